@@ -1,0 +1,167 @@
+"""What a sweep leaves behind, as typed records; the files of a sweep folder are these as JSON.
+
+Words: *training return* is the mean undiscounted return of the last 100 whole exploring episodes; *evaluation return*
+the mean of greedy episodes on the sweep's fixed evaluation seeds. `None` stands for "not known (yet)"; a score that is
+NaN or infinite is written as `None`, so it can never win.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+FORMAT_VERSION = 1
+
+TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
+SweepState = Literal["running", "interrupted", "completed"]
+FINISHED: frozenset[str] = frozenset({"completed", "failed", "stopped"})
+
+
+def finite_or_none(value: float | None) -> float | None:
+    """The value, or None if it is None, NaN or infinite."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+class _Record(BaseModel):
+    # Unknown keys are ignored, so that an older version can read what a newer one wrote.
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class CheckpointRecord(_Record):
+    """One kept checkpoint of a trial."""
+
+    trial_id: str
+    iteration: int
+    num_env_steps: int
+    path: str = Field(description="Folder, relative to the sweep folder, with forward slashes.")
+    training_return: float | None = None
+    evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")
+
+    @field_validator("training_return", "evaluation_return")
+    @classmethod
+    def _finite(cls, value: float | None) -> float | None:
+        return finite_or_none(value)
+
+
+class IterationRecord(_Record):
+    """One iteration of one trial: a line of results.jsonl."""
+
+    iteration: int
+    num_env_steps: int = Field(description="Env steps sampled so far in this trial.")
+    num_episodes: int = Field(description="Whole episodes so far in this trial.")
+    time_s: float = Field(description="Seconds of training so far, evaluation and checkpoints included.")
+    training_return: float | None = None
+    evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")
+    episode_returns: tuple[float, ...] = Field((), description="Whole training episodes that ended here.")
+    episode_lengths: tuple[int, ...] = ()
+    learner: dict[str, float | None] = Field(default_factory=dict, description="Losses, entropy, lr, ...")
+
+    @field_validator("training_return", "evaluation_return")
+    @classmethod
+    def _finite(cls, value: float | None) -> float | None:
+        return finite_or_none(value)
+
+
+class TrialRecord(_Record):
+    """One training run: one point and one seed."""
+
+    trial_id: str
+    index: int
+    point_index: int
+    seed_index: int = 0
+    seed: int
+    point: dict[str, Any] = Field(description="The sampled values alone.")
+    hyperparams: dict[str, Any] = Field(default_factory=dict, description="All values, fixed ones too.")
+    status: TrialStatus = "pending"
+    stop_reason: str | None = Field(None, description="The stop rule, cap or scheduler that ended it.")
+    error: str | None = Field(None, description="Why it failed, with the end of its log.")
+    num_failures: int = 0
+    num_iterations: int = 0
+    num_env_steps: int = 0
+    num_episodes: int = 0
+    time_s: float = 0.0
+    training_return: float | None = None
+    evaluation_return: float | None = Field(None, description="The newest evaluation.")
+    best_evaluation_return: float | None = None
+    best_iteration: int | None = None
+    node: str | None = Field(None, description="Address or name of the node it last ran on.")
+    pid: int | None = Field(None, description="Process it last ran in.")
+    started_at: float | None = Field(None, description="Unix time, seconds.")
+    ended_at: float | None = None
+    checkpoints: tuple[CheckpointRecord, ...] = Field((), description="The kept ones, oldest first.")
+
+    @field_validator("training_return", "evaluation_return", "best_evaluation_return")
+    @classmethod
+    def _finite(cls, value: float | None) -> float | None:
+        return finite_or_none(value)
+
+
+class EvaluationRecord(_Record):
+    """Greedy episodes of one policy on known seeds."""
+
+    policy: str = Field(description="What was evaluated: a path, or 'random'.")
+    env_id: str
+    env_args: dict[str, Any] = Field(default_factory=dict)
+    seeds: tuple[int, ...]
+    returns: tuple[float, ...] = Field(description="Undiscounted return of each episode, in the order of seeds.")
+    lengths: tuple[int, ...] = Field(description="Env steps of each episode.")
+    threshold: float | None = Field(None, description="The env's reward threshold; None if it has none.")
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.returns)
+
+    @property
+    def mean_return(self) -> float:
+        """Mean episode return."""
+        return sum(self.returns) / len(self.returns)
+
+    @property
+    def std_return(self) -> float:
+        """Population standard deviation of the episode returns."""
+        mean = self.mean_return
+        return math.sqrt(sum((value - mean) ** 2 for value in self.returns) / len(self.returns))
+
+    @property
+    def solved(self) -> bool | None:
+        """Whether the mean reaches the env's threshold; None if it has none."""
+        return None if self.threshold is None else self.mean_return >= self.threshold
+
+
+class BestRecord(_Record):
+    """The winner: best/evaluation.json."""
+
+    format_version: int = FORMAT_VERSION
+    checkpoint: CheckpointRecord
+    point: dict[str, Any]
+    seed: int
+    selection_score: float = Field(description="Mean evaluation return it was chosen by.")
+    confirmation: EvaluationRecord = Field(description="The winner on seeds it was not chosen on.")
+    random: EvaluationRecord = Field(description="A random policy on the confirmation seeds.")
+
+    @property
+    def optimism_gap(self) -> float:
+        """Selection score minus confirmation mean: what choosing the maximum flattered it by."""
+        return self.selection_score - self.confirmation.mean_return
+
+
+class SweepRecord(_Record):
+    """sweep.json."""
+
+    format_version: int = FORMAT_VERSION
+    name: str
+    state: SweepState
+    spec: dict[str, Any] = Field(description="The resolved sweep file.")
+    evaluation_seeds: tuple[int, ...]
+    confirmation_seeds: tuple[int, ...]
+    num_trials: int
+    created_at: float
+    started_at: float | None = None
+    ended_at: float | None = None
+    run_time_s: float = Field(0.0, description="Seconds that launches and resumes took together.")
+    versions: dict[str, str] = Field(default_factory=dict)
+    git_commit: str | None = None
+    address: str | None = None
