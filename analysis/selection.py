@@ -1,0 +1,181 @@
+"""The one place that decides which checkpoint of a sweep is "best".
+
+Words: a *usable* trial did not fail and keeps at least one checkpoint with a finite evaluation return; its
+*score* is the highest of them. The score of a *point* is the mean score of its usable trials, one a seed. A point
+is *complete* when every one of its seeds is usable.
+
+The rule, in order:
+
+1. Complete points come before incomplete ones: a failed seed must not flatter its point by leaving the mean.
+2. The higher point score wins; then fewer env steps (mean over the seeds); then the lower trial index.
+3. Within the winning point: the trial with the highest score; then fewer env steps; then the lower index.
+4. Within the winning trial: the checkpoint with the highest evaluation return; then fewer env steps.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.records import CheckpointRecord, TrialRecord, finite_or_none
+from policies.errors import NotFoundError
+
+_MAX_ERROR_CHARS = 300
+
+
+class NoUsableTrialError(NotFoundError):
+    """Not one trial of the sweep has a checkpoint that may win; the message says why."""
+
+
+@dataclass(frozen=True)
+class TrialScore:
+    """A usable trial and the checkpoint it would win with."""
+
+    trial: TrialRecord
+    checkpoint: CheckpointRecord
+    score: float
+    """Mean evaluation return of the checkpoint, reward units."""
+
+
+@dataclass(frozen=True)
+class PointScore:
+    """A point with at least one usable trial."""
+
+    point_index: int
+    point: dict[str, Any]
+    score: float
+    """Mean score over the usable seeds, reward units."""
+    num_env_steps: float
+    """Env steps to those scores, mean over the usable seeds."""
+    num_seeds: int
+    """Seeds the point should have; `len(trial_scores)` of them are usable."""
+    trial_scores: tuple[TrialScore, ...]
+    """The usable trials, best first."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every seed of the point is usable."""
+        return len(self.trial_scores) == self.num_seeds
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The winner of a sweep."""
+
+    checkpoint: CheckpointRecord
+    trial: TrialRecord
+    score: float
+    """Evaluation return of the winning checkpoint alone: what its confirmation is compared with."""
+    ranking: tuple[PointScore, ...]
+    """Every point with a usable trial, best first; the winner is in the first."""
+
+    @property
+    def point_score(self) -> float:
+        """Score of the winning point: the mean over its seeds that it was chosen by."""
+        return self.ranking[0].score
+
+
+def score_trial(trial: TrialRecord) -> TrialScore | None:
+    """The checkpoint a trial would win with, or None if the trial is not usable."""
+    if trial.status == "failed":
+        return None
+    best: TrialScore | None = None
+    for checkpoint in trial.checkpoints:
+        score = finite_or_none(checkpoint.evaluation_return)
+        if score is None:
+            continue
+        if best is None or (-score, checkpoint.num_env_steps) < (-best.score, best.checkpoint.num_env_steps):
+            best = TrialScore(trial, checkpoint, score)
+    return best
+
+
+def rank_points(trials: Sequence[TrialRecord]) -> list[PointScore]:
+    """Every point that has a usable trial, best first by the rule of this module.
+
+    Trials may be in any order and in any status, so that a live view can call this while the sweep runs.
+    """
+    by_point: defaultdict[int, list[TrialRecord]] = defaultdict(list)
+    for trial in trials:
+        by_point[trial.point_index].append(trial)
+    # A seed without a record is as little proof as one that failed: all points owe the same number of seeds.
+    num_seeds = max((len(members) for members in by_point.values()), default=0)
+    points = []
+    for point_index, members in by_point.items():
+        scored = [score for score in map(score_trial, members) if score is not None]
+        if not scored:
+            continue
+        scored.sort(key=_trial_order)
+        points.append(
+            PointScore(
+                point_index=point_index,
+                point=scored[0].trial.point,
+                score=sum(item.score for item in scored) / len(scored),
+                num_env_steps=sum(item.checkpoint.num_env_steps for item in scored) / len(scored),
+                num_seeds=num_seeds,
+                trial_scores=tuple(scored),
+            )
+        )
+    points.sort(key=_point_order)
+    return points
+
+
+def select_best(trials: Sequence[TrialRecord]) -> Selection:
+    """Choose the checkpoint that wins the sweep.
+
+    Raises:
+        NoUsableTrialError: No trial is usable.
+    """
+    ranking = rank_points(trials)
+    if not ranking:
+        raise NoUsableTrialError(*_why_none(trials))
+    winner = ranking[0].trial_scores[0]
+    return Selection(winner.checkpoint, winner.trial, winner.score, tuple(ranking))
+
+
+def _trial_order(item: TrialScore) -> tuple[float, int, int]:
+    return (-item.score, item.checkpoint.num_env_steps, item.trial.index)
+
+
+def _point_order(item: PointScore) -> tuple[bool, float, float, int]:
+    lowest_index = min(score.trial.index for score in item.trial_scores)
+    return (not item.complete, -item.score, item.num_env_steps, lowest_index)
+
+
+def _why_none(trials: Sequence[TrialRecord]) -> tuple[str, str]:
+    """Message and hint for a sweep without a usable trial."""
+    if not trials:
+        return "No trial is usable: the sweep has no trials yet.", "Launch it, or wait for its first result."
+    failed = [trial for trial in trials if trial.status == "failed"]
+    waiting = sum(trial.status == "pending" for trial in trials)
+    others = len(trials) - len(failed) - waiting
+    counts = [
+        (len(failed), "failed"),
+        (waiting, "not started"),
+        (others, "without a kept checkpoint that has a finite evaluation return"),
+    ]
+    parts = ", ".join(f"{count} {what}" for count, what in counts if count)
+    message = f"No trial of {len(trials)} is usable: {parts}."
+    if failed:
+        first = min(failed, key=lambda trial: trial.index)
+        return (
+            f"{message} First error ({first.trial_id}): {error_summary(first.error)}",
+            f"Read the log of {first.trial_id}, mend the cause and launch again.",
+        )
+    if any(trial.status in {"pending", "running", "paused"} for trial in trials):
+        return message, "Wait for the first evaluation, or resume the sweep if it was interrupted."
+    return message, "Evaluate more often (evaluation.every_iterations), or let the trials train longer."
+
+
+def error_summary(error: str | None) -> str:
+    """The one line of a recorded error that names it: its first, or a traceback's exception; shortened."""
+    lines = [line.rstrip() for line in (error or "").splitlines() if line.strip()]
+    if not lines:
+        return "no message was recorded"
+    line = lines[0]
+    if line.startswith("Traceback"):
+        # Frames are indented; the first line that is not names the exception.
+        line = next((item for item in lines[1:] if not item[0].isspace()), line)
+    line = line.strip()
+    return line if len(line) <= _MAX_ERROR_CHARS else line[: _MAX_ERROR_CHARS - 1] + "…"

@@ -1,0 +1,323 @@
+"""Policies that act: a network read from a portable file, or a random one; NumPy alone.
+
+`Policy.act` takes one observation, shape (n,), and gives one action ready for `env.step`, or takes a batch,
+shape (num, n), and gives a batch of actions. Acting is greedy. The actions are those that RLlib sends to the
+env: shifted by
+the start of a Discrete space, and for Box actions transformed as the policy file says:
+
+* `unsquash`: the network's [-1, 1] is stretched over the bounds and clipped to them, if all bounds are
+  finite; otherwise the action is left as it is (`normalize_actions=True`, RLlib's default).
+* `clip`: clipped to the bounds.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from policies.envs import check_env
+from policies.errors import TuneJobsError
+from policies.portable import Layer, PortablePolicy, read_policy, space_from_description
+
+ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
+Action = int | NDArray[Any]
+
+
+class ObservationError(TuneJobsError):
+    """An observation is not of the shape that the policy takes."""
+
+
+class NonFiniteWeightsError(TuneJobsError):
+    """A network holds NaN or infinite weights: its training went wrong, and what it does means nothing."""
+
+
+class Policy(ABC):
+    """Something that acts greedily in an environment.
+
+    Args:
+        observation_space: What it observes.
+        action_space: What its actions are taken from.
+        env_id: The environment it is for.
+        env_args: The arguments of that environment.
+        description: What it is, in a few words; captions and messages show it.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        *,
+        env_id: str,
+        env_args: Mapping[str, Any] | None,
+        description: str,
+    ) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.env_id = env_id
+        self.env_args = dict(env_args or {})
+        self.description = description
+
+    def act(self, observations: ArrayLike) -> Action:
+        """The greedy action for one observation, or for each of a batch.
+
+        Args:
+            observations: Shape (n,) or (num, n).
+
+        Returns:
+            For one observation what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
+            (Box). For a batch an array of shape (num,) or (num, action_dim).
+
+        Raises:
+            ObservationError: The observations are of another shape, or no numbers.
+        """
+        shape = self.observation_space.shape or ()
+        try:
+            batch = np.asarray(observations, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise ObservationError(
+                f"Observations must be numbers of shape {shape}: {error}.",
+                "Pass what env.reset or env.step returned.",
+            ) from error
+        single = batch.ndim == len(shape)
+        if batch.shape[-len(shape) :] != shape or batch.ndim > len(shape) + 1:
+            raise ObservationError(
+                f"The observations are of shape {batch.shape}; this policy ({self.env_id}) takes {shape}, "
+                "or a batch of "
+                f"shape {('num', *shape)}.".replace("'", ""),
+                "Pass what env.reset or env.step returned.",
+            )
+        actions = self._act_batch(batch[None] if single else batch)
+        if not single:
+            return actions
+        return (
+            int(actions[0])
+            if isinstance(self.action_space, gym.spaces.Discrete)
+            else cast("NDArray[Any]", actions[0])
+        )
+
+    @abstractmethod
+    def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        """Actions for observations of shape (num, n)."""
+
+
+class NetworkPolicy(Policy):
+    """Greedy actions of a portable network.
+
+    The result for an observation does not depend on what else is in its batch, to the last bit, so an episode
+    is the same one whether it is evaluated alone, beside others, or filmed.
+
+    Args:
+        portable: The network and its spaces.
+        description: Shown in captions; by default the algorithm and the env.
+    """
+
+    def __init__(self, portable: PortablePolicy, description: str | None = None) -> None:
+        action_space = space_from_description(portable.action_space)
+        super().__init__(
+            space_from_description(portable.observation_space),
+            action_space,
+            env_id=portable.env_id,
+            env_args=portable.env_args,
+            description=description or f"{portable.algorithm.upper()} on {portable.env_id}",
+        )
+        self.portable = portable
+        self._layers = [_Linear(layer) for layer in portable.network.layers]
+        self._to_actions = _action_function(portable, action_space)
+
+    def check_finite(self) -> None:
+        """Raise unless all weights are finite.
+
+        Raises:
+            NonFiniteWeightsError: A weight is NaN or infinite; the message names its layer.
+        """
+        for index, layer in enumerate(self.portable.network.layers):
+            count = sum(int(array.size - np.isfinite(array).sum()) for array in (layer.weight, layer.bias))
+            if count:
+                raise NonFiniteWeightsError(
+                    f"The policy {self.description!r} has {count} weights that are NaN or infinite in layer "
+                    f"{index}.",
+                    "Lower the learning rate, or set grad_clip.",
+                )
+
+    def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
+        """The network's raw output: logits, means and log standard deviations, or Q-values or advantages.
+
+        Args:
+            observations: Shape (num, n).
+
+        Returns:
+            Shape (num, num_outputs).
+        """
+        # One vector-matrix product an observation (a stack of 1-row matrices): a single product of the batch
+        # takes other BLAS kernels at other batch sizes, whose results differ in the last bit. It costs no
+        # more at these sizes.
+        x = np.asarray(observations, dtype=np.float32)[:, None, :]
+        for layer in self._layers:
+            x = layer(x)
+        return x[:, 0, :]
+
+    def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        return self._to_actions(self.outputs(observations))
+
+
+class RandomPolicy(Policy):
+    """Actions drawn uniformly from the action space, as `action_space.sample()` draws them.
+
+    Args:
+        observation_space: Of the env; only the shape matters.
+        action_space: What is drawn from.
+        env_id: The environment it is for.
+        env_args: The arguments of that environment.
+        seed: First seed; `reset` sets another.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        *,
+        env_id: str,
+        env_args: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ) -> None:
+        # A copy: a space has one generator, and the env's own must not be touched.
+        own_space = _copy_space(action_space)
+        super().__init__(
+            observation_space, own_space, env_id=env_id, env_args=env_args, description="random policy"
+        )
+        self.reset(seed)
+
+    @classmethod
+    def for_env(
+        cls, env_id: str, env_args: Mapping[str, Any] | None = None, *, seed: int = 0
+    ) -> RandomPolicy:
+        """A random policy for an environment.
+
+        Raises:
+            EnvError: The environment cannot be made, or its spaces are not supported.
+        """
+        info = check_env(env_id, env_args)
+        return cls(
+            info.observation_space, info.action_space, env_id=info.env_id, env_args=info.env_args, seed=seed
+        )
+
+    def reset(self, seed: int) -> None:
+        """Start again from a seed: the same seed gives the same actions."""
+        # Gymnasium seeds an env's generator with SeedSequence(seed). The spawn key makes this another stream,
+        # or the actions would be drawn from the very numbers that the env's start states and noise come from.
+        sequence = np.random.SeedSequence(seed, spawn_key=(1,))
+        self.action_space.seed(int(sequence.generate_state(1, np.uint64)[0]))
+
+    def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        actions = [self.action_space.sample() for _ in range(len(observations))]
+        return np.array(actions).reshape(len(observations), *(self.action_space.shape or ()))
+
+
+def load_policy(path: str | Path) -> NetworkPolicy:
+    """Read a policy from its portable file; needs no Ray and no torch, and executes nothing in the file.
+
+    Args:
+        path: `policy.json`, `policy.safetensors`, or the folder that holds them.
+
+    Raises:
+        NotFoundError: There is no such file.
+        CheckpointError: The file is incomplete, altered, or of another format.
+    """
+    return NetworkPolicy(read_policy(Path(path)))
+
+
+class _Linear:
+    """A layer, its weights transposed once into the order that the product wants."""
+
+    def __init__(self, layer: Layer) -> None:
+        self._matrix = np.ascontiguousarray(layer.weight.T, dtype=np.float32)
+        self._bias = np.asarray(layer.bias, dtype=np.float32)
+        self._activation = _ACTIVATION_FUNCTIONS[layer.activation]
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        x = np.matmul(x, self._matrix)
+        x += self._bias
+        return x if self._activation is None else self._activation(x)
+
+
+def _copy_space(space: gym.Space[Any]) -> gym.Space[Any]:
+    if isinstance(space, gym.spaces.Box):
+        return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
+    if isinstance(space, gym.spaces.Discrete):
+        return gym.spaces.Discrete(int(space.n), start=int(space.start))
+    raise TuneJobsError(
+        f"Actions of kind {type(space).__name__} are not supported.", "Use Box or Discrete actions."
+    )
+
+
+def _action_function(
+    portable: PortablePolicy, action_space: ActionSpace
+) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
+    """What turns the network's outputs, shape (num, num_outputs), into actions for the env."""
+    if isinstance(action_space, gym.spaces.Discrete):
+        start = int(action_space.start)
+        return lambda outputs: np.argmax(outputs, axis=1) + start
+    low, high, dtype = action_space.low, action_space.high, action_space.dtype
+    size = math.prod(action_space.shape)
+    transform = portable.action_transform
+    if transform == "unsquash" and not (
+        np.all(action_space.bounded_below) and np.all(action_space.bounded_above)
+    ):
+        transform = "none"
+
+    def to_actions(outputs: NDArray[np.float32]) -> NDArray[Any]:
+        # The same operations in the same order as RLlib's unsquash_action and clip_action, so the bits are
+        # the same.
+        actions: NDArray[Any] = outputs[:, :size]
+        if transform == "unsquash":
+            actions = low + (actions + 1.0) * (high - low) / 2.0
+        if transform != "none":
+            actions = np.clip(actions, low, high)
+        return actions.astype(dtype)
+
+    return to_actions
+
+
+def _relu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.maximum(x, np.float32(0.0), out=x)
+
+
+def _tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.tanh(x, out=x)
+
+
+def _silu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    # x * sigmoid(x). For very negative x the exponential overflows to infinity and the quotient is the right
+    # limit, -0.
+    with np.errstate(over="ignore"):
+        return x / (np.float32(1.0) + np.exp(-x))
+
+
+def _elu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, np.float32(0.0))))
+
+
+def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    # The exact form, torch's default: x times the normal distribution function.
+    # math.erf number by number costs a few times the product of the layer; only SciPy has a faster one.
+    cumulative = 0.5 * (1.0 + _erf(x / math.sqrt(2.0)).astype(np.float64))
+    return (x * cumulative).astype(np.float32)
+
+
+_erf = np.frompyfunc(math.erf, 1, 1)
+
+_ACTIVATION_FUNCTIONS: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]] | None] = {
+    "linear": None,
+    "relu": _relu,
+    "tanh": _tanh,
+    "silu": _silu,
+    "elu": _elu,
+    "gelu": _gelu,
+}

@@ -1,0 +1,196 @@
+"""The rule of the design for "best", case by case."""
+
+import itertools
+import math
+import pickle
+
+import pytest
+
+from analysis.records import CheckpointRecord, TrialRecord
+from analysis.selection import NoUsableTrialError, error_summary, rank_points, score_trial, select_best
+from policies.errors import NotFoundError
+
+
+def checkpoint(trial_id, iteration, evaluation, *, steps=None, training=None):
+    return CheckpointRecord(
+        trial_id=trial_id,
+        iteration=iteration,
+        num_env_steps=iteration * 1000 if steps is None else steps,
+        path=f"trials/{trial_id}/checkpoints/{iteration}",
+        training_return=training,
+        evaluation_return=evaluation,
+    )
+
+
+def trial(
+    index, *evaluations, point=None, seed_index=0, status="completed", steps=None, error=None, training=None
+):
+    trial_id = f"t{index:04d}"
+    return TrialRecord(
+        trial_id=trial_id,
+        index=index,
+        point_index=index if point is None else point,
+        seed_index=seed_index,
+        seed=1000 + index,
+        point={"lr": 0.001 * (index if point is None else point)},
+        status=status,
+        error=error,
+        checkpoints=tuple(
+            checkpoint(trial_id, i + 1, value, steps=steps, training=training)
+            for i, value in enumerate(evaluations)
+        ),
+    )
+
+
+def test_the_highest_evaluation_return_wins_wherever_in_the_trial_it_was():
+    best = select_best([trial(0, 100.0, 50.0), trial(1, 40.0, 180.0, 20.0), trial(2, 150.0)])
+    assert (best.trial.trial_id, best.checkpoint.iteration, best.score) == ("t0001", 2, 180.0)
+    assert [point.point_index for point in best.ranking] == [1, 2, 0]
+
+
+def test_training_return_decides_nothing():
+    assert select_best([trial(0, 10.0, training=500.0), trial(1, 20.0, training=1.0)]).trial.index == 1
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, None])
+def test_a_score_that_is_not_finite_never_wins(value):
+    assert select_best([trial(0, value, -7.0), trial(1, value)]).score == -7.0
+    assert score_trial(trial(0, value)) is None
+
+
+def test_a_not_finite_score_never_wins_even_where_a_record_skipped_validation():
+    bad = checkpoint("t0000", 1, 1.0).model_copy(update={"evaluation_return": math.nan})
+    assert score_trial(trial(0).model_copy(update={"checkpoints": (bad,)})) is None
+
+
+def test_a_failed_trial_never_wins():
+    assert select_best([trial(0, 500.0, status="failed", error="boom"), trial(1, 0.0)]).trial.index == 1
+
+
+@pytest.mark.parametrize("status", ["running", "paused", "completed", "stopped"])
+def test_a_trial_that_did_not_fail_may_win(status):
+    assert select_best([trial(0, 5.0, status=status)]).trial.status == status
+
+
+def test_a_score_of_zero_is_a_score():
+    best = select_best([trial(0, 0.0), trial(1, -1.0)])
+    assert (best.trial.index, best.score) == (0, 0.0)
+
+
+def test_ties_go_to_fewer_env_steps_then_to_the_lower_trial_index():
+    assert select_best([trial(0, 9.0, steps=500), trial(1, 9.0, steps=400)]).trial.index == 1
+    assert select_best([trial(3, 9.0, steps=400), trial(1, 9.0, steps=400)]).trial.index == 1
+    assert select_best([trial(0, 9.0, 9.0)]).checkpoint.iteration == 1
+
+
+def test_trial_index_orders_as_a_number():
+    # As text t10000 comes before t9999.
+    assert select_best([trial(10_000, 9.0, steps=1), trial(9_999, 9.0, steps=1)]).trial.index == 9_999
+
+
+def test_a_point_scores_the_mean_of_its_seeds_and_its_best_seed_is_taken():
+    trials = [
+        trial(0, 100.0, point=0, seed_index=0),
+        trial(1, 20.0, point=0, seed_index=1),
+        trial(2, 70.0, point=1, seed_index=0),
+        trial(3, 80.0, point=1, seed_index=1),
+    ]
+    best = select_best(trials)
+    assert (best.trial.index, best.score, best.point_score) == (3, 80.0, 75.0)
+    assert [point.score for point in best.ranking] == [75.0, 60.0]
+    assert best.ranking[0].num_env_steps == 1000.0
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        trial(1, 500.0, point=0, seed_index=1, status="failed"),
+        trial(1, point=0, seed_index=1),
+        trial(1, math.nan, point=0, seed_index=1),
+        None,
+    ],
+)
+def test_a_lost_seed_does_not_flatter_its_point(lost):
+    trials = [
+        trial(0, 200.0, point=0, seed_index=0),
+        trial(2, 70.0, point=1, seed_index=0),
+        trial(3, 80.0, point=1, seed_index=1),
+    ]
+    best = select_best(trials if lost is None else [*trials, lost])
+    assert best.trial.index == 3
+    assert [point.complete for point in best.ranking] == [True, False]
+    assert [point.num_seeds for point in best.ranking] == [2, 2]
+
+
+def test_incomplete_points_win_where_no_point_is_complete():
+    trials = [
+        trial(0, 200.0, point=0, seed_index=0),
+        trial(1, point=0, seed_index=1, status="failed"),
+        trial(2, 70.0, point=1, seed_index=0),
+        trial(3, point=1, seed_index=1, status="failed"),
+    ]
+    assert select_best(trials).trial.index == 0
+
+
+def test_the_order_of_the_trials_does_not_matter():
+    trials = [trial(0, 9.0, steps=5), trial(1, 9.0, steps=5), trial(2, 9.0, steps=4), trial(3, 1.0)]
+    for order in itertools.permutations(trials):
+        assert [point.point_index for point in rank_points(order)] == [2, 0, 1, 3]
+
+
+def test_no_usable_trial_says_why():
+    trials = [
+        trial(2, status="failed", error="ValueError: second"),
+        trial(1, status="failed", error="ZeroDivisionError: the pole\n  at line 3"),
+        trial(0, None),
+        trial(3, status="pending"),
+    ]
+    with pytest.raises(NoUsableTrialError) as caught:
+        select_best(trials)
+    message = caught.value.message
+    assert "of 4" in message
+    assert "2 failed" in message
+    assert "1 not started" in message
+    assert "1 without" in message
+    assert "t0001" in message
+    assert "ZeroDivisionError: the pole" in message
+    assert "second" not in message
+    assert "t0001" in caught.value.hint
+
+
+def test_no_usable_trial_has_a_hint_for_each_reason():
+    hints = set()
+    for trials in ([], [trial(0, status="pending")], [trial(0)], [trial(0, status="failed")]):
+        assert rank_points(trials) == []
+        with pytest.raises(NoUsableTrialError) as caught:
+            select_best(trials)
+        assert caught.value.hint
+        hints.add(caught.value.hint)
+    assert len(hints) == 4
+
+
+def test_the_error_is_a_not_found_error_that_pickles():
+    assert issubclass(NoUsableTrialError, NotFoundError)
+    assert NoUsableTrialError.exit_code == 4
+    with pytest.raises(NoUsableTrialError) as caught:
+        select_best([])
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (copy.message, copy.hint) == (caught.value.message, caught.value.hint)
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (None, "no message was recorded"),
+        ("  \n", "no message was recorded"),
+        ("RuntimeError: broke\nlog: Traceback (most recent call last):\nlast line", "RuntimeError: broke"),
+        ("Traceback (most recent call last):\n  File x\n    y()\nKeyError: 'z'\nlog line", "KeyError: 'z'"),
+        ("Traceback (most recent call last):\n  File x", "Traceback (most recent call last):"),
+    ],
+)
+def test_error_summary_is_the_line_that_names_the_error(error, line):
+    assert error_summary(error) == line
+
+
+def test_error_summary_is_short():
+    assert len(error_summary("x" * 5000)) == 300

@@ -1,0 +1,74 @@
+"""What an engine is: the one thing that knows how a trial's iterations are computed.
+
+Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is `tune_jobs.trial`'s and the same
+for all engines. This module imports no ray, so that both sides can import it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from policies.portable import PortablePolicy
+from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+
+
+@dataclass(frozen=True)
+class TrialTask:
+    """Everything a process needs to run one trial, or to go on with it."""
+
+    sweep_folder: Path
+    trial_id: str
+    seed: int
+    algorithm: str
+    hyperparams: dict[str, Any]
+    env_id: str
+    env_args: dict[str, Any]
+    stop: StopSpec
+    evaluation: EvaluationSpec
+    checkpoints: CheckpointSpec
+    evaluation_seeds: tuple[int, ...]
+    num_env_runners: int = 0
+    num_gpus: float = 0.0
+    iteration_timeout_s: float = 600.0
+
+
+@dataclass(frozen=True)
+class IterationStats:
+    """What one iteration gave."""
+
+    num_env_steps: int
+    """Env steps of the trial so far."""
+    episodes: tuple[tuple[float, int], ...] = ()
+    """(undiscounted return, env steps) of each whole episode that ended in it."""
+    learner: dict[str, float] = field(default_factory=dict)
+    """Losses, entropy, learning rate and the like, of the last update."""
+
+
+class TrainingEngine(Protocol):
+    """Trains one trial at a time; reused for the next by another `build`."""
+
+    def build(self, task: TrialTask, checkpoint: Path | None) -> None:
+        """Make the networks and environments of a trial, fresh or exactly as a checkpoint folder holds them.
+
+        Raises:
+            CheckpointError: The checkpoint cannot be restored. Never starts afresh instead.
+        """
+        ...
+
+    def train_iteration(self) -> IterationStats:
+        """Train for one iteration."""
+        ...
+
+    def policy(self) -> PortablePolicy:
+        """The current greedy policy."""
+        ...
+
+    def save(self, folder: Path) -> None:
+        """Write what `build` needs into an empty folder."""
+        ...
+
+    def close(self) -> None:
+        """Free everything; `build` may follow."""
+        ...

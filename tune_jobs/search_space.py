@@ -1,0 +1,365 @@
+"""The search space: which values each searched hyperparameter may take, and the points drawn from it.
+
+Words: a *domain* is the set of values of one hyperparameter; a *grid* domain is tried exhaustively, every
+other domain is sampled; a *point* is one value of each. Domains mean what the functions of the same names in
+`ray.tune` mean: `randint` leaves its upper end out, quantised domains (`q...`) give multiples of `q` between
+the ends.
+
+In a sweep file a domain is a mapping of one key, its kind: `lr: {loguniform: [1e-5, 1e-2]}`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from decimal import Decimal
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+
+# First element of the spawn keys of points; seeds.py uses 1 and up.
+POINTS_SPAWN_KEY = 0
+
+
+def _refuse_coercion(value: Any) -> Any:
+    # Pydantic would read true as 1 and "5" as 5: a quoted or misspelt value is better refused than guessed
+    # at.
+    if isinstance(value, bool | str):
+        raise ValueError(f"{value!r} is not a number")  # noqa: TRY004 - pydantic reports ValueErrors only
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_refuse_coercion), Field(allow_inf_nan=False)]
+"""A finite float; texts and true/false are refused."""
+
+WholeNumber = Annotated[int, BeforeValidator(_refuse_coercion)]
+"""An int, or a float without a fraction such as 1e5; texts and true/false are refused."""
+
+
+class _Domain(BaseModel, ABC):
+    """Values of one hyperparameter; the one field of a subclass has the name of its kind."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: ClassVar[str]
+    is_random: ClassVar[bool] = True
+    is_whole: ClassVar[bool] = False
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value, as a plain Python object."""
+
+    @abstractmethod
+    def probes(self) -> list[tuple[int | None, Any]]:
+        """Values to validate, each with its index in the sweep file (None: no value of its own there).
+
+        If the hyperparameter accepts all of these, it accepts whatever the domain can give.
+        """
+
+
+class _Listed(_Domain):
+    """A domain that lists its values."""
+
+    @property
+    def values(self) -> tuple[Any, ...]:
+        """The listed values, in the order of the file."""
+        values: tuple[Any, ...] = getattr(self, self.kind)
+        return values
+
+    @model_validator(mode="after")
+    def _has_distinct_values(self) -> Self:
+        if not self.values:
+            raise ValueError("is empty: list at least one value, or take it out of the space")
+        seen: list[str] = []
+        for value in self.values:
+            # The type counts, as 1 == True == 1.0 in Python; so does an inner list, which can't be hashed.
+            key = repr(value)
+            if key in seen:
+                raise ValueError(
+                    f"lists {value!r} twice: list it once (seeds_per_point repeats points with other seeds)"
+                )
+            seen.append(key)
+        return self
+
+    def probes(self) -> list[tuple[int | None, Any]]:
+        return list(enumerate(self.values))
+
+
+class Grid(_Listed):
+    """Every value is tried, in combination with every value of the other grids."""
+
+    kind: ClassVar[str] = "grid"
+    is_random: ClassVar[bool] = False
+    grid: tuple[Any, ...] = Field(description="Values to try, each with every value of the other grids.")
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value; only for callers that ignore that a grid is exhaustive."""
+        return self.values[int(rng.integers(len(self.values)))]
+
+
+class Choice(_Listed):
+    """One of the values, each as likely as the others."""
+
+    kind: ClassVar[str] = "choice"
+    choice: tuple[Any, ...] = Field(description="Values to draw from, each as likely as the others.")
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value."""
+        return self.values[int(rng.integers(len(self.values)))]
+
+
+class _Range(_Domain):
+    """A domain between two ends, perhaps on a log scale, perhaps of multiples of a step q."""
+
+    is_log: ClassVar[bool] = False
+
+    @property
+    def low(self) -> float:
+        """Lower end, included."""
+        return float(getattr(self, self.kind)[0])
+
+    @property
+    def high(self) -> float:
+        """Upper end as in the sweep file."""
+        return float(getattr(self, self.kind)[1])
+
+    @property
+    def q(self) -> float | None:
+        """Step of a quantised domain, else None."""
+        ends = getattr(self, self.kind)
+        return float(ends[2]) if len(ends) == 3 else None
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and greatest value that can be drawn."""
+        if self.q is not None:
+            first, last = self._indices()
+            return _multiple(first, self.q), _multiple(last, self.q)
+        return (self.low, self.high - 1) if self.is_whole else (self.low, self.high)
+
+    def _indices(self) -> tuple[int, int]:
+        """First and last multiple of q that can be drawn, as factors of q."""
+        q = self.q or 1.0
+        first, last = _index(self.low, q, up=True), _index(self.high, q, up=False)
+        # As in ray.tune: upper ends of whole ranges are included, except that a step of 1 changes nothing.
+        return first, last - 1 if self.is_whole and q == 1 else last
+
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        low, high = getattr(self, self.kind)[:2]
+        if self.q is not None and self.q <= 0:
+            raise ValueError(f"has the step {self.q:g}: the third number must be greater than 0")
+        if low >= high:
+            raise ValueError(f"goes from {low!r} to {high!r}: the first number must be less than the second")
+        if self.is_log and low <= 0:
+            raise ValueError(f"starts at {low!r}: a log scale needs a start greater than 0")
+        if self.q is not None:
+            first, last = self._indices()
+            if first > last:
+                raise ValueError(f"has no multiple of {self.q:g} between {low!r} and {high!r}")
+        return self
+
+    def probes(self) -> list[tuple[int | None, Any]]:
+        low, high = self.bounds
+        if self.is_whole:
+            return [(0, int(low)), (1, int(high))]
+        # The ends alone don't tell whether a hyperparameter that is a whole number could be given a fraction.
+        fraction = None if self.q is not None and self.q.is_integer() else low + (high - low) / math.pi
+        inside = [] if fraction is None else [(None, fraction)]
+        return [(0, low), (1, high), *inside]
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value: int from a whole range, else float."""
+        if self.is_whole:
+            first, last = self._indices()
+            factor = _draw_whole(rng, first, last, log=self.is_log)
+            return factor * int(self.q or 1)
+        if self.q is None:
+            return _draw_real(rng, self.low, self.high, log=self.is_log)
+        low, high = self.bounds
+        # Drawn between the outermost multiples, so that rounding can't lead out of the range.
+        return _multiple(round(_draw_real(rng, low, high, log=self.is_log) / self.q), self.q)
+
+
+class Uniform(_Range):
+    """A float, uniform between the ends."""
+
+    kind: ClassVar[str] = "uniform"
+    uniform: tuple[Number, Number] = Field(description="[low, high], floats.")
+
+
+class LogUniform(_Range):
+    """A float, uniform between the ends on a log scale."""
+
+    kind: ClassVar[str] = "loguniform"
+    is_log: ClassVar[bool] = True
+    loguniform: tuple[Number, Number] = Field(description="[low, high], floats > 0, drawn on a log scale.")
+
+
+class QUniform(_Range):
+    """A multiple of q, uniform between the ends."""
+
+    kind: ClassVar[str] = "quniform"
+    quniform: tuple[Number, Number, Number] = Field(description="[low, high, q]: multiples of q.")
+
+
+class QLogUniform(_Range):
+    """A multiple of q, uniform between the ends on a log scale."""
+
+    kind: ClassVar[str] = "qloguniform"
+    is_log: ClassVar[bool] = True
+    qloguniform: tuple[Number, Number, Number] = Field(
+        description="[low, high, q]: multiples of q, log scale."
+    )
+
+
+class RandInt(_Range):
+    """A whole number from the lower end up to but without the upper end."""
+
+    kind: ClassVar[str] = "randint"
+    is_whole: ClassVar[bool] = True
+    randint: tuple[WholeNumber, WholeNumber] = Field(description="[low, high): whole numbers, high left out.")
+
+
+class LogRandInt(_Range):
+    """As randint, on a log scale."""
+
+    kind: ClassVar[str] = "lograndint"
+    is_whole: ClassVar[bool] = True
+    is_log: ClassVar[bool] = True
+    lograndint: tuple[WholeNumber, WholeNumber] = Field(description="[low, high): whole numbers, log scale.")
+
+
+class QRandInt(_Range):
+    """A whole multiple of q between the ends, both included (with q = 1: as randint)."""
+
+    kind: ClassVar[str] = "qrandint"
+    is_whole: ClassVar[bool] = True
+    qrandint: tuple[WholeNumber, WholeNumber, WholeNumber] = Field(
+        description="[low, high, q]: multiples of q, ends included."
+    )
+
+
+class QLogRandInt(_Range):
+    """As qrandint, on a log scale."""
+
+    kind: ClassVar[str] = "qlograndint"
+    is_whole: ClassVar[bool] = True
+    is_log: ClassVar[bool] = True
+    qlograndint: tuple[WholeNumber, WholeNumber, WholeNumber] = Field(
+        description="[low, high, q]: multiples of q, ends included, log scale."
+    )
+
+
+_KINDS: dict[str, type[_Domain]] = {
+    domain.kind: domain
+    for domain in (
+        Grid, Choice, Uniform, LogUniform, QUniform, QLogUniform, RandInt, LogRandInt, QRandInt, QLogRandInt
+    )
+}  # fmt: skip
+DOMAIN_KINDS: tuple[str, ...] = tuple(_KINDS)
+
+
+def _kind_of(value: Any) -> str | None:
+    if isinstance(value, _Domain):
+        return value.kind
+    return next(iter(value)) if isinstance(value, Mapping) and len(value) == 1 else None
+
+
+def _check_shape(value: Any) -> Any:
+    """Refuse what is no domain at all with a message that shows how to write one."""
+    if isinstance(value, _Domain):
+        return value
+    if isinstance(value, list | tuple):
+        raise ValueError(  # noqa: TRY004 - as above
+            f"{value!r} is a bare list: write {{grid: {list(value)!r}}} to try each of its values"
+        )
+    if not isinstance(value, Mapping):
+        raise ValueError(  # noqa: TRY004 - as above
+            f"{value!r} is one value: fix it under hyperparams, or write a domain such as {{grid: [...]}}"
+        )
+    if len(value) != 1:
+        kinds = ", ".join(DOMAIN_KINDS)
+        raise ValueError(f"needs exactly one key, the kind of the domain ({kinds}), and has {len(value)}")
+    kind = next(iter(value))
+    if kind not in _KINDS:
+        close = difflib.get_close_matches(str(kind), DOMAIN_KINDS, n=1)
+        did_you_mean = f" Did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"there is no domain {kind!r} (there are {', '.join(DOMAIN_KINDS)}).{did_you_mean}")
+    return value
+
+
+Domain = Annotated[
+    Annotated[Grid, Tag("grid")]
+    | Annotated[Choice, Tag("choice")]
+    | Annotated[Uniform, Tag("uniform")]
+    | Annotated[LogUniform, Tag("loguniform")]
+    | Annotated[QUniform, Tag("quniform")]
+    | Annotated[QLogUniform, Tag("qloguniform")]
+    | Annotated[RandInt, Tag("randint")]
+    | Annotated[LogRandInt, Tag("lograndint")]
+    | Annotated[QRandInt, Tag("qrandint")]
+    | Annotated[QLogRandInt, Tag("qlograndint")],
+    Discriminator(_kind_of),
+    BeforeValidator(_check_shape),
+]
+"""Any domain, for use as the type of a pydantic field."""
+
+
+def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) -> list[dict[str, Any]]:
+    """Draw the points of a sweep: for each sample, one for each combination of the grids' values.
+
+    The random values of point i come from a generator of their own, so a point depends on the space, the
+    sweep seed and its own index alone: a larger `num_samples` appends points and changes none.
+
+    Args:
+        space: Domains by hyperparameter. Their order is the order of the grid (the last one varies fastest).
+        num_samples: How often the grid is gone through, each time with new random values.
+        sweep_seed: Seed of the sweep, at least 0.
+
+    Returns:
+        `num_samples` times the product of the grids' sizes points, each a dict in the order of the space.
+    """
+    grids = {name: domain.values for name, domain in space.items() if isinstance(domain, Grid)}
+    combinations = [dict(zip(grids, values, strict=True)) for values in itertools.product(*grids.values())]
+    points: list[dict[str, Any]] = []
+    for combination in combinations * num_samples:
+        sequence = np.random.SeedSequence(sweep_seed, spawn_key=(POINTS_SPAWN_KEY, len(points)))
+        rng = np.random.default_rng(sequence)
+        points.append(
+            {
+                name: combination[name] if name in combination else domain.sample(rng)
+                for name, domain in space.items()
+            }
+        )
+    return points
+
+
+def _index(end: float, q: float, *, up: bool) -> int:
+    """An end as a factor of q, rounded into the range; 0.3 is 3 times 0.1, not a little less."""
+    factor = end / q
+    if math.isclose(factor, round(factor)):
+        return round(factor)
+    return math.ceil(factor) if up else math.floor(factor)
+
+
+def _multiple(factor: int, q: float) -> float:
+    """`factor * q` without the binary dust of 3 * 0.1."""
+    return float(Decimal(repr(q)) * factor)
+
+
+def _draw_real(rng: np.random.Generator, low: float, high: float, *, log: bool) -> float:
+    if not log:
+        return float(rng.uniform(low, high))
+    value = math.exp(rng.uniform(math.log(low), math.log(high)))
+    return min(max(value, low), high)
+
+
+def _draw_whole(rng: np.random.Generator, first: int, last: int, *, log: bool) -> int:
+    if not log:
+        return int(rng.integers(first, last, endpoint=True))
+    return min(math.floor(_draw_real(rng, first, last + 1, log=True)), last)

@@ -1,0 +1,323 @@
+"""Reading a sweep file: YAML, presets, `--set`, and all that is wrong with them in one message."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+
+from policies.errors import SpecError
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.search_space import Domain
+from tune_jobs.spec import (
+    NAME_RULE,
+    Problem,
+    ProblemsError,
+    SweepSpec,
+    describe,
+    did_you_mean,
+    dotted,
+    hyperparam_problems,
+)
+
+_HINT = (
+    "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
+)
+
+
+class Preset(NamedTuple):
+    """A sweep file that ships with the package."""
+
+    name: str
+    description: str
+    text: str
+
+
+def list_presets() -> list[Preset]:
+    """The presets, by name; a preset's description is the comment its file begins with."""
+    folder = resources.files("tune_jobs").joinpath("presets")
+    presets = []
+    for file in folder.iterdir():
+        if file.name.endswith(".yaml"):
+            text = file.read_text(encoding="utf-8")
+            comment = re.match(r"(?:#.*\n)*", text)
+            lines = comment.group().splitlines() if comment else []
+            description = " ".join(line.lstrip("# ").rstrip() for line in lines).strip()
+            presets.append(Preset(file.name.removesuffix(".yaml"), description, text))
+    return sorted(presets)
+
+
+def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> SweepSpec:
+    """Read and validate a sweep.
+
+    Args:
+        source: Path of a sweep file, name of a preset, or the content of a sweep file as a mapping.
+        overrides: `a.b=value` assignments, as given to `--set`; the value is YAML. An empty value takes the
+            field out.
+
+    Returns:
+        The sweep, valid by itself.
+
+    Raises:
+        SpecError: No such file or preset, no YAML, or a wrong sweep; the message lists every problem.
+    """
+    label, data = _read(source)
+    set_paths = [_apply_override(data, override) for override in overrides]
+    try:
+        return SweepSpec.model_validate(data)
+    except ValidationError as error:
+        problems = _problems(error, data)
+    lines = [
+        f"{path}: {text}{' (from --set)' if _is_set(path, set_paths) else ''}" if path else text
+        for path, text in dict.fromkeys(problems)
+    ]
+    if len(lines) == 1:
+        raise SpecError(f"{label}: {lines[0]}", _HINT)
+    raise SpecError(f"{label}: {len(lines)} problems:\n" + "\n".join(f"  {line}" for line in lines), _HINT)
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the sweep file, for editors: all fields, and the hyperparameters of each algorithm."""
+    schema = SweepSpec.model_json_schema(mode="validation")
+    definitions: dict[str, Any] = schema["$defs"]
+    domain_schema = TypeAdapter(Domain).json_schema(ref_template="#/$defs/{model}")
+    definitions |= domain_schema.pop("$defs")
+    definitions["Domain"] = domain_schema
+    rules = []
+    for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items():
+        fixed = model.model_json_schema(ref_template="#/$defs/{model}")
+        definitions[model.__name__] = fixed
+        searched = {
+            name: {"$ref": "#/$defs/Domain", "description": field.get("description", "")}
+            for name, field in fixed["properties"].items()
+        }
+        then = {
+            "hyperparams": {"anyOf": [{"$ref": f"#/$defs/{model.__name__}"}, {"type": "null"}]},
+            "space": {"type": ["object", "null"], "properties": searched, "additionalProperties": False},
+        }
+        condition = {"properties": {"algorithm": {"const": algorithm}}, "required": ["algorithm"]}
+        rules.append({"if": condition, "then": {"properties": then}})
+    properties = schema["properties"]
+    properties["hyperparams"] = {"description": properties["hyperparams"]["description"]}
+    properties["space"] = {"description": properties["space"]["description"]}
+    for section in ("env", "scheduler"):
+        # These may also be written as one text.
+        properties[section] = {
+            "anyOf": [{"type": "string"}, {"$ref": properties[section]["$ref"]}],
+            "description": properties[section]["description"],
+        }
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "tune-jobs sweep"} | {
+        **schema,
+        "title": "tune-jobs sweep file",
+        "allOf": rules,
+    }
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML as people mean it: 1e-4 is a number, dates are texts, a key may stand only once."""
+
+    def construct_mapping(
+        self,
+        node: yaml.MappingNode,
+        deep: bool = False,  # noqa: FBT001, FBT002 - PyYAML's signature
+    ) -> dict[Any, Any]:
+        """Refuse keys that stand twice; PyYAML would silently take the last."""
+        seen: set[str] = set()
+        for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            if key_node.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key_node.value!r} stands twice", key_node.start_mark
+                )
+            seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+# YAML 1.1, which PyYAML reads, wants a dot and a signed exponent in floats: it takes 1e-4 for a text.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
+)
+
+
+def _parse_yaml(text: str, label: str) -> Any:
+    try:
+        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a subclass of SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise SpecError(f"{label}{place}: {error.problem}", "Correct the YAML there.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise SpecError(f"{label}: this is no YAML: {error}", "Correct the YAML.") from error
+
+
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """What a source is called in messages, and its content as plain JSON-like data."""
+    if isinstance(source, Mapping):
+        label, data = "sweep", source
+    else:
+        label, text = _read_text(source)
+        data = _parse_yaml(text, label)
+    if not isinstance(data, Mapping):
+        kind = "is empty" if data is None else f"holds a {type(data).__name__}"
+        raise SpecError(f"{label}: {kind}, not the fields of a sweep", _HINT)
+    try:
+        # One pass through JSON makes a copy that holds nothing JSON can't, as the sweep folder is to hold it
+        # as JSON.
+        plain = json.loads(json.dumps(data, default=_to_plain))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise SpecError(f"{label}: holds a value that JSON can't hold: {error}", _HINT) from error
+    return label, plain
+
+
+def _to_plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    raise TypeError(f"{value!r} is a {type(value).__name__}")
+
+
+def _read_text(source: str | Path) -> tuple[str, str]:
+    path = Path(source)
+    if not path.is_file():
+        presets = {preset.name: preset for preset in list_presets()}
+        if str(source) in presets:
+            return f"preset {source}", presets[str(source)].text
+        if path.is_dir():
+            raise SpecError(f"{source} is a folder, not a sweep file", "Name the .yaml file, or a preset.")
+        suggestion = did_you_mean(str(source), presets)
+        raise SpecError(
+            f"There is no sweep file {str(source)!r} and no preset of that name.{suggestion}",
+            f"Name a .yaml file, or one of the presets: {', '.join(presets)}.",
+        )
+    try:
+        return path.name, path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: can't be read: {error}", "Name a text file that you may read.") from error
+
+
+def _apply_override(data: dict[str, Any], override: str) -> str:
+    """Set one field in place; returns its dotted path."""
+    path, equals, text = override.partition("=")
+    path = path.strip()
+    if not equals or not all(path.split(".")):
+        raise SpecError(
+            f"--set {override}: this is no assignment",
+            "Write --set a.b=value, such as --set stop.num_env_steps=50000.",
+        )
+    *parents, last = path.split(".")
+    section = data
+    for index, parent in enumerate(parents):
+        child = section.get(parent)
+        if child is None or (isinstance(child, str) and parent in ("env", "scheduler") and index == 0):
+            # `env: CartPole-v1` is short for a mapping, which --set env.args... has to go into.
+            child = {} if child is None else {{"env": "id", "scheduler": "type"}[parent]: child}
+            section[parent] = child
+        if not isinstance(child, dict):
+            here = ".".join(parents[: index + 1])
+            raise SpecError(
+                f"--set {override}: {here} is {child!r}, which has no fields", f"Set {here} itself."
+            )
+        section = child
+    if text.strip():
+        section[last] = json.loads(json.dumps(_parse_yaml(text, f"--set {override}"), default=str))
+    else:
+        section.pop(last, None)
+    return path
+
+
+def _is_set(path: str, set_paths: Sequence[str]) -> bool:
+    """Whether a problem's path lies at or below a path that --set gave."""
+    return any(re.match(rf"{re.escape(given)}(?:$|[.\[])", path) for given in set_paths)
+
+
+def _problems(error: ValidationError, data: Mapping[str, Any]) -> list[Problem]:
+    details = error.errors(include_url=False)
+    problems = [problem for detail in details for problem in _from_detail(detail, data)]
+    if not any(isinstance(detail.get("ctx", {}).get("error"), ProblemsError) for detail in details):
+        # A wrong field kept pydantic from running the checks that look at the whole: run them on what is
+        # right.
+        problems += _hyperparam_problems(data)
+    return problems
+
+
+def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
+    algorithm, fixed, space = data.get("algorithm"), data.get("hyperparams"), data.get("space")
+    if algorithm not in HYPERPARAMS_BY_ALGORITHM:
+        return []
+    adapter: TypeAdapter[Any] = TypeAdapter(Domain)
+    domains = {}
+    for name, value in space.items() if isinstance(space, Mapping) else ():
+        try:
+            domains[name] = adapter.validate_python(value)
+        except ValidationError:
+            continue  # already among the problems; only its name is left to check
+    known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    unknown = {name: None for name in space if name not in known} if isinstance(space, Mapping) else {}
+    problems = hyperparam_problems(algorithm, fixed if isinstance(fixed, Mapping) else {}, domains)
+    unseen = hyperparam_problems(algorithm, {name: None for name in unknown if name not in domains}, {})
+    return problems + [Problem(path.replace("hyperparams.", "space.", 1), text) for path, text in unseen]
+
+
+def _from_detail(detail: ErrorDetails, data: Mapping[str, Any]) -> list[Problem]:
+    location = _without_tags(detail["loc"])
+    path = dotted(location)
+    inner = detail.get("ctx", {}).get("error")
+    if isinstance(inner, ProblemsError):
+        return inner.problems
+    if detail["type"] == "extra_forbidden":
+        return [Problem(path, _unknown_key(location))]
+    if detail["type"] == "missing":
+        options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
+        return [Problem(path, f"is missing{f': give {options}' if options else ''}")]
+    if detail["type"] == "string_pattern_mismatch" and path == "name":
+        text = f"{data.get('name')!r} is not allowed: use {NAME_RULE}"
+        return [Problem(path, text)]
+    return [Problem(path, describe(detail["msg"], detail["input"]))]
+
+
+def _without_tags(location: Iterable[int | str]) -> list[int | str]:
+    """Pydantic names the kind of a domain twice, as the union's member and as its field."""
+    parts: list[int | str] = []
+    for part in location:
+        if not (parts and part == parts[-1] and parts[0] == "space" and len(parts) == 3):
+            parts.append(part)
+    return parts
+
+
+def _unknown_key(location: Sequence[int | str]) -> str:
+    *parents, name = [str(part) for part in location]
+    model: Any = SweepSpec
+    for parent in parents:
+        model = model.model_fields[parent].annotation
+    suggestion = did_you_mean(name, model.model_fields)
+    if not suggestion:
+        suggestion = did_you_mean_path(name)
+    listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
+    return f"there is no field {name!r} here.{suggestion}{listed}"
+
+
+def did_you_mean_path(name: str) -> str:
+    """A hint for a field that exists, but in another section."""
+    places = [
+        f"{section}.{name}"
+        for section, field in SweepSpec.model_fields.items()
+        if isinstance(field.annotation, type)
+        and issubclass(field.annotation, BaseModel)
+        and name in field.annotation.model_fields
+    ]
+    if any(name in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values()):
+        places += [f"hyperparams.{name}", f"space.{name}"]
+    return f" Did you mean {' or '.join(places)}?" if places else ""

@@ -1,0 +1,250 @@
+"""One trial from start to end, whichever engine trains it: stop rules, evaluation, checkpoints, results.
+
+A trial's state is on disk alone (its checkpoints and results.jsonl), so a trial that is opened again, after a kill, on
+another node, in another process, goes on from its latest checkpoint.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
+from policies.evaluate import Evaluator, NonFiniteWeightsError
+from policies.policy import NetworkPolicy
+from policies.portable import save_policy
+from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
+from tune_jobs.store import SweepStore, verify_checkpoint
+
+TRAINING_RETURN_EPISODES = 100
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a trial stands; what its process tells the one that drives the sweep."""
+
+    iteration: int
+    num_env_steps: int
+    num_episodes: int
+    time_s: float
+    training_return: float | None
+    evaluation_return: float | None
+    best_evaluation_return: float | None
+    best_iteration: int | None
+    evaluated: bool
+    """Whether `evaluation_return` is of this very iteration."""
+    status: str
+    """running, paused (asked to stop), completed or failed."""
+    stop_reason: str | None = None
+    error: str | None = None
+
+
+class TrialLoop:
+    """Runs one trial.
+
+    Args:
+        task: What to run.
+        engine: Trains it; reused between trials.
+        evaluator: Runs the greedy episodes on the sweep's evaluation seeds; reused between trials.
+        clock: Seconds, monotonic.
+    """
+
+    def __init__(
+        self,
+        task: TrialTask,
+        engine: TrainingEngine,
+        evaluator: Evaluator,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.task = task
+        self._engine = engine
+        self._evaluator = evaluator
+        self._clock = clock
+        self._sweep = SweepStore(task.sweep_folder)
+        self._store = self._sweep.trial(task.trial_id)
+        self._window: deque[float] = deque(maxlen=TRAINING_RETURN_EPISODES)
+        self._last = IterationRecord(iteration=0, num_env_steps=0, num_episodes=0, time_s=0.0)
+        self._evaluation_return: float | None = None
+        self._checkpoints: list[CheckpointRecord] = []
+        self._best: CheckpointRecord | None = None
+        self._unwritten: list[IterationRecord] = []
+        self._started = 0.0
+
+    @property
+    def iteration(self) -> int:
+        """Iterations done."""
+        return self._last.iteration
+
+    def open(self) -> None:
+        """Build the trial: from its latest checkpoint if it has one, else from its seed.
+
+        Raises:
+            CheckpointError: The latest checkpoint is damaged or cannot be restored.
+        """
+        self._store.folder.mkdir(parents=True, exist_ok=True)
+        self._store.remove_leftovers()
+        self._checkpoints = self._store.checkpoints()
+        latest = self._checkpoints[-1] if self._checkpoints else None
+        known = self._store.read_iterations() if latest is not None else []
+        # What was done after the checkpoint is done again, so its results must not stay.
+        kept = [record for record in known if latest is not None and record.iteration <= latest.iteration]
+        self._store.keep_iterations(kept)
+        for record in kept:
+            self._window.extend(record.episode_returns)
+            if record.evaluation_return is not None:
+                self._evaluation_return = record.evaluation_return
+        if kept:
+            self._last = kept[-1]
+        self._best = _best_of(self._checkpoints)
+        folder: Path | None = None
+        if latest is not None:
+            folder = self.task.sweep_folder / latest.path
+            verify_checkpoint(folder)
+        self._engine.build(self.task, folder)
+        self._started = self._clock() - self._last.time_s
+
+    def advance(self, max_s: float) -> Progress:
+        """Train until the next evaluation, the end, or for max_s seconds, whichever comes first.
+
+        Raises:
+            Exception: Whatever the engine or the environment raises.
+        """
+        deadline = self._clock() + max_s
+        try:
+            while True:
+                progress = self._one_iteration()
+                if progress.status != "running" or progress.evaluated or self._clock() >= deadline:
+                    return progress
+        finally:
+            self._store.append_iterations(self._unwritten)
+            self._unwritten = []
+
+    def pause(self) -> None:
+        """Save a checkpoint of this very iteration, so that the trial can go on elsewhere."""
+        if self.iteration and not (self._checkpoints and self._checkpoints[-1].iteration == self.iteration):
+            self._checkpoint(self._last.evaluation_return)
+
+    def _one_iteration(self) -> Progress:
+        # A trial that was opened at its end (its process was killed after the last checkpoint) is done already.
+        reason = self._stop_reason(self._last, self._last.evaluation_return)
+        if reason is not None and self._last.evaluation_return is not None:
+            return self._progress("completed", evaluated=True, reason=reason)
+        if self._sweep.stop_requested():
+            self.pause()
+            return self._progress("paused", evaluated=False)
+        record = self._record(self._engine.train_iteration())
+        every = self.task.evaluation.every_iterations
+        evaluated = record.iteration % every == 0
+        reason = self._stop_reason(record, None)
+        if evaluated or reason is not None:
+            try:
+                record = record.model_copy(update={"evaluation_return": self._evaluate()})
+            except NonFiniteWeightsError as error:
+                # Its later iterations would only repeat it, and a retry too: the trial is over.
+                self._last = record
+                self._unwritten.append(record)
+                return self._progress("failed", evaluated=False, error=f"{error} (iteration {record.iteration})")
+            evaluated = True
+            self._evaluation_return = record.evaluation_return
+            reason = reason or self._stop_reason(record, record.evaluation_return)
+        self._last = record.model_copy(update={"time_s": self._clock() - self._started})
+        self._unwritten.append(self._last)
+        score = record.evaluation_return
+        improved = score is not None and (self._best is None or score > (self._best.evaluation_return or score - 1))
+        if improved or reason is not None or record.iteration % self.task.checkpoints.every_iterations == 0:
+            self._checkpoint(score)
+        status = "running" if reason is None else "completed"
+        return self._progress(status, evaluated=evaluated, reason=reason)
+
+    def _record(self, stats: IterationStats) -> IterationRecord:
+        returns = tuple(episode_return for episode_return, _ in stats.episodes)
+        self._window.extend(returns)
+        return IterationRecord(
+            iteration=self._last.iteration + 1,
+            num_env_steps=stats.num_env_steps,
+            num_episodes=self._last.num_episodes + len(returns),
+            time_s=self._clock() - self._started,
+            training_return=sum(self._window) / len(self._window) if self._window else None,
+            episode_returns=returns,
+            episode_lengths=tuple(length for _, length in stats.episodes),
+            learner=dict(stats.learner),
+        )
+
+    def _evaluate(self) -> float | None:
+        episodes = self._evaluator.run(NetworkPolicy(self._engine.policy()))
+        return finite_or_none(sum(episodes.returns) / len(episodes.returns))
+
+    def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
+        stop = self.task.stop
+        full_window = len(self._window) == TRAINING_RETURN_EPISODES
+        if stop.training_return is not None and full_window and record.training_return is not None:
+            # Over fewer than 100 episodes a lucky start would count as solved.
+            if record.training_return >= stop.training_return:
+                return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
+        if stop.evaluation_return is not None and evaluation_return is not None:
+            if evaluation_return >= stop.evaluation_return:
+                return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
+        if record.num_env_steps >= stop.num_env_steps:
+            return f"num_env_steps {record.num_env_steps} >= {stop.num_env_steps}"
+        if record.iteration >= stop.num_iterations:
+            return f"num_iterations {record.iteration} >= {stop.num_iterations}"
+        if record.time_s >= stop.time_s:
+            return f"time_s {record.time_s:.0f} >= {stop.time_s:g}"
+        return None
+
+    def _checkpoint(self, score: float | None) -> None:
+        record = CheckpointRecord(
+            trial_id=self.task.trial_id,
+            iteration=self._last.iteration,
+            num_env_steps=self._last.num_env_steps,
+            path=self._store.checkpoint_path(self._last.iteration),
+            training_return=self._last.training_return,
+            evaluation_return=score,
+        )
+        # The results first: a checkpoint whose iterations are not in results.jsonl would leave a hole in the curve.
+        self._store.append_iterations(self._unwritten)
+        self._unwritten = []
+
+        def write(folder: Path) -> None:
+            self._engine.save(folder)
+            save_policy(self._engine.policy(), folder)
+
+        self._store.write_checkpoint(record, write)
+        self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]
+        self._best = _best_of(self._checkpoints)
+        self._prune()
+
+    def _prune(self) -> None:
+        """Keep the newest so many, the latest and the best."""
+        newest = self._checkpoints[-max(1, self.task.checkpoints.keep) :]
+        for record in list(self._checkpoints):
+            if record not in newest and record != self._best:
+                self._store.delete_checkpoint(record)
+                self._checkpoints.remove(record)
+
+    def _progress(
+        self, status: str, *, evaluated: bool, reason: str | None = None, error: str | None = None
+    ) -> Progress:
+        return Progress(
+            iteration=self._last.iteration,
+            num_env_steps=self._last.num_env_steps,
+            num_episodes=self._last.num_episodes,
+            time_s=self._last.time_s,
+            training_return=self._last.training_return,
+            evaluation_return=self._evaluation_return,
+            best_evaluation_return=self._best.evaluation_return if self._best else None,
+            best_iteration=self._best.iteration if self._best else None,
+            evaluated=evaluated,
+            status=status,
+            stop_reason=reason,
+            error=error,
+        )
+
+
+def _best_of(checkpoints: list[CheckpointRecord]) -> CheckpointRecord | None:
+    """The checkpoint with the highest evaluation return; the earliest of equals."""
+    scored = [record for record in checkpoints if record.evaluation_return is not None]
+    return max(scored, key=lambda record: (record.evaluation_return or 0.0, -record.iteration), default=None)
