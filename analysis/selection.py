@@ -1,8 +1,8 @@
 """The one place that decides which checkpoint of a sweep is "best".
 
 Words: a *usable* trial did not fail and keeps at least one checkpoint with a finite evaluation return; its
-*score* is the highest of them. The score of a *point* is the mean score of its usable trials, one a seed. A point
-is *complete* when every one of its seeds is usable.
+*score* is the highest of them. The score of a *point* is the mean score of its usable trials, one a seed. A
+point is *complete* when every one of its seeds is usable.
 
 The rule, in order:
 

@@ -236,8 +236,7 @@ def _check_limit(env_id: str, limit: Any) -> None:
 
 def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
     """Whether the env has a vectorised version that accepts these arguments and the env's time limit."""
-    # Wrappers of the registry entry would be left out by a vector entry point; so would a limit it does not
-    # take.
+    # A vector entry point would leave out wrappers of the registry entry, and a time limit it does not take.
     if spec.vector_entry_point is None or spec.additional_wrappers:
         return False
     kwargs = {**spec.kwargs, **env_args}
@@ -290,15 +289,13 @@ def _check_observation_space(info: EnvInfo) -> None:
     if not isinstance(space, gym.spaces.Box):
         raise EnvError(
             f"{info.env_id} has observations of kind {type(space).__name__} ({space}); only 1-D Box "
-            "observations are "
-            "supported.",
+            "observations are supported.",
             "Choose an env whose observations are a vector of numbers, such as 'CartPole-v1'.",
         )
     if len(space.shape) != 1 or space.shape[0] == 0:
         raise EnvError(
             f"{info.env_id} has observations of shape {space.shape}; only 1-D Box observations, of shape "
-            "(n,), are "
-            "supported.",
+            "(n,), are supported.",
             "Choose an env whose observations are a vector of numbers; images need a convolutional network.",
         )
     if not np.issubdtype(space.dtype, np.floating):
@@ -316,8 +313,7 @@ def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
     if not isinstance(space, gym.spaces.Box):
         raise EnvError(
             f"{info.env_id} has actions of kind {type(space).__name__} ({space}); only Discrete and 1-D Box "
-            "actions "
-            "are supported.",
+            "actions are supported.",
             "Choose an env with Discrete or 1-D Box actions.",
         )
     if algorithm == "dqn":
@@ -329,7 +325,6 @@ def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
     if len(space.shape) != 1 or space.shape[0] == 0 or not np.issubdtype(space.dtype, np.floating):
         raise EnvError(
             f"{info.env_id} has actions of shape {space.shape} and dtype {space.dtype}; only floating-point "
-            "Box actions "
-            "of shape (n,) are supported.",
+            "Box actions of shape (n,) are supported.",
             "Choose an env with Discrete or 1-D floating-point Box actions.",
         )

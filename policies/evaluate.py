@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, cast, runtime_checkable
 
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.envs import make_env, make_vector_env
-from policies.errors import EnvError
+from policies.errors import EnvError, SpecError
 from policies.policy import NetworkPolicy, Policy
 
 MAX_EPISODE_STEPS = 10_000
@@ -64,7 +64,8 @@ class Evaluator:
             none.
 
     Raises:
-        EnvError: The environment cannot be made, or a seed or the cap is out of range.
+        EnvError: The environment cannot be made.
+        SpecError: There are no seeds, or one of them or the cap is out of range.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class Evaluator:
             actions = cast("NDArray[Any]", policy.act(np.stack([episode.observation for episode in running])))
             for episode, action in zip(running, actions, strict=True):
                 if episode.step(action) or episode.length >= self.max_episode_steps:
-                    results[episode.index] = (math.fsum(episode.rewards), episode.length)
+                    results[episode.index] = (episode.total, episode.length)
             ended = [episode for episode in running if episode.index in results]
             running = [episode for episode in running if episode.index not in results]
             running += [_Running(episode.env, *waiting.popleft()) for episode in ended if waiting]
@@ -158,25 +159,29 @@ def evaluate_policy(
 
 
 def play_episode(
-    policy: Policy,
-    env: gym.Env[Any, Any],
-    seed: int,
-    *,
-    max_episode_steps: int,
-    on_step: Callable[[int, float], None] | None = None,
+    policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int
 ) -> tuple[float, int]:
-    """One greedy episode in one environment.
+    """One greedy episode in one environment: its return and its env steps.
+
+    Args and errors are those of `episode_steps`.
+    """
+    *_, (length, total, _) = episode_steps(policy, env, seed, max_episode_steps=max_episode_steps)
+    return total, length
+
+
+def episode_steps(
+    policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int
+) -> Iterator[tuple[int, float, bool]]:
+    """One greedy episode in one environment, step by step.
 
     Args:
         policy: What acts; reset from the seed if it can be.
         env: Where; it is not closed.
         seed: Of the env's reset.
         max_episode_steps: Cap on its env steps.
-        on_step: Called after the reset with (0, 0.0) and after each step with the env steps and the return so
-            far.
 
-    Returns:
-        Its return and its env steps.
+    Yields:
+        After the reset and after each step: env steps so far, return so far, whether the episode is over.
 
     Raises:
         EnvError: The env raised an error.
@@ -184,14 +189,11 @@ def play_episode(
     if isinstance(policy, Resettable):
         policy.reset(seed)
     episode = _Running(env, 0, seed)
-    ended = False
-    if on_step is not None:
-        on_step(0, 0.0)
-    while not ended and episode.length < max_episode_steps:
-        ended = episode.step(policy.act(episode.observation))
-        if on_step is not None:
-            on_step(episode.length, math.fsum(episode.rewards))
-    return math.fsum(episode.rewards), episode.length
+    over = False
+    yield 0, 0.0, over
+    while not over:
+        over = episode.step(policy.act(episode.observation)) or episode.length >= max_episode_steps
+        yield episode.length, episode.total, over
 
 
 def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
@@ -224,13 +226,13 @@ def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
     """The seeds as ints.
 
     Raises:
-        EnvError: There are none, or one is negative.
+        SpecError: There are none, or one is negative.
     """
     result = tuple(int(seed) for seed in seeds)
     if not result:
-        raise EnvError("There are no seeds to evaluate on.", "Ask for at least one episode.")
+        raise SpecError("There are no seeds to evaluate on.", "Ask for at least one episode.")
     if min(result) < 0:
-        raise EnvError(f"The seed {min(result)} is negative.", "Use seeds of 0 or more.")
+        raise SpecError(f"The seed {min(result)} is negative.", "Use seeds of 0 or more.")
     return result
 
 
@@ -238,7 +240,7 @@ def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
     """Env steps after which an episode is cut off.
 
     Raises:
-        EnvError: The given cap is below 1.
+        SpecError: The given cap is below 1.
     """
     if max_episode_steps is None:
         limit = None if env.spec is None else env.spec.max_episode_steps
@@ -256,7 +258,7 @@ class _Running:
     def __init__(self, env: gym.Env[Any, Any], index: int, seed: int) -> None:
         self.env, self.index, self.seed = env, index, seed
         self.length = 0
-        self.rewards: list[float] = []
+        self.total = 0.0
         try:
             self.observation, _ = env.reset(seed=seed)
         except Exception as error:  # an env may raise anything
@@ -271,7 +273,7 @@ class _Running:
             self.observation, reward, terminated, truncated, _ = self.env.step(action)
         except Exception as error:  # an env may raise anything
             raise self._env_failed("step", error) from error
-        self.rewards.append(float(reward))
+        self.total += float(reward)
         self.length += 1
         return bool(terminated or truncated)
 

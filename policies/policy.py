@@ -88,9 +88,8 @@ class Policy(ABC):
         single = batch.ndim == len(shape)
         if batch.shape[-len(shape) :] != shape or batch.ndim > len(shape) + 1:
             raise ObservationError(
-                f"The observations are of shape {batch.shape}; this policy ({self.env_id}) takes {shape}, "
-                "or a batch of "
-                f"shape {('num', *shape)}.".replace("'", ""),
+                f"The observations are of shape {batch.shape}; this policy ({self.env_id}) takes one of "
+                f"shape {shape}, or a batch of them.",
                 "Pass what env.reset or env.step returned.",
             )
         actions = self._act_batch(batch[None] if single else batch)
@@ -294,21 +293,21 @@ def _tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _silu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    # x * sigmoid(x). For very negative x the exponential overflows to infinity and the quotient is the right
-    # limit, -0.
+    # x * sigmoid(x). For very negative x the exponential overflows, and the quotient is the right limit, -0.
     with np.errstate(over="ignore"):
-        return x / (np.float32(1.0) + np.exp(-x))
+        return np.asarray(x / (np.float32(1.0) + np.exp(-x)), dtype=np.float32)
 
 
 def _elu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.where(x > 0, x, np.expm1(np.minimum(x, np.float32(0.0))))
+    negative = np.expm1(np.minimum(x, np.float32(0.0)))
+    return np.asarray(np.where(x > 0, x, negative), dtype=np.float32)
 
 
 def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:
     # The exact form, torch's default: x times the normal distribution function.
     # math.erf number by number costs a few times the product of the layer; only SciPy has a faster one.
     cumulative = 0.5 * (1.0 + _erf(x / math.sqrt(2.0)).astype(np.float64))
-    return (x * cumulative).astype(np.float32)
+    return np.asarray(x * cumulative, dtype=np.float32)
 
 
 _erf = np.frompyfunc(math.erf, 1, 1)

@@ -66,14 +66,13 @@ def build_algorithm_config(
         )
         .learners(num_learners=0, num_gpus_per_learner=num_gpus)
         .rl_module(model_config=model_config(hyperparams))
-        # The monitor thread it starts takes 0.5 s to join at every `stop()`.
-        .reporting(log_sys_usage=False)
         # A greedy evaluation of our own, on fixed seeds, takes the place of RLlib's.
         .evaluation(evaluation_interval=None)
         # An environment that raises ends the trial with its error; RLlib's own restarts have no cap. An env runner
         # that dies is an error too: PPO would go on without it, or without any, and not say so.
         .fault_tolerance(restart_failed_env_runners=False, restart_failed_sub_environments=False)
-        .debugging(seed=seed, log_level="WARN")
+        # log_sys_usage starts a thread that takes 0.5 s to join at every `stop()`.
+        .debugging(seed=seed, log_level="WARN", log_sys_usage=False)
     )
 
 

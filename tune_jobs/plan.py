@@ -181,7 +181,8 @@ def _point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: i
     if num_streams > SEEDS_PER_TRIAL:
         raise SpecError(
             f"The values of {place} make {num_streams} sub-environments (num_envs {values.num_envs}, "
-            f"resources.num_env_runners {spec.resources.num_env_runners}); a trial has {SEEDS_PER_TRIAL} seeds.",
+            f"resources.num_env_runners {spec.resources.num_env_runners}), more than the {SEEDS_PER_TRIAL} "
+            "that a trial has seeds for.",
             "Lower num_envs or resources.num_env_runners.",
         )
     return values

@@ -221,8 +221,8 @@ def _section_problems(spec: SweepSpec) -> list[Problem]:
     needed = 1 + resources.num_env_runners
     if resources.num_cpus is not None and resources.num_cpus < needed:
         text = (
-            f"{resources.num_cpus} is fewer than the {needed} that a trial with {resources.num_env_runners} env "
-            "runners needs; leave it out to get just those"
+            f"{resources.num_cpus} is fewer than the {needed} that a trial with "
+            f"{resources.num_env_runners} env runners needs; leave it out to get just those"
         )
         problems.append(Problem("resources.num_cpus", text))
     if resources.num_gpus > 1 and not resources.num_gpus.is_integer():

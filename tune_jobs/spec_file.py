@@ -54,6 +54,21 @@ def list_presets() -> list[Preset]:
     return sorted(presets)
 
 
+def find_preset(name: str) -> Preset:
+    """The preset of a name.
+
+    Raises:
+        SpecError: There is none; the message names the nearest.
+    """
+    presets = {preset.name: preset for preset in list_presets()}
+    if name not in presets:
+        raise SpecError(
+            f"There is no preset {name!r}.{did_you_mean(name, presets)}",
+            f"The presets are: {', '.join(presets)}.",
+        )
+    return presets[name]
+
+
 def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> SweepSpec:
     """Read and validate a sweep.
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
-from policies.evaluate import Evaluator, NonFiniteWeightsError
-from policies.policy import NetworkPolicy
+from policies.evaluate import Evaluator
+from policies.policy import NetworkPolicy, NonFiniteWeightsError
 from policies.portable import save_policy
 from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
 from tune_jobs.store import SweepStore, verify_checkpoint
@@ -40,6 +40,11 @@ class Progress:
     """running, paused (asked to stop), completed or failed."""
     stop_reason: str | None = None
     error: str | None = None
+    checkpoints: tuple[CheckpointRecord, ...] = ()
+    started_at: float | None = None
+    """Unix time at which the first iteration here began, seconds."""
+    ended_at: float | None = None
+    """Unix time at which the trial ended or paused; None while it runs."""
 
 
 class TrialLoop:
@@ -72,6 +77,7 @@ class TrialLoop:
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
         self._started = 0.0
+        self._started_at: float | None = None
 
     @property
     def iteration(self) -> int:
@@ -105,6 +111,7 @@ class TrialLoop:
             verify_checkpoint(folder)
         self._engine.build(self.task, folder)
         self._started = self._clock() - self._last.time_s
+        self._started_at = time.time()
 
     def advance(self, max_s: float) -> Progress:
         """Train until the next evaluation, the end, or for max_s seconds, whichever comes first.
@@ -153,8 +160,7 @@ class TrialLoop:
         self._last = record.model_copy(update={"time_s": self._clock() - self._started})
         self._unwritten.append(self._last)
         score = record.evaluation_return
-        improved = score is not None and (self._best is None or score > (self._best.evaluation_return or score - 1))
-        if improved or reason is not None or record.iteration % self.task.checkpoints.every_iterations == 0:
+        if self._improves(score) or reason is not None or record.iteration % self.task.checkpoints.every_iterations == 0:
             self._checkpoint(score)
         status = "running" if reason is None else "completed"
         return self._progress(status, evaluated=evaluated, reason=reason)
@@ -194,6 +200,12 @@ class TrialLoop:
         if record.time_s >= stop.time_s:
             return f"time_s {record.time_s:.0f} >= {stop.time_s:g}"
         return None
+
+    def _improves(self, score: float | None) -> bool:
+        if score is None:
+            return False
+        best = self._best.evaluation_return if self._best is not None else None
+        return best is None or score > best
 
     def _checkpoint(self, score: float | None) -> None:
         record = CheckpointRecord(
@@ -241,10 +253,18 @@ class TrialLoop:
             status=status,
             stop_reason=reason,
             error=error,
+            checkpoints=tuple(self._checkpoints),
+            started_at=self._started_at,
+            ended_at=None if status == "running" else time.time(),
         )
 
 
 def _best_of(checkpoints: list[CheckpointRecord]) -> CheckpointRecord | None:
     """The checkpoint with the highest evaluation return; the earliest of equals."""
     scored = [record for record in checkpoints if record.evaluation_return is not None]
-    return max(scored, key=lambda record: (record.evaluation_return or 0.0, -record.iteration), default=None)
+    return max(scored, key=_score_and_age, default=None)
+
+
+def _score_and_age(record: CheckpointRecord) -> tuple[float, int]:
+    assert record.evaluation_return is not None
+    return record.evaluation_return, -record.iteration

@@ -120,6 +120,7 @@ def test_a_lost_seed_does_not_flatter_its_point(lost):
     assert best.trial.index == 3
     assert [point.complete for point in best.ranking] == [True, False]
     assert [point.num_seeds for point in best.ranking] == [2, 2]
+    assert [point.score for point in best.ranking] == [75.0, 200.0]
 
 
 def test_incomplete_points_win_where_no_point_is_complete():

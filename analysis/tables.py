@@ -1,0 +1,189 @@
+"""Trials and iterations as pandas DataFrames and CSV files.
+
+One row is one trial or one iteration of a trial. Units stand in the column names; returns are undiscounted
+and in reward units. A value that is not known is missing (NaN, an empty CSV cell), never 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis.records import IterationRecord, TrialRecord
+from analysis.selection import error_summary, score_trial
+from policies.files import write_atomic
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SOLVED_OVER_NUM_EPISODES = 100
+"""Gymnasium's reward thresholds are means over this many consecutive episodes."""
+
+
+_AFTER_POINT = [
+    "seed",
+    "score",
+    "score_num_env_steps",
+    "training_return",
+    "evaluation_return",
+    "num_env_steps_to_solve",
+    "num_iterations",
+    "num_env_steps",
+    "num_episodes",
+    "time_s",
+    "stop_reason",
+    "num_failures",
+    "error",
+]
+
+
+def format_value(value: Any) -> Any:
+    """A sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text."""
+    if isinstance(value, list | tuple):
+        return "x".join(str(item) for item in value)
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def point_names(trials: Sequence[TrialRecord]) -> list[str]:
+    """Names of the searched hyperparameters, in the order of the sweep file."""
+    return list(dict.fromkeys(name for trial in trials for name in trial.point))
+
+
+def env_steps_to(
+    threshold: float | None,
+    iterations: Sequence[IterationRecord],
+    num_episodes: int = SOLVED_OVER_NUM_EPISODES,
+) -> int | None:
+    """Env steps until the training return first reached a threshold; None if it never did.
+
+    Args:
+        threshold: Mean episode return to reach; None: there is nothing to reach.
+        iterations: Of one trial, oldest first.
+        num_episodes: Whole episodes that must stand behind the mean.
+    """
+    if threshold is None:
+        return None
+    for item in iterations:
+        value = item.training_return
+        if item.num_episodes >= num_episodes and value is not None and value >= threshold:
+            return item.num_env_steps
+    return None
+
+
+def trials_frame(
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]] | None = None,
+    *,
+    threshold: float | None = None,
+) -> pd.DataFrame:
+    """One row a trial, in order of index.
+
+    Columns: trial_id, status, one for each searched hyperparameter, seed, score (what the selection goes by;
+    missing if the trial cannot win), score_num_env_steps (when it was reached), training_return,
+    evaluation_return (the newest), num_env_steps_to_solve (see `env_steps_to`; all missing without results
+    and a threshold), num_iterations, num_env_steps, num_episodes, time_s, stop_reason, num_failures, error
+    (its first line).
+    """
+    import pandas as pd
+
+    names = point_names(trials)
+    rows = []
+    for trial in sorted(trials, key=lambda item: item.index):
+        best = score_trial(trial)
+        rows.append(
+            {
+                "trial_id": trial.trial_id,
+                "status": trial.status,
+                **{name: format_value(trial.point.get(name)) for name in names},
+                "seed": trial.seed,
+                "score": best.score if best is not None else None,
+                "score_num_env_steps": best.checkpoint.num_env_steps if best is not None else None,
+                "training_return": trial.training_return,
+                "evaluation_return": trial.evaluation_return,
+                "num_env_steps_to_solve": env_steps_to(threshold, (results or {}).get(trial.trial_id, ())),
+                "num_iterations": trial.num_iterations,
+                "num_env_steps": trial.num_env_steps,
+                "num_episodes": trial.num_episodes,
+                "time_s": trial.time_s,
+                "stop_reason": trial.stop_reason,
+                "num_failures": trial.num_failures,
+                "error": error_summary(trial.error) if trial.error is not None else None,
+            }
+        )
+    frame = pd.DataFrame(rows, columns=["trial_id", "status", *names, *_AFTER_POINT])
+    floats = ["score", "training_return", "evaluation_return", "time_s"]
+    # Int64 (capital I) is pandas' integer that can be missing: env steps stay whole numbers in the CSV.
+    counts = ["score_num_env_steps", "num_env_steps_to_solve"]
+    return frame.astype({**dict.fromkeys(floats, "float64"), **dict.fromkeys(counts, "Int64")})
+
+
+def iterations_frame(results: Mapping[str, Sequence[IterationRecord]]) -> pd.DataFrame:
+    """One row an iteration: trial_id, its numbers, and `learner/<name>` for each learner metric."""
+    import pandas as pd
+
+    base = ["iteration", "num_env_steps", "num_episodes", "time_s", "training_return", "evaluation_return"]
+    learner = sorted({name for items in results.values() for item in items for name in item.learner})
+    rows = [
+        {
+            "trial_id": trial_id,
+            **{name: getattr(item, name) for name in base},
+            **{f"learner/{name}": value for name, value in item.learner.items()},
+        }
+        for trial_id, items in results.items()
+        for item in items
+    ]
+    metrics = [f"learner/{name}" for name in learner]
+    frame = pd.DataFrame(rows, columns=["trial_id", *base, *metrics])
+    floats = ["time_s", "training_return", "evaluation_return", *metrics]
+    return frame.astype(dict.fromkeys(floats, "float64"))
+
+
+def groups_frame(
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    names: Sequence[str],
+    *,
+    threshold: float | None,
+) -> pd.DataFrame:
+    """One row for each combination of some searched hyperparameters: which of them solves, and how fast.
+
+    Args:
+        trials: Of one sweep.
+        results: Iterations by trial id, oldest first.
+        names: Hyperparameters to group by; the others are what varies within a group.
+        threshold: Training return that counts as solved; None: none does.
+
+    Returns:
+        The columns `names`, num_trials, num_failed, num_solved, min_num_env_steps_to_solve, best_score,
+        mean_score; best score first.
+    """
+    frame = trials_frame(trials, results, threshold=threshold)
+    groups = frame.groupby(list(names), sort=False, dropna=False)
+    table = groups.agg(
+        num_trials=("trial_id", "size"),
+        num_failed=("status", lambda status: int((status == "failed").sum())),
+        num_solved=("num_env_steps_to_solve", "count"),
+        min_num_env_steps_to_solve=("num_env_steps_to_solve", "min"),
+        best_score=("score", "max"),
+        mean_score=("score", "mean"),
+    )
+    return table.reset_index().sort_values("best_score", ascending=False, kind="stable", ignore_index=True)
+
+
+def write_csv(path: Path, frame: pd.DataFrame) -> None:
+    """Write a frame as CSV (UTF-8, no index), so that no reader sees half of it.
+
+    Text that a spreadsheet would run as a formula gets a leading apostrophe: error texts are not ours.
+
+    Raises:
+        CannotRunError: The file cannot be written.
+    """
+    safe = frame.copy()
+    for name in safe.columns:
+        safe[name] = safe[name].map(_defuse) if safe[name].dtype.kind in "OTU" else safe[name]
+    write_atomic(path, safe.to_csv(index=False, lineterminator="\n"))
+
+
+def _defuse(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and value[:1] in {"=", "+", "-", "@", "\t", "\r"} else value

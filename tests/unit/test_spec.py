@@ -1,0 +1,350 @@
+"""Sweep files: what is read from them, and that everything wrong with them is told at once."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from policies.errors import SpecError
+from policies.hyperparams import ACTIVATIONS
+from tune_jobs.search_space import Grid, Uniform
+from tune_jobs.spec import SweepSpec, check_sweep_name
+from tune_jobs.spec_file import find_preset, json_schema, list_presets, load_spec
+
+MINIMAL = {"env": "CartPole-v1", "algorithm": "ppo"}
+
+
+def errors(*, base=MINIMAL, overrides=(), **fields):
+    with pytest.raises(SpecError) as caught:
+        load_spec({**base, **fields}, overrides)
+    assert caught.value.exit_code == 2
+    assert caught.value.hint
+    return caught.value.message
+
+
+def write(tmp_path, text):
+    path = tmp_path / "sweep.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# -- what is read ------------------------------------------------------------------------------------------------------
+
+
+def test_the_smallest_sweep_has_finite_caps():
+    spec = load_spec(MINIMAL)
+    assert spec.env.id == "CartPole-v1"
+    assert spec.stop.num_env_steps == 200_000
+    assert spec.stop.num_iterations == 100_000
+    assert math.isfinite(spec.stop.time_s)
+    assert spec.cpus_per_trial == 1
+
+
+def test_numbers_as_people_write_them(tmp_path):
+    spec = load_spec(
+        write(
+            tmp_path,
+            """
+env: CartPole-v1
+algorithm: ppo
+hyperparams: {lr: 3e-4, hidden_sizes: [512, 256, 64], grad_clip: null}
+space: {gamma: {uniform: [9E-1, 0.99]}, clip_param: {grid: [1e-1, .2]}}
+stop: {num_env_steps: 5e4, time_s: 1e+2}
+""",
+        )
+    )
+    assert spec.hyperparams == {"lr": 3e-4, "hidden_sizes": [512, 256, 64], "grad_clip": None}
+    assert spec.space["gamma"].bounds == (0.9, 0.99)
+    assert spec.space["clip_param"].values == (0.1, 0.2)
+    assert (spec.stop.num_env_steps, spec.stop.time_s) == (50_000, 100.0)
+
+
+def test_zero_and_null_are_values_of_their_own():
+    spec = load_spec({**MINIMAL, "hyperparams": {"entropy_coeff": 0}, "stop": {"training_return": 0},
+                      "checkpoints": {"keep": 0}, "max_retries": 0})  # fmt: skip
+    assert spec.stop.training_return == 0.0
+    assert spec.stop.evaluation_return is None
+    assert (spec.checkpoints.keep, spec.max_retries, spec.hyperparams["entropy_coeff"]) == (0, 0, 0)
+
+
+def test_sections_can_be_short_empty_or_full(tmp_path):
+    spec = load_spec(
+        write(tmp_path, "env: {id: CartPole-v1, args: {sutton_barto_reward: true}}\nalgorithm: ppo\nspace:\nscheduler: asha\n")
+    )
+    assert spec.env.args == {"sutton_barto_reward": True}
+    assert spec.space == {}
+    assert spec.scheduler.type == "asha"
+    assert spec.grace_env_steps == 10_000
+
+
+def test_a_resolved_spec_round_trips_through_json():
+    spec = load_spec("cartpole-ppo", ["seeds_per_point=2", "space.gamma={loguniform: [0.9, 0.99]}", "hyperparams.gamma="])
+    dumped = json.loads(json.dumps(spec.model_dump(mode="json")))
+    assert SweepSpec.model_validate(dumped) == spec
+    assert list(dumped["space"]) == ["hidden_sizes", "activation", "lr", "gamma"]
+    assert load_spec(dumped) == spec
+
+
+def test_domains_can_be_given_as_objects():
+    spec = load_spec({**MINIMAL, "space": {"lr": Uniform(uniform=(1e-4, 1e-3)), "activation": Grid(grid=("relu",))}})
+    assert spec.space["lr"] == Uniform(uniform=(1e-4, 1e-3))
+
+
+def test_a_spec_cannot_be_changed():
+    with pytest.raises(Exception, match="frozen"):
+        load_spec(MINIMAL).num_samples = 3
+
+
+# -- presets -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_preset_loads_has_a_description_and_no_name():
+    presets = list_presets()
+    assert "cartpole-ppo" in {preset.name for preset in presets}
+    for preset in presets:
+        assert load_spec(preset.name).name is None
+        assert len(preset.description) > 20
+
+
+def test_the_cartpole_preset_is_the_tutorials_sweep():
+    spec = load_spec("cartpole-ppo")
+    assert spec.env.id == "CartPole-v0"
+    assert spec.space["hidden_sizes"].values == ([32], [64])
+    assert spec.space["activation"].values == ("linear", "relu")
+    assert spec.space["lr"].bounds == (1e-7, 1e-2)
+    assert spec.num_samples == 5
+    assert spec.stop.training_return == 195
+
+
+def test_an_unknown_source_names_the_nearest_preset(tmp_path):
+    with pytest.raises(SpecError, match=r"'cartpol-ppo'.*Did you mean 'cartpole-ppo'"):
+        load_spec("cartpol-ppo")
+    with pytest.raises(SpecError, match="is a folder"):
+        load_spec(tmp_path)
+    with pytest.raises(SpecError, match="Did you mean 'cartpole-ppo'"):
+        find_preset("cartpole")
+
+
+def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("cartpole-ppo").write_text("env: Acrobot-v1\nalgorithm: dqn\n")
+    assert load_spec("cartpole-ppo").env.id == "Acrobot-v1"
+
+
+# -- what is wrong -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "parts"),
+    [
+        ({"enviroment": "x"}, ["enviroment: there is no field", "Did you mean 'env'?"]),
+        ({"num_sample": 3}, ["num_sample", "Did you mean 'num_samples'?"]),
+        ({"stop": {"num_env_step": 5}}, ["stop.num_env_step", "Did you mean 'num_env_steps'?"]),
+        ({"stop": {"episode_reward_mean": 195}}, ["stop.episode_reward_mean", "Known here: training_return"]),
+        ({"num_env_steps": 5}, ["num_env_steps", "Did you mean stop.num_env_steps?"]),
+        ({"lr": 0.1}, ["lr", "hyperparams.lr or space.lr"]),
+        ({"num_samples": "many"}, ["num_samples", "'many' is not a number"]),
+        ({"num_samples": True}, ["num_samples", "True is not a number"]),
+        ({"num_samples": 1.5}, ["num_samples", "1.5"]),
+        ({"num_samples": 0}, ["num_samples", "0 is not allowed"]),
+        ({"seed": -1}, ["seed", "-1 is not allowed"]),
+        ({"stop": {"time_s": float("inf")}}, ["stop.time_s", "finite"]),
+        ({"stop": {"num_env_steps": None}}, ["stop.num_env_steps", "None"]),
+        ({"stop": [1]}, ["stop", "[1]"]),
+        ({"algorithm": "pppo"}, ["algorithm", "'pppo'", "Did you mean 'ppo'?"]),
+        ({"scheduler": "ahsa"}, ["scheduler.type", "'ahsa'", "Did you mean 'asha'?"]),
+        ({"scheduler": {"type": "asha", "grace_env_steps": 200_000}}, ["scheduler.grace_env_steps", "200000"]),
+        ({"resources": {"num_cpus": 1, "num_env_runners": 2}}, ["resources.num_cpus: 1 is fewer than the 3"]),
+        ({"resources": {"num_gpus": 1.5}}, ["resources.num_gpus: 1.5"]),
+        ({"name": "../x"}, ["name: '../x' is not allowed"]),
+        ({"name": ".x"}, ["name: '.x' is not allowed"]),
+        ({"name": "x\n"}, ["name: 'x\\n' is not allowed"]),
+        ({"env": 5}, ["env"]),
+        ({"env": {"args": {}}}, ["env.id: is missing"]),
+        ({"hyperparams": {"lr": 0}}, ["hyperparams.lr: 0 is not allowed: it should be greater than 0"]),
+        ({"hyperparams": {"lr": -1e-3}}, ["hyperparams.lr: -0.001 is not allowed"]),
+        ({"hyperparams": {"lr": "1e-3"}}, ["hyperparams.lr: '1e-3' is of the wrong type"]),
+        ({"hyperparams": {"num_epochs": True}}, ["hyperparams.num_epochs: True is of the wrong type"]),
+        ({"hyperparams": {"vf_share_layers": 1}}, ["hyperparams.vf_share_layers: 1 is of the wrong type"]),
+        ({"hyperparams": {"hidden_sizes": 32}}, ["hyperparams.hidden_sizes: 32 is not allowed"]),
+        ({"hyperparams": {"hidden_sizes": [32, 0]}}, ["hyperparams.hidden_sizes[1]: 0 is not allowed"]),
+        ({"hyperparams": {"hidden_sizes": []}}, ["hyperparams.hidden_sizes"]),
+        ({"hyperparams": {"activation": "rellu"}}, ["hyperparams.activation: 'rellu'", "Did you mean 'relu'?"]),
+        ({"hyperparams": {"learning_rate": 0.1}}, ["hyperparams.learning_rate: ppo has no", "It has activation"]),
+        ({"hyperparams": {"double_q": True}}, ["ppo has no hyperparameter 'double_q'", "dqn has it"]),
+        ({"space": {"gama": {"grid": [0.9]}}}, ["space.gama: ppo has no hyperparameter", "Did you mean 'gamma'?"]),
+        ({"space": {"gama": {"grid": []}}}, ["space.gama.grid: is empty", "Did you mean 'gamma'?"]),
+        ({"space": {"lr": {"grid": []}}}, ["space.lr.grid: is empty"]),
+        ({"space": {"lr": {"unifrom": [1, 2]}}}, ["space.lr: there is no domain 'unifrom'", "'uniform'"]),
+        ({"space": {"lr": {"uniform": [0, 0.01]}}}, ["space.lr.uniform[0]: 0.0 is not allowed"]),
+        ({"space": {"lr": {"loguniform": [0, 0.01]}}}, ["space.lr.loguniform: starts at 0.0"]),
+        ({"space": {"gamma": {"uniform": [0.9, 1.1]}}}, ["space.gamma.uniform[1]: 1.1 is not allowed"]),
+        ({"space": {"lr": 0.01}}, ["space.lr: 0.01 is one value: fix it under hyperparams"]),
+        ({"space": {"activation": {"grid": ["relu", "swish"]}}}, ["space.activation.grid[1]: 'swish'", *ACTIVATIONS]),
+        ({"space": {"num_epochs": {"uniform": [1, 4]}}}, ["space.num_epochs.uniform: can give", "use randint"]),
+        ({"space": {"num_epochs": {"quniform": [1, 4, 0.5]}}}, ["space.num_epochs.quniform: can give"]),
+        ({"space": {"num_epochs": {"randint": [0, 4]}}}, ["space.num_epochs.randint[0]: 0 is not allowed"]),
+        ({"space": {"activation": {"randint": [0, 4]}}}, ["space.activation.randint[0]: 0 is not allowed"]),
+        ({"space": {"vf_share_layers": {"randint": [0, 2]}}}, ["space.vf_share_layers.randint[0]: 0 is of the"]),
+        ({"space": {"lr": {"grid": [1e-3]}}, "hyperparams": {"lr": 0.1}}, ["hyperparams.lr: is fixed at 0.1 and"]),
+        ({"env": "x", "hyperparams": {"lr": object()}}, ["JSON"]),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_told_with_its_place_and_value(fields, parts):
+    message = errors(**fields)
+    for part in parts:
+        assert part in message
+
+
+def test_every_problem_is_told_at_once():
+    message = errors(
+        base={},
+        algorithm="dqn",
+        num_samples="x",
+        hyperparams={"num_epochs": 3, "lr": -1},
+        space={"gamma": {"grid": []}, "taau": {"uniform": [0, 1]}, "tau": {"uniform": [0, 2]}},
+    )
+    assert message.startswith("sweep: 7 problems:\n  ")
+    for part in ("env: is missing", "num_samples: 'x'", "hyperparams.num_epochs", "hyperparams.lr", "space.gamma.grid",
+                 "space.taau", "space.tau.uniform[1]"):  # fmt: skip
+        assert part in message
+
+
+def test_whole_values_of_a_quantised_float_range_are_accepted():
+    assert load_spec({**MINIMAL, "space": {"num_epochs": {"quniform": [2, 8, 2]}}}).space["num_epochs"].q == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("env: a\nenv: b\n", "sweep.yaml, line 2, column 1: the key 'env' stands twice"),
+        ("env: a\nspace:\n  lr: {grid: [1]}\n  lr: {grid: [2]}\n", "sweep.yaml, line 4, column 3: the key 'lr'"),
+        ("env: [a\n", "sweep.yaml, line 2"),
+        ("", "sweep.yaml: is empty"),
+        ("- a\n", "sweep.yaml: holds a list"),
+        ("env: !!python/object/apply:os.system [ls]\n", "could not determine a constructor"),
+        ("env: x\nalgorithm: ppo\nhyperparams: {lr: &a [*a]}\n", "JSON"),
+    ],
+)
+def test_bad_yaml_is_told_with_its_line(tmp_path, text, part):
+    with pytest.raises(SpecError) as caught:
+        load_spec(write(tmp_path, text))
+    assert part in caught.value.message
+
+
+def test_a_file_that_is_no_text(tmp_path):
+    path = tmp_path / "sweep.yaml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SpecError, match="can't be read"):
+        load_spec(path)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a b", "-x", "x" * 101, "é", "x\n"])
+def test_bad_sweep_names(name):
+    with pytest.raises(SpecError, match="sweep name"):
+        check_sweep_name(name)
+
+
+@pytest.mark.parametrize("name", ["a", "cartpole-ppo_2.1", "0", "x" * 100])
+def test_good_sweep_names(name):
+    assert check_sweep_name(name) == name
+    assert load_spec({**MINIMAL, "name": name}).name == name
+
+
+# -- --set -------------------------------------------------------------------------------------------------------------
+
+
+def test_set_overrides_and_creates_fields():
+    spec = load_spec(
+        "cartpole-ppo",
+        ["stop.num_env_steps=1000", "env=CartPole-v1", "env.args.sutton_barto_reward=true", "scheduler=asha",
+         "scheduler.grace_env_steps=50", "space.lr={grid: [1e-3, 2e-3]}", "resources.max_concurrent=1",
+         "hyperparams.grad_clip=null", "name=a=b" if False else "name=ab"],
+    )  # fmt: skip
+    assert spec.stop.num_env_steps == 1000
+    assert spec.stop.training_return == 195
+    assert (spec.env.id, spec.env.args) == ("CartPole-v1", {"sutton_barto_reward": True})
+    assert (spec.scheduler.type, spec.scheduler.grace_env_steps) == ("asha", 50)
+    assert spec.space["lr"].values == (1e-3, 2e-3)
+    assert spec.resources.max_concurrent == 1
+    assert spec.hyperparams["grad_clip"] is None
+
+
+def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed():
+    assert "is fixed at 0.001 and searched" in errors(
+        space={"lr": {"uniform": [1e-4, 1e-2]}}, overrides=["hyperparams.lr=1e-3"]
+    )
+    spec = load_spec("cartpole-ppo", ["space.lr=", "hyperparams.lr=1e-3"])
+    assert "lr" not in spec.space
+    assert spec.hyperparams["lr"] == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("stop", "--set stop: this is no assignment"),
+        ("=3", "this is no assignment"),
+        ("stop..x=3", "this is no assignment"),
+        ("num_samples.x=3", "num_samples is 5, which has no fields"),
+        ("stop.num_env_step=3", "stop.num_env_step: there is no field 'num_env_step' here."),
+        ("stop.num_env_steps=-3", "stop.num_env_steps: -3 is not allowed"),
+        ("space.lr={uniform: [1, 0]}", "space.lr.uniform: goes from 1.0 to 0.0"),
+        ("space.lr={uniform: [", "--set space.lr={uniform: [, line 1"),
+        ("stopp.x=1", "stopp: there is no field"),
+    ],
+)
+def test_bad_overrides(override, part):
+    with pytest.raises(SpecError) as caught:
+        load_spec("cartpole-ppo", [override])
+    assert part in caught.value.message
+
+
+def test_a_problem_says_that_it_came_from_set():
+    message = errors(num_samples=0, overrides=["seed=-1"])
+    lines = message.splitlines()
+    assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(True) == 1
+    assert any(line.strip().startswith("seed:") and line.endswith("(from --set)") for line in lines)
+
+
+def test_overrides_leave_the_mapping_they_were_given_alone():
+    source = {**MINIMAL, "stop": {"num_env_steps": 10}}
+    load_spec(source, ["stop.num_env_steps=20"])
+    assert source["stop"] == {"num_env_steps": 10}
+
+
+# -- JSON Schema -------------------------------------------------------------------------------------------------------
+
+
+def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    good = {**MINIMAL, "hyperparams": {"lr": 0.1}, "space": {"hidden_sizes": {"grid": [[32]]}, "gamma": {"uniform": [0, 1]}},
+            "scheduler": "asha"}  # fmt: skip
+    assert list(validator.iter_errors(good)) == []
+    assert list(validator.iter_errors({**good, "env": {"id": "x", "args": {}}, "space": None})) == []
+    bad = [{"algorithm": "ppo"}, {**good, "x": 1}, {**good, "hyperparams": {"dueling": True}},
+           {**good, "space": {"tau": {"grid": [1]}}}, {**good, "space": {"lr": {"grid": 1}}},
+           {**good, "hyperparams": {"lr": 0}}, {**good, "stop": {"x": 1}}, {**good, "scheduler": {"type": "x"}}]  # fmt: skip
+    for wrong in bad:
+        assert list(validator.iter_errors(wrong)), wrong
+
+
+def test_the_schema_accepts_every_preset():
+    import yaml
+
+    jsonschema = pytest.importorskip("jsonschema")
+    for preset in list_presets():
+        # A plain YAML 1.1 loader is what many editors use; it may take 1e-7 for a text, so numbers are read our way.
+        data = load_spec(preset.name).model_dump(mode="json")
+        jsonschema.validate(data, json_schema())
+        assert set(yaml.safe_load(preset.text)) <= set(data)
+
+
+def test_the_schema_describes_every_field():
+    schema = json_schema()
+    for name in ("StopSpec", "SchedulerSpec", "EvaluationSpec", "CheckpointSpec", "ResourcesSpec", "PPOHyperparams"):
+        assert all(field.get("description") for field in schema["$defs"][name]["properties"].values()), name
+    assert all(field.get("description") for field in schema["properties"].values())

@@ -1,0 +1,107 @@
+"""What is known of a running sweep: the numbers behind the live table, without the table."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from analysis.records import FINISHED, TrialRecord
+from analysis.selection import NoUsableTrialError, Selection, select_best
+
+_RATE_WINDOW_S = 20.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """How fast a sweep goes, and how long it has to go."""
+
+    env_steps_per_s: float | None
+    time_left_s: float | None
+
+
+class SweepMonitor:
+    """Takes trial records as they change and sums them up.
+
+    Args:
+        name: The sweep's name.
+        records: Its trials at the start.
+        max_env_steps_per_trial: Cap of each trial.
+        max_concurrent: Trials at once.
+        clock: Seconds, monotonic.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        records: Iterable[TrialRecord],
+        *,
+        max_env_steps_per_trial: int,
+        max_concurrent: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name = name
+        self.records: dict[str, TrialRecord] = {record.trial_id: record for record in records}
+        self.max_concurrent = max_concurrent
+        self.stopping = False
+        self._cap = max_env_steps_per_trial
+        self._clock = clock
+        self._start = clock()
+        self._finished_before = {r.trial_id for r in self.records.values() if r.status in FINISHED}
+        self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
+        self._history: deque[tuple[float, int]] = deque([(self._start, self._num_env_steps)])
+        self._selection: Selection | None = None
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since this monitor was made."""
+        return self._clock() - self._start
+
+    @property
+    def num_env_steps(self) -> int:
+        """Env steps of all trials so far."""
+        return self._num_env_steps
+
+    def update(self, record: TrialRecord) -> None:
+        """Take the new state of a trial."""
+        before = self.records.get(record.trial_id)
+        self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
+        self.records[record.trial_id] = record
+        now = self._clock()
+        self._history.append((now, self._num_env_steps))
+        while len(self._history) > 2 and self._history[1][0] < now - _RATE_WINDOW_S:
+            self._history.popleft()
+        changed = before is None or before.best_evaluation_return != record.best_evaluation_return
+        if changed or before.status != record.status:
+            try:
+                self._selection = select_best(list(self.records.values()))
+            except NoUsableTrialError:
+                self._selection = None
+
+    def counts(self) -> dict[str, int]:
+        """Number of trials by status."""
+        return dict(Counter(record.status for record in self.records.values()))
+
+    def best(self) -> Selection | None:
+        """The winner so far, by the rule that will choose the winner; None while no trial is usable."""
+        return self._selection
+
+    def estimate(self) -> Estimate:
+        """Rate over the last seconds, and the time that is left if the other trials take as long as the ended ones."""
+        now = self._clock()
+        first_time, first_steps = self._history[0]
+        span = now - first_time
+        rate = (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
+        records = list(self.records.values())
+        left = [record for record in records if record.status not in FINISHED]
+        ended = [r for r in records if r.status == "completed" and r.trial_id not in self._finished_before]
+        if not left:
+            return Estimate(rate, 0.0)
+        if ended:
+            seconds = sum(record.time_s for record in ended) / len(ended)
+            work = sum(max(0.0, seconds - record.time_s) for record in left)
+            return Estimate(rate, work / max(1, min(self.max_concurrent, len(left))))
+        if rate:
+            return Estimate(rate, sum(max(0, self._cap - record.num_env_steps) for record in left) / rate)
+        return Estimate(rate, None)

@@ -1,0 +1,208 @@
+"""The Ray Tune Trainable: one warm process that runs one trial after another.
+
+Tune gives it a sweep folder and a trial id and nothing else; what to run is read from the sweep folder, so a trial that
+is started again anywhere goes on from what is on disk there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import faulthandler
+import json
+import os
+import socket
+import sys
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import ray
+from ray import tune
+
+from policies.errors import CheckpointError
+from policies.evaluate import Evaluator
+from tune_jobs.engines.protocol import TrainingEngine, TrialTask
+from tune_jobs.engines.rllib import RLlibEngine
+from tune_jobs.schedulers import METRIC, WORST_SCORE, grace_env_steps
+from tune_jobs.spec import SweepSpec
+from tune_jobs.store import SweepStore
+from tune_jobs.trial import Progress, TrialLoop
+
+# Reporting every iteration of a fast env costs more than the iteration.
+REPORT_INTERVAL_S = 1.0
+_POINTER = "pointer.json"
+
+
+class TrialLog:
+    """Sends everything this process prints, C++ included, to a trial's log, appended."""
+
+    def __init__(self) -> None:
+        self._file: IO[bytes] | None = None
+        self._original = [os.dup(1), os.dup(2)]
+
+    def open(self, path: Path) -> IO[bytes]:
+        """Send standard output and error to this file from now on."""
+        self.close()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("ab")
+        for number in (1, 2):
+            os.dup2(self._file.fileno(), number)
+        return self._file
+
+    def close(self) -> None:
+        """Send them where they went before."""
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        if self._file is not None:
+            for number, original in enumerate(self._original, start=1):
+                os.dup2(original, number)
+            self._file.close()
+            self._file = None
+
+
+def read_task(sweep_folder: Path, trial_id: str) -> TrialTask:
+    """What to run, from the sweep folder.
+
+    Raises:
+        NotFoundError: There is no such sweep or trial there.
+    """
+    store = SweepStore(sweep_folder)
+    sweep, trial = store.read_record(), store.trial(trial_id).read_record()
+    spec = SweepSpec.model_validate(sweep.spec)
+    return TrialTask(
+        sweep_folder=store.folder,
+        trial_id=trial_id,
+        seed=trial.seed,
+        algorithm=spec.algorithm,
+        hyperparams=trial.hyperparams,
+        env_id=spec.env.id,
+        env_args=spec.env.args,
+        stop=spec.stop,
+        evaluation=spec.evaluation,
+        checkpoints=spec.checkpoints,
+        evaluation_seeds=sweep.evaluation_seeds,
+        num_env_runners=spec.resources.num_env_runners,
+        num_gpus=spec.resources.num_gpus,
+        iteration_timeout_s=spec.iteration_timeout_s,
+    )
+
+
+class TrialTrainable(tune.Trainable):  # type: ignore[misc]
+    """Runs trials; `config` holds `sweep_folder` and `trial_id`."""
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Remember the trial; it is built in the first step, so that every error comes from there."""
+        self._log = TrialLog()
+        self._engine: TrainingEngine = RLlibEngine()
+        self._evaluators: dict[str, Evaluator] = {}
+        self._node = f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
+        self._take(config)
+
+    def reset_config(self, new_config: Mapping[str, Any]) -> bool:
+        """Take the next trial in the same warm process."""
+        self._take(new_config)
+        return True
+
+    def _take(self, config: Mapping[str, Any]) -> None:
+        self._trial = (Path(config["sweep_folder"]), str(config["trial_id"]))
+        self._loop: TrialLoop | None = None
+        self._grace = 1
+
+    def step(self) -> dict[str, Any]:
+        """Train until the next report.
+
+        Raises:
+            Exception: Whatever went wrong; it is in the trial's log too.
+        """
+        folder, trial_id = self._trial
+        try:
+            if self._loop is None:
+                self._loop = self._open(folder, trial_id)
+            progress = self._watched(self._loop)
+        except Exception:
+            traceback.print_exc()
+            raise
+        if progress.status != "running":
+            self._log.close()
+        return self._report(progress)
+
+    def _open(self, folder: Path, trial_id: str) -> TrialLoop:
+        store = SweepStore(folder)
+        self._file = self._log.open(store.trial(trial_id).log_path)
+        task = read_task(folder, trial_id)
+        key = json.dumps([task.env_id, task.env_args, task.evaluation_seeds], sort_keys=True)
+        if key not in self._evaluators:
+            self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
+        spec = SweepSpec.model_validate(store.read_record().spec)
+        self._grace = grace_env_steps(spec.scheduler, spec.stop.num_env_steps)
+        loop = TrialLoop(task, self._engine, self._evaluators[key])
+        with self._watchdog(task.iteration_timeout_s):
+            loop.open()
+        return loop
+
+    def _watched(self, loop: TrialLoop) -> Progress:
+        with self._watchdog(loop.task.iteration_timeout_s + REPORT_INTERVAL_S):
+            return loop.advance(REPORT_INTERVAL_S)
+
+    @contextlib.contextmanager
+    def _watchdog(self, timeout_s: float) -> Any:
+        """End this process, with a traceback in the log, if the block hangs: not even a thread could interrupt it.
+
+        A hung `env.step` has no time-out of its own with RLlib; Tune then retries the trial in a new process.
+        """
+        faulthandler.dump_traceback_later(timeout_s, exit=True, file=self._file)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+    def _report(self, progress: Progress) -> dict[str, Any]:
+        score = progress.evaluation_return
+        fields = dataclasses.asdict(progress)
+        fields["checkpoints"] = [record.model_dump(mode="json") for record in progress.checkpoints]
+        return {
+            "done": progress.status != "running",
+            "evaluated": progress.evaluated,
+            "num_env_steps": progress.num_env_steps,
+            "grace_periods": progress.num_env_steps / self._grace,
+            METRIC: WORST_SCORE if score is None else score,
+            "progress": fields,
+            "node": self._node,
+            "host": socket.gethostname(),
+        }
+
+    def save_checkpoint(self, checkpoint_dir: str) -> None:
+        """For Tune's pauses: the checkpoint itself goes to the sweep folder, Tune gets a pointer to it."""
+        iteration = 0
+        if self._loop is not None:
+            self._loop.pause()
+            iteration = self._loop.iteration
+        folder, trial_id = self._trial
+        pointer = {"sweep_folder": str(folder), "trial_id": trial_id, "iteration": iteration}
+        (Path(checkpoint_dir) / _POINTER).write_text(json.dumps(pointer), encoding="utf-8")
+
+    def load_checkpoint(self, checkpoint: str) -> None:
+        """Check that what the sweep folder holds is what Tune paused; the next step goes on from it.
+
+        Raises:
+            CheckpointError: The checkpoint Tune wants is not there.
+        """
+        pointer = json.loads((Path(checkpoint) / _POINTER).read_text(encoding="utf-8"))
+        folder, trial_id = self._trial
+        latest = max((record.iteration for record in SweepStore(folder).trial(trial_id).checkpoints()), default=0)
+        if latest != pointer["iteration"]:
+            raise CheckpointError(
+                f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is of {latest}.",
+                "Resume the sweep: its trials go on from their latest checkpoints.",
+            )
+        self._loop = None
+
+    def cleanup(self) -> None:
+        """Free the trial; the process may end."""
+        self._engine.close()
+        for evaluator in self._evaluators.values():
+            evaluator.close()
+        self._log.close()
