@@ -227,7 +227,9 @@ def list_command(*, storage: str | None, as_json: bool) -> None:
     """List the sweeps of a storage folder."""
     from tune_jobs import cli_output, sweeps
 
-    cli_output.show_sweeps(sweeps.list_sweeps(storage), as_json=as_json)
+    with _stdout_for(as_json=as_json):
+        statuses = sweeps.list_sweeps(storage)
+    cli_output.show_sweeps(statuses, as_json=as_json)
 
 
 @cli.command()
@@ -238,7 +240,9 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Say how far a sweep is."""
     from tune_jobs import cli_output, sweeps
 
-    cli_output.show_status(sweeps.status(sweep, storage=storage), as_json=as_json)
+    with _stdout_for(as_json=as_json):
+        state = sweeps.status(sweep, storage=storage)
+    cli_output.show_status(state, as_json=as_json)
 
 
 @cli.command()
@@ -249,7 +253,9 @@ def trials(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """List the trials of a sweep with their points, scores and errors."""
     from tune_jobs import cli_output, sweeps
 
-    cli_output.show_trials(sweeps.trials(sweep, storage=storage), as_json=as_json)
+    with _stdout_for(as_json=as_json):
+        records = sweeps.trials(sweep, storage=storage)
+    cli_output.show_trials(records, as_json=as_json)
 
 
 @cli.command()
@@ -302,7 +308,8 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Ask a running sweep to stop; it can be resumed."""
     from tune_jobs import cli_output, sweeps
 
-    was_running = sweeps.stop(sweep, storage=storage)
+    with _stdout_for(as_json=as_json):
+        was_running = sweeps.stop(sweep, storage=storage)
     cli_output.show_stop(sweep, was_running=was_running, as_json=as_json)
 
 

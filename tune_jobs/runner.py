@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
-import ray
 from ray import tune
 from ray.exceptions import RayActorError, RayTaskError
 from ray.tune.experiment import Trial
@@ -232,8 +231,3 @@ def describe_failure(error: BaseException | None, log_tail: str) -> str:
     else:
         message = str(error) if error is not None else "Unknown error."
     return f"{message}\n{log_tail}".strip()
-
-
-def connected_to_ray() -> bool:
-    """Whether this process is connected to a Ray cluster."""
-    return bool(ray.is_initialized())

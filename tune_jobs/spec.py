@@ -207,8 +207,14 @@ def check_sweep_name(name: str) -> str:
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """' Did you mean ...?' with the nearest of the known names, or nothing."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f" Did you mean {close[0]!r}?" if close else ""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    # `environment` and `epochs` look unlike `env` and `num_epochs`, but mean them.
+    inside = [
+        other for other in names if min(len(name), len(other)) >= 3 and (other in name or name in other)
+    ]
+    nearest = close[0] if close else max(inside, key=len, default=None)
+    return "" if nearest is None else f" Did you mean {nearest!r}?"
 
 
 def _section_problems(spec: SweepSpec) -> list[Problem]:
@@ -268,6 +274,8 @@ def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
     suggestion = f" ({' and '.join(others)} has it.)" if others else did_you_mean(name, known)
+    if name == "learning_rate":
+        suggestion = " Did you mean 'lr'?"  # its letters are nearer to DQN's learning_starts
     listed = "" if suggestion else f" It has {', '.join(sorted(known))}."
     return f"{algorithm} has no hyperparameter {name!r}.{suggestion}{listed}"
 

@@ -317,14 +317,13 @@ def _unknown_key(location: Sequence[int | str]) -> str:
     model: Any = SweepSpec
     for parent in parents:
         model = model.model_fields[parent].annotation
-    suggestion = did_you_mean(name, model.model_fields)
-    if not suggestion:
-        suggestion = did_you_mean_path(name)
+    # A field that exists elsewhere under just this name is meant more likely than a similar one here.
+    suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
     listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
     return f"there is no field {name!r} here.{suggestion}{listed}"
 
 
-def did_you_mean_path(name: str) -> str:
+def _other_place(name: str) -> str:
     """A hint for a field that exists, but in another section."""
     places = [
         f"{section}.{name}"

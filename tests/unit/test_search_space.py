@@ -52,6 +52,7 @@ def test_loguniform_gives_each_decade_the_same_share():
         ({"qrandint": [3, 6, 1]}, {3, 4, 5}),
         ({"qlograndint": [16, 64, 16]}, {16, 32, 48, 64}),
         ({"quniform": [0.1, 0.5, 0.1]}, {0.1, 0.2, 0.3, 0.4, 0.5}),
+        ({"quniform": [0.1, 0.3, 0.1]}, {0.1, 0.2, 0.3}),
         ({"qloguniform": [0.25, 1, 0.25]}, {0.25, 0.5, 0.75, 1.0}),
         ({"choice": ["a", [1, 2]]}, None),
         ({"grid": [True, False]}, {True, False}),
@@ -117,7 +118,11 @@ def test_every_domain_survives_json():
         assert ADAPTER.validate_json(parsed.model_dump_json()) == parsed
 
 
-SPACE = {"hidden": domain(grid=[[32], [64]]), "lr": domain(uniform=[0, 1]), "act": domain(grid=["linear", "relu"])}
+SPACE = {
+    "hidden": domain(grid=[[32], [64]]),
+    "lr": domain(uniform=[0, 1]),
+    "act": domain(grid=["linear", "relu"]),
+}
 
 
 def test_points_go_through_the_grid_once_a_sample_in_file_order():
@@ -142,7 +147,8 @@ def test_points_are_what_they_always_were():
     # A change here breaks `extend` and `resume` of the sweeps people already have.
     space = {"lr": domain(loguniform=[1e-5, 1e-2]), "n": domain(randint=[0, 1000])}
     assert draw_points(space, 2, sweep_seed=7) == [
-        pytest.approx(point) for point in [{"lr": 0.000150079572571204, "n": 804}, {"lr": 0.004156478866087, "n": 479}]
+        pytest.approx(point)
+        for point in [{"lr": 0.000150079572571204, "n": 804}, {"lr": 0.004156478866087, "n": 479}]
     ]
 
 

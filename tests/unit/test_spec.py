@@ -29,7 +29,8 @@ def write(tmp_path, text):
     return path
 
 
-# -- what is read ------------------------------------------------------------------------------------------------------
+# -- what is read
+# ------------------------------------------------------------------------------------------------------
 
 
 def test_the_smallest_sweep_has_finite_caps():
@@ -70,7 +71,10 @@ def test_zero_and_null_are_values_of_their_own():
 
 def test_sections_can_be_short_empty_or_full(tmp_path):
     spec = load_spec(
-        write(tmp_path, "env: {id: CartPole-v1, args: {sutton_barto_reward: true}}\nalgorithm: ppo\nspace:\nscheduler: asha\n")
+        write(
+            tmp_path,
+            "env: {id: CartPole-v1, args: {sutton_barto_reward: true}}\nalgorithm: ppo\nspace:\nscheduler: asha\n",
+        )
     )
     assert spec.env.args == {"sutton_barto_reward": True}
     assert spec.space == {}
@@ -79,7 +83,9 @@ def test_sections_can_be_short_empty_or_full(tmp_path):
 
 
 def test_a_resolved_spec_round_trips_through_json():
-    spec = load_spec("cartpole-ppo", ["seeds_per_point=2", "space.gamma={loguniform: [0.9, 0.99]}", "hyperparams.gamma="])
+    spec = load_spec(
+        "cartpole-ppo", ["seeds_per_point=2", "space.gamma={loguniform: [0.9, 0.99]}", "hyperparams.gamma="]
+    )
     dumped = json.loads(json.dumps(spec.model_dump(mode="json")))
     assert SweepSpec.model_validate(dumped) == spec
     assert list(dumped["space"]) == ["hidden_sizes", "activation", "lr", "gamma"]
@@ -87,7 +93,9 @@ def test_a_resolved_spec_round_trips_through_json():
 
 
 def test_domains_can_be_given_as_objects():
-    spec = load_spec({**MINIMAL, "space": {"lr": Uniform(uniform=(1e-4, 1e-3)), "activation": Grid(grid=("relu",))}})
+    spec = load_spec(
+        {**MINIMAL, "space": {"lr": Uniform(uniform=(1e-4, 1e-3)), "activation": Grid(grid=("relu",))}}
+    )
     assert spec.space["lr"] == Uniform(uniform=(1e-4, 1e-3))
 
 
@@ -96,7 +104,8 @@ def test_a_spec_cannot_be_changed():
         load_spec(MINIMAL).num_samples = 3
 
 
-# -- presets -----------------------------------------------------------------------------------------------------------
+# -- presets
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_preset_loads_has_a_description_and_no_name():
@@ -132,7 +141,8 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
     assert load_spec("cartpole-ppo").env.id == "Acrobot-v1"
 
 
-# -- what is wrong -----------------------------------------------------------------------------------------------------
+# -- what is wrong
+# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -154,7 +164,10 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
         ({"stop": [1]}, ["stop", "[1]"]),
         ({"algorithm": "pppo"}, ["algorithm", "'pppo'", "Did you mean 'ppo'?"]),
         ({"scheduler": "ahsa"}, ["scheduler.type", "'ahsa'", "Did you mean 'asha'?"]),
-        ({"scheduler": {"type": "asha", "grace_env_steps": 200_000}}, ["scheduler.grace_env_steps", "200000"]),
+        (
+            {"scheduler": {"type": "asha", "grace_env_steps": 200_000}},
+            ["scheduler.grace_env_steps", "200000"],
+        ),
         ({"resources": {"num_cpus": 1, "num_env_runners": 2}}, ["resources.num_cpus: 1 is fewer than the 3"]),
         ({"resources": {"num_gpus": 1.5}}, ["resources.num_gpus: 1.5"]),
         ({"name": "../x"}, ["name: '../x' is not allowed"]),
@@ -170,10 +183,21 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
         ({"hyperparams": {"hidden_sizes": 32}}, ["hyperparams.hidden_sizes: 32 is not allowed"]),
         ({"hyperparams": {"hidden_sizes": [32, 0]}}, ["hyperparams.hidden_sizes[1]: 0 is not allowed"]),
         ({"hyperparams": {"hidden_sizes": []}}, ["hyperparams.hidden_sizes"]),
-        ({"hyperparams": {"activation": "rellu"}}, ["hyperparams.activation: 'rellu'", "Did you mean 'relu'?"]),
-        ({"hyperparams": {"learning_rate": 0.1}}, ["hyperparams.learning_rate: ppo has no", "It has activation"]),
+        (
+            {"hyperparams": {"activation": "rellu"}},
+            ["hyperparams.activation: 'rellu'", "Did you mean 'relu'?"],
+        ),
+        (
+            {"hyperparams": {"learning_rate": 0.1}},
+            ["hyperparams.learning_rate: ppo has no", "Did you mean 'lr'?"],
+        ),
         ({"hyperparams": {"double_q": True}}, ["ppo has no hyperparameter 'double_q'", "dqn has it"]),
-        ({"space": {"gama": {"grid": [0.9]}}}, ["space.gama: ppo has no hyperparameter", "Did you mean 'gamma'?"]),
+        ({"hyperparams": {"epochs": 3}}, ["hyperparams.epochs: ppo has no", "Did you mean 'num_epochs'?"]),
+        ({"hyperparams": {"xyz": 3}}, ["hyperparams.xyz: ppo has no", "It has activation, clip_param"]),
+        (
+            {"space": {"gama": {"grid": [0.9]}}},
+            ["space.gama: ppo has no hyperparameter", "Did you mean 'gamma'?"],
+        ),
         ({"space": {"gama": {"grid": []}}}, ["space.gama.grid: is empty", "Did you mean 'gamma'?"]),
         ({"space": {"lr": {"grid": []}}}, ["space.lr.grid: is empty"]),
         ({"space": {"lr": {"unifrom": [1, 2]}}}, ["space.lr: there is no domain 'unifrom'", "'uniform'"]),
@@ -181,16 +205,28 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
         ({"space": {"lr": {"loguniform": [0, 0.01]}}}, ["space.lr.loguniform: starts at 0.0"]),
         ({"space": {"gamma": {"uniform": [0.9, 1.1]}}}, ["space.gamma.uniform[1]: 1.1 is not allowed"]),
         ({"space": {"lr": 0.01}}, ["space.lr: 0.01 is one value: fix it under hyperparams"]),
-        ({"space": {"activation": {"grid": ["relu", "swish"]}}}, ["space.activation.grid[1]: 'swish'", *ACTIVATIONS]),
-        ({"space": {"num_epochs": {"uniform": [1, 4]}}}, ["space.num_epochs.uniform: can give", "use randint"]),
+        (
+            {"space": {"activation": {"grid": ["relu", "swish"]}}},
+            ["space.activation.grid[1]: 'swish'", *ACTIVATIONS],
+        ),
+        (
+            {"space": {"num_epochs": {"uniform": [1, 4]}}},
+            ["space.num_epochs.uniform: can give", "use randint"],
+        ),
         ({"space": {"num_epochs": {"quniform": [1, 4, 0.5]}}}, ["space.num_epochs.quniform: can give"]),
         ({"space": {"num_epochs": {"randint": [0, 4]}}}, ["space.num_epochs.randint[0]: 0 is not allowed"]),
         ({"space": {"activation": {"randint": [0, 4]}}}, ["space.activation.randint[0]: 0 is not allowed"]),
-        ({"space": {"vf_share_layers": {"randint": [0, 2]}}}, ["space.vf_share_layers.randint[0]: 0 is of the"]),
-        ({"space": {"lr": {"grid": [1e-3]}}, "hyperparams": {"lr": 0.1}}, ["hyperparams.lr: is fixed at 0.1 and"]),
+        (
+            {"space": {"vf_share_layers": {"randint": [0, 2]}}},
+            ["space.vf_share_layers.randint[0]: 0 is of the"],
+        ),
+        (
+            {"space": {"lr": {"grid": [1e-3]}}, "hyperparams": {"lr": 0.1}},
+            ["hyperparams.lr: is fixed at 0.1 and"],
+        ),
         ({"env": "x", "hyperparams": {"lr": object()}}, ["JSON"]),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_told_with_its_place_and_value(fields, parts):
     message = errors(**fields)
     for part in parts:
@@ -219,7 +255,10 @@ def test_whole_values_of_a_quantised_float_range_are_accepted():
     ("text", "part"),
     [
         ("env: a\nenv: b\n", "sweep.yaml, line 2, column 1: the key 'env' stands twice"),
-        ("env: a\nspace:\n  lr: {grid: [1]}\n  lr: {grid: [2]}\n", "sweep.yaml, line 4, column 3: the key 'lr'"),
+        (
+            "env: a\nspace:\n  lr: {grid: [1]}\n  lr: {grid: [2]}\n",
+            "sweep.yaml, line 4, column 3: the key 'lr'",
+        ),
         ("env: [a\n", "sweep.yaml, line 2"),
         ("", "sweep.yaml: is empty"),
         ("- a\n", "sweep.yaml: holds a list"),
@@ -252,7 +291,8 @@ def test_good_sweep_names(name):
     assert load_spec({**MINIMAL, "name": name}).name == name
 
 
-# -- --set -------------------------------------------------------------------------------------------------------------
+# -- --set
+# -------------------------------------------------------------------------------------------------------------
 
 
 def test_set_overrides_and_creates_fields():
@@ -260,7 +300,7 @@ def test_set_overrides_and_creates_fields():
         "cartpole-ppo",
         ["stop.num_env_steps=1000", "env=CartPole-v1", "env.args.sutton_barto_reward=true", "scheduler=asha",
          "scheduler.grace_env_steps=50", "space.lr={grid: [1e-3, 2e-3]}", "resources.max_concurrent=1",
-         "hyperparams.grad_clip=null", "name=a=b" if False else "name=ab"],
+         "hyperparams.grad_clip=null", "name=ab"],
     )  # fmt: skip
     assert spec.stop.num_env_steps == 1000
     assert spec.stop.training_return == 195
@@ -303,7 +343,9 @@ def test_bad_overrides(override, part):
 def test_a_problem_says_that_it_came_from_set():
     message = errors(num_samples=0, overrides=["seed=-1"])
     lines = message.splitlines()
-    assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(True) == 1
+    assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(
+        True
+    ) == 1
     assert any(line.strip().startswith("seed:") and line.endswith("(from --set)") for line in lines)
 
 
@@ -313,7 +355,8 @@ def test_overrides_leave_the_mapping_they_were_given_alone():
     assert source["stop"] == {"num_env_steps": 10}
 
 
-# -- JSON Schema -------------------------------------------------------------------------------------------------------
+# -- JSON Schema
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
@@ -321,8 +364,12 @@ def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
     schema = json_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
-    good = {**MINIMAL, "hyperparams": {"lr": 0.1}, "space": {"hidden_sizes": {"grid": [[32]]}, "gamma": {"uniform": [0, 1]}},
-            "scheduler": "asha"}  # fmt: skip
+    good = {
+        **MINIMAL,
+        "hyperparams": {"lr": 0.1},
+        "space": {"hidden_sizes": {"grid": [[32]]}, "gamma": {"uniform": [0, 1]}},
+        "scheduler": "asha",
+    }
     assert list(validator.iter_errors(good)) == []
     assert list(validator.iter_errors({**good, "env": {"id": "x", "args": {}}, "space": None})) == []
     bad = [{"algorithm": "ppo"}, {**good, "x": 1}, {**good, "hyperparams": {"dueling": True}},
@@ -337,7 +384,8 @@ def test_the_schema_accepts_every_preset():
 
     jsonschema = pytest.importorskip("jsonschema")
     for preset in list_presets():
-        # A plain YAML 1.1 loader is what many editors use; it may take 1e-7 for a text, so numbers are read our way.
+        # A plain YAML 1.1 loader is what many editors use; it may take 1e-7 for a text, so numbers are read
+        # our way.
         data = load_spec(preset.name).model_dump(mode="json")
         jsonschema.validate(data, json_schema())
         assert set(yaml.safe_load(preset.text)) <= set(data)
@@ -345,6 +393,13 @@ def test_the_schema_accepts_every_preset():
 
 def test_the_schema_describes_every_field():
     schema = json_schema()
-    for name in ("StopSpec", "SchedulerSpec", "EvaluationSpec", "CheckpointSpec", "ResourcesSpec", "PPOHyperparams"):
+    for name in (
+        "StopSpec",
+        "SchedulerSpec",
+        "EvaluationSpec",
+        "CheckpointSpec",
+        "ResourcesSpec",
+        "PPOHyperparams",
+    ):
         assert all(field.get("description") for field in schema["$defs"][name]["properties"].values()), name
     assert all(field.get("description") for field in schema["properties"].values())

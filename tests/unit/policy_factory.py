@@ -1,0 +1,150 @@
+"""Small networks and environments that several test modules use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from policies.envs import check_env
+from policies.policy import NetworkPolicy
+from policies.portable import Layer, PolicyNetwork, PortablePolicy, describe_space
+
+
+def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algorithm="ppo", **env_args: Any):
+    """A network with random weights for a registered env."""
+    info = check_env(env_id, env_args)
+    rng = np.random.default_rng(seed)
+    discrete = isinstance(info.action_space, gym.spaces.Discrete)
+    num_outputs = int(info.action_space.n) if discrete else 2 * info.action_space.shape[0]
+    sizes = [info.observation_space.shape[0], *hidden, num_outputs]
+    layers = []
+    for index, (num_in, num_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        weight = rng.normal(size=(num_out, num_in)) / np.sqrt(num_in)
+        bias = 0.1 * rng.normal(size=num_out)
+        last = index == len(sizes) - 2
+        layers.append(
+            Layer(weight.astype(np.float32), bias.astype(np.float32), "linear" if last else activation)
+        )
+    kind = "gaussian" if not discrete else "q_values" if algorithm == "dqn" else "categorical"
+    return PortablePolicy(
+        network=PolicyNetwork(kind, tuple(layers)),
+        algorithm=algorithm,
+        env_id=info.env_id,
+        env_args=env_args,
+        observation_space=describe_space(info.observation_space),
+        action_space=describe_space(info.action_space),
+        action_transform="none" if discrete else "unsquash",
+        training={"trial_id": "t0003", "iteration": 12},
+    )
+
+
+def make_policy(env_id: str, **kwargs: Any) -> NetworkPolicy:
+    """A random network as a policy."""
+    return NetworkPolicy(make_portable(env_id, **kwargs))
+
+
+def balancing_policy(env_id: str = "CartPole-v0", noise: float = 0.0, seed: int = 0) -> NetworkPolicy:
+    """A linear CartPole policy that balances the pole; with noise on its weights it balances it for a "
+    "while."""
+    rng = np.random.default_rng(seed)
+    push = np.array([0.1, 0.5, 10.0, 2.0]) * (1 + noise * rng.normal(size=4))
+    weight = np.array([np.zeros(4), push], dtype=np.float32)
+    base = make_portable(env_id, hidden=())
+    layers = (Layer(weight, np.zeros(2, np.float32)),)
+    return NetworkPolicy(
+        PortablePolicy(
+            network=PolicyNetwork("categorical", layers),
+            algorithm="ppo",
+            env_id=base.env_id,
+            env_args={},
+            observation_space=base.observation_space,
+            action_space=base.action_space,
+        )
+    )
+
+
+class Walk(gym.Env):
+    """A point on a line that is moved by its action; it ends far out, or never. Actions start at 3."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+
+    def __init__(self, end: float | None = None, fail_at: int | None = None, render_mode: str | None = None):
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.action_space = gym.spaces.Discrete(2, start=3)
+        self.render_mode = render_mode
+        self.end, self.fail_at, self.position, self.steps = end, fail_at, 0.0, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position, self.steps = float(self.np_random.normal()), 0
+        return np.array([self.position, 1.0]), {}
+
+    def step(self, action):
+        # Not `isinstance(action, int) or np.integer`: an env may well want a plain int.
+        assert isinstance(action, int), type(action)
+        assert action in {3, 4}
+        self.steps += 1
+        if self.steps == self.fail_at:
+            raise RuntimeError("the motor broke")
+        self.position += 0.1 * (2 * action - 7) + 0.01 * float(self.np_random.normal())
+        terminated = self.end is not None and abs(self.position) > self.end
+        return np.array([self.position, 1.0]), self.position, terminated, False, {}
+
+    def render(self):
+        frame = np.zeros((10, 15, 3), np.uint8)
+        frame[:, self.steps % 15] = 255
+        return frame
+
+
+class NotDrawable(Walk):
+    """The same without a render mode."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__()
+
+
+class Pushes(gym.Env):
+    """Continuous actions, one bounded and one not, so that nothing can be stretched over the bounds."""
+
+    def __init__(self):
+        self.observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+        self.action_space = gym.spaces.Box(
+            np.array([-1.0, -np.inf], np.float32), np.array([1.0, np.inf], np.float32)
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample() * 0, {}
+
+    def step(self, action):
+        assert action.shape == (2,)
+        return np.zeros(3, np.float32), float(action.sum()), True, False, {}
+
+
+class Odd(gym.Env):
+    """Spaces of any kind, to be refused."""
+
+    def __init__(self, observation_space=None, action_space=None):
+        self.observation_space = observation_space or gym.spaces.Box(-1, 1, (2,))
+        self.action_space = action_space or gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+
+def register_test_envs() -> None:
+    """Register the envs above; more than once does no harm."""
+    here = {
+        "TestWalk-v0": Walk,
+        "TestNotDrawable-v0": NotDrawable,
+        "TestPushes-v0": Pushes,
+        "TestOdd-v0": Odd,
+    }
+    for env_id, entry_point in here.items():
+        if env_id not in gym.registry:
+            limit = 50 if env_id == "TestNotDrawable-v0" else None
+            gym.register(env_id, entry_point, max_episode_steps=limit)

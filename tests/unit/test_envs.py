@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from policy_factory import register_test_envs
+
+from policies.envs import check_env, make_env, make_vector_env, normalize_env_id
+from policies.errors import EnvError
+
+register_test_envs()
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "steps", "threshold"), [("CartPole-v0", 200, 195.0), ("CartPole-v1", 500, 475.0)]
+)
+def test_both_cartpoles_are_known_without_a_word(env_id, steps, threshold, capfd):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        info = check_env(env_id, None, "ppo")
+        make_env(env_id).close()
+        make_vector_env(env_id, None, 2).close()
+    assert (info.env_id, info.max_episode_steps, info.threshold) == (env_id, steps, threshold)
+    assert info.has_vector_entry_point
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("limit", [200, 500, 30])
+def test_the_vectorised_cartpole_has_the_time_limit_of_the_scalar_one(limit):
+    args = {"max_episode_steps": 30} if limit == 30 else {}
+    env = make_vector_env("CartPole-v0" if limit == 200 else "CartPole-v1", args, 3)
+    env.reset(seed=0)
+    for step in range(1, limit + 1):
+        state = env.unwrapped.state
+        state[:] = 0.0  # upright for ever
+        _, _, terminated, truncated, _ = env.step(np.zeros(3, np.int64))
+        assert not terminated.any()
+        assert truncated.all() == (step == limit)
+
+
+def test_an_env_without_a_vectorised_version_is_looped_over_with_its_limit():
+    info = check_env("Pendulum-v1", {"g": 9.0}, "ppo")
+    assert not info.has_vector_entry_point
+    env = make_vector_env("Pendulum-v1", {"g": 9.0}, 2)
+    assert isinstance(env, gym.vector.SyncVectorEnv)
+    assert [one.unwrapped.g for one in env.envs] == [9.0, 9.0]
+    assert env.envs[0].spec.max_episode_steps == 200
+    env.close()
+
+
+def test_arguments_reach_the_env():
+    assert make_env("CartPole-v1", {"sutton_barto_reward": True}).unwrapped._sutton_barto_reward
+    assert make_vector_env("CartPole-v1", {"sutton_barto_reward": True}, 2).unwrapped._sutton_barto_reward
+    assert check_env("CartPole-v1", {"max_episode_steps": 7}, None).max_episode_steps == 7
+
+
+def test_an_id_without_a_version_is_the_newest():
+    assert normalize_env_id(" CartPole ") == "CartPole-v1"
+    assert check_env("Pendulum", None, "ppo").env_id == "Pendulum-v1"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "nearest"),
+    [("cartpole-v1", "CartPole-v1"), ("CartPole-v7", "CartPole-v1"), ("Pendulm-v1", "Pendulum-v1")],
+)
+def test_an_unknown_id_names_the_nearest(env_id, nearest):
+    with pytest.raises(EnvError, match=rf"{env_id!r}.*Did you mean .*{nearest!r}") as caught:
+        check_env(env_id, None, None)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("env_id", ["", "  ", None, 3, "a b c", "Nothing-v", "-v1", "x/y/z-v0"])
+def test_what_is_no_id_is_refused(env_id):
+    with pytest.raises(EnvError):
+        check_env(env_id, None, None)
+
+
+def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp_path):
+    (tmp_path / "evil_module.py").write_text("print('ran')")
+    code = (
+        "from policies.envs import *\n"
+        "for use in (check_env, make_env, lambda i, a: make_vector_env(i, a, 2)):\n"
+        "    try: use('evil_module:CartPole-v1', None)\n"
+        "    except EnvError as error: assert 'colon' in error.message\n"
+        "    else: raise SystemExit('not refused')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_an_unknown_argument_names_the_nearest_and_all():
+    with pytest.raises(
+        EnvError, match=r"no argument 'sutton_barto' .*Did you mean 'sutton_barto_reward'"
+    ) as caught:
+        check_env("CartPole-v1", {"sutton_barto": True}, None)
+    assert "max_episode_steps" in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["render_mode", "num_envs", "wrappers", "disable_env_checker", "id"])
+def test_arguments_that_are_set_elsewhere_are_refused(name):
+    with pytest.raises(EnvError, match=name):
+        make_env("CartPole-v1", {name: 1})
+
+
+@pytest.mark.parametrize("limit", [0, -1, 2.5, "100", True, None])
+def test_a_wrong_time_limit_is_refused(limit):
+    with pytest.raises(EnvError, match="max_episode_steps"):
+        check_env("CartPole-v1", {"max_episode_steps": limit}, None)
+
+
+def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error():
+    with pytest.raises(EnvError, match="LunarLander-v3' cannot be made"):
+        check_env("LunarLander-v3", {"gravity": 5.0}, None)
+
+
+@pytest.mark.parametrize(
+    ("spaces", "words"),
+    [
+        ({"observation_space": gym.spaces.Discrete(4)}, "observations of kind Discrete.*1-D Box"),
+        ({"observation_space": gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)}, r"shape \(8, 8, 3\)"),
+        ({"observation_space": gym.spaces.Box(-1, 1, ())}, r"shape \(\)"),
+        ({"observation_space": gym.spaces.Box(0, 255, (4,), np.uint8)}, "dtype uint8"),
+        ({"observation_space": gym.spaces.Dict(a=gym.spaces.Discrete(2))}, "kind Dict"),
+        ({"action_space": gym.spaces.MultiDiscrete([2, 2])}, "actions of kind MultiDiscrete"),
+        ({"action_space": gym.spaces.Box(-1, 1, (2, 2))}, r"actions of shape \(2, 2\)"),
+        ({"action_space": gym.spaces.Box(0, 5, (2,), np.int32)}, "int32"),
+    ],
+)
+def test_spaces_that_cannot_be_taken_are_refused(spaces, words):
+    with pytest.raises(EnvError, match=words):
+        check_env("TestOdd-v0", spaces, "ppo")
+
+
+def test_dqn_refuses_continuous_actions_and_says_what_to_do():
+    assert check_env("Pendulum-v1", None, "ppo").action_space.shape == (1,)
+    with pytest.raises(EnvError, match="DQN cannot train on Pendulum-v1") as caught:
+        check_env("Pendulum-v1", None, "dqn")
+    assert "ppo" in caught.value.hint
+
+
+def test_a_reset_of_another_shape_than_declared_is_refused():
+    class Liar(gym.Env):
+        observation_space = gym.spaces.Box(-1, 1, (2,))
+        action_space = gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(3, np.float32), {}
+
+    gym.register("TestLiar-v0", Liar)
+    try:
+        with pytest.raises(EnvError, match=r"shape \(3,\) but declares \(2,\)"):
+            check_env("TestLiar-v0", None, "ppo")
+    finally:
+        del gym.registry["TestLiar-v0"]

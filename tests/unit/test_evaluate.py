@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
+
+import policies.evaluate
+from policies.envs import make_env
+from policies.errors import EnvError, SpecError
+from policies.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
+from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
+
+register_test_envs()
+
+
+def by_hand(policy, env_id, seeds, max_steps=10**9, **env_args):
+    """The definition of an episode, in a few lines of its own."""
+    env = gym.make(env_id, **env_args)
+    returns, lengths = [], []
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        returns.append(0.0)
+        lengths.append(0)
+        ended = False
+        while not ended and lengths[-1] < max_steps:
+            observation, reward, terminated, truncated, _ = env.step(policy.act(observation))
+            returns[-1] += float(reward)
+            lengths[-1] += 1
+            ended = terminated or truncated
+    return Episodes(tuple(seeds), tuple(returns), tuple(lengths))
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v0", "CartPole-v1"])
+@pytest.mark.parametrize("noise", [0.0, 0.6, 3.0])
+def test_vectorised_cartpole_plays_the_scalar_env_s_episodes(env_id, noise):
+    policy, seeds = balancing_policy(env_id, noise), tuple(range(1000, 1100))
+    expected = by_hand(policy, env_id, seeds)
+    assert evaluate_policy(policy, env_id=env_id, seeds=seeds) == expected
+    if noise:
+        assert len(set(expected.lengths)) > 5  # or the test would see little
+    else:
+        assert set(expected.lengths) == {200 if env_id == "CartPole-v0" else 500}
+
+
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_vectorised_cartpole_has_the_scalar_env_s_other_reward(noise):
+    policy, seeds = balancing_policy("CartPole-v1", noise, seed=1), tuple(range(20))
+    expected = by_hand(policy, "CartPole-v1", seeds, sutton_barto_reward=True)
+    assert set(expected.returns) == ({0.0} if not noise else {-1.0})
+    ours = evaluate_policy(policy, env_id="CartPole-v1", env_args={"sutton_barto_reward": True}, seeds=seeds)
+    assert ours == expected
+
+
+def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit():
+    seen = []
+
+    class Spy(NetworkPolicy):
+        def act(self, observations):
+            seen.append(np.array(observations))
+            return super().act(observations)
+
+    policy = Spy(make_portable("CartPole-v1", seed=2))
+    episodes = evaluate_policy(policy, env_id="CartPole-v1", seeds=[11, 12])
+    vectorised, seen = list(seen), []
+    for side, seed in enumerate((11, 12)):
+        seen = []
+        by_hand(policy, "CartPole-v1", [seed])
+        assert len(seen) == episodes.lengths[side]
+        for step, observation in enumerate(seen):
+            np.testing.assert_array_equal(observation, vectorised[step][side])
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v0", "Pendulum-v1", "TestWalk-v0"])
+def test_an_episode_depends_on_its_seed_alone(env_id, monkeypatch):
+    monkeypatch.setattr(policies.evaluate, "_MAX_CARTPOLES", 8)
+    policy = balancing_policy(env_id, 0.6) if env_id == "CartPole-v0" else make_policy(env_id, seed=1)
+    seeds = tuple(int(seed) for seed in np.random.default_rng(0).permutation(40)[:21])
+    whole = evaluate_policy(policy, env_id=env_id, seeds=seeds, max_episode_steps=60)
+    assert whole.seeds == seeds
+    assert whole == by_hand(policy, env_id, seeds, 60)
+    back = evaluate_policy(policy, env_id=env_id, seeds=seeds[::-1], max_episode_steps=60)
+    assert (back.returns[::-1], back.lengths[::-1]) == (whole.returns, whole.lengths)
+    alone = [
+        evaluate_policy(policy, env_id=env_id, seeds=[seed], max_episode_steps=60).returns[0]
+        for seed in seeds
+    ]
+    assert tuple(alone) == whole.returns
+
+
+def test_an_evaluator_can_be_used_again_and_again():
+    first, second = balancing_policy("CartPole-v0", 0.6, seed=1), balancing_policy("CartPole-v0", 0.6, seed=2)
+    with Evaluator("CartPole-v0", None, range(12)) as evaluator:
+        results = [evaluator.run(policy) for policy in (first, second, first)]
+    assert results[0] == results[2] != results[1]
+    assert results[1] == by_hand(second, "CartPole-v0", range(12))
+
+
+def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed(monkeypatch):
+    monkeypatch.setattr(policies.evaluate, "_MAX_ENVS", 3)
+    policy, seeds = make_policy("TestWalk-v0", seed=1), tuple(range(17))
+    with Evaluator("TestWalk-v0", {"end": 2.0}, seeds, max_episode_steps=300) as evaluator:
+        result = evaluator.run(policy)
+        assert len(evaluator._envs) == 3
+        assert evaluator.run(policy) == result
+    assert result == by_hand(policy, "TestWalk-v0", seeds, 300, end=2.0)
+    assert len(set(result.lengths)) > 5
+
+
+def test_continuous_actions():
+    policy = make_policy("Pendulum-v1", seed=3)
+    result = evaluate_policy(policy, env_id="Pendulum-v1", seeds=range(5))
+    assert result == by_hand(policy, "Pendulum-v1", range(5))
+    assert result.lengths == (200,) * 5
+    assert result.mean_return == pytest.approx(np.mean(result.returns))
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_a_random_policy_repeats_itself(env_id):
+    policy = RandomPolicy.for_env(env_id, seed=1)
+    first = evaluate_policy(policy, env_id=env_id, seeds=range(6))
+    policy.act(np.zeros(policy.observation_space.shape))
+    assert evaluate_policy(policy, env_id=env_id, seeds=range(6)) == first
+    assert (
+        evaluate_policy(RandomPolicy.for_env(env_id), env_id=env_id, seeds=range(3)).returns
+        == first.returns[:3]
+    )
+    assert len(set(first.returns)) > 1
+
+
+def test_a_random_policy_scores_what_is_known_of_it():
+    result = evaluate_policy(RandomPolicy.for_env("CartPole-v1"), env_id="CartPole-v1", seeds=range(300))
+    assert 19 < result.mean_return < 26
+
+
+def test_an_endless_episode_is_cut_off():
+    policy = make_policy("TestWalk-v0")
+    assert evaluate_policy(policy, env_id="TestWalk-v0", seeds=[0]).lengths == (10_000,)
+    assert evaluate_policy(policy, env_id="TestWalk-v0", seeds=[0], max_episode_steps=7).lengths == (7,)
+    short = evaluate_policy(balancing_policy(), env_id="CartPole-v0", seeds=[0, 1], max_episode_steps=7)
+    assert (short.lengths, short.returns) == ((7, 7), (7.0, 7.0))
+    capped = evaluate_policy(
+        balancing_policy("CartPole-v1"),
+        env_id="CartPole-v1",
+        env_args={"max_episode_steps": 40},
+        seeds=[0, 1],
+    )
+    assert capped.lengths == (40, 40)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v0", "Pendulum-v1"])
+def test_weights_that_are_not_finite_are_refused(env_id):
+    portable = make_portable(env_id)
+    portable.network.layers[0].weight[0, 0] = np.nan
+    with pytest.raises(NonFiniteWeightsError, match="layer 0"):
+        evaluate_policy(NetworkPolicy(portable), env_id=env_id, seeds=[0])
+
+
+@pytest.mark.parametrize(
+    ("policy_env", "env_id", "words"),
+    [
+        ("CartPole-v1", "Pendulum-v1", "observations"),
+        ("CartPole-v1", "Acrobot-v1", "observations"),
+        ("MountainCar-v0", "MountainCarContinuous-v0", "actions"),
+        ("MountainCar-v0", "TestWalk-v0", "actions"),
+    ],
+)
+def test_a_policy_for_another_env_is_refused(policy_env, env_id, words):
+    with pytest.raises(EnvError, match=f"is for {policy_env}, whose {words}"):
+        evaluate_policy(make_policy(policy_env), env_id=env_id, seeds=[0])
+
+
+def test_a_policy_for_one_cartpole_may_act_in_the_other():
+    assert evaluate_policy(balancing_policy("CartPole-v0"), env_id="CartPole-v1", seeds=[0]).lengths == (500,)
+
+
+@pytest.mark.parametrize("policy", [make_policy("TestWalk-v0"), RandomPolicy.for_env("TestWalk-v0")])
+def test_an_env_that_raises_is_one_clear_error(policy):
+    with pytest.raises(
+        EnvError, match=r"step\(\) of the episode with seed 5, after 2 steps: RuntimeError: the motor broke"
+    ):
+        evaluate_policy(policy, env_id="TestWalk-v0", env_args={"fail_at": 3}, seeds=[5])
+
+
+@pytest.mark.parametrize(("seeds", "cap"), [([], None), ([1, -1], None), ([1], 0)])
+def test_seeds_and_caps_out_of_range_are_refused(seeds, cap):
+    with pytest.raises(SpecError):
+        evaluate_policy(balancing_policy(), env_id="CartPole-v0", seeds=seeds, max_episode_steps=cap)
+
+
+def test_an_episode_step_by_step():
+    policy, env = balancing_policy(noise=3.0, seed=1), make_env("CartPole-v0")
+    steps = list(episode_steps(policy, env, 3, max_episode_steps=200))
+    assert [length for length, _, _ in steps] == list(range(len(steps)))
+    assert [over for _, _, over in steps] == [False] * (len(steps) - 1) + [True]
+    assert play_episode(policy, env, 3, max_episode_steps=200) == (steps[-1][1], steps[-1][0])
+
+
+def test_episodes_are_plain_values():
+    episodes = evaluate_policy(balancing_policy(), env_id="CartPole-v0", seeds=np.arange(2))
+    for values, kind in ((episodes.seeds, int), (episodes.returns, float), (episodes.lengths, int)):
+        assert isinstance(values, tuple)
+        assert all(type(value) is kind for value in values)
+    assert dataclasses.asdict(episodes)["lengths"] == (200, 200)

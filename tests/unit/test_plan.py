@@ -1,0 +1,222 @@
+"""Plans: the trials of a sweep, what fits on a machine, and what is refused with its numbers."""
+
+import json
+import math
+import os
+
+import pytest
+
+from policies.errors import CannotRunError, EnvError, SpecError
+from tune_jobs import plan as plan_module
+from tune_jobs.plan import Machine, local_machine, make_plan, trial_id
+from tune_jobs.seeds import SEEDS_PER_TRIAL
+from tune_jobs.spec_file import load_spec
+
+TWO_CORES = Machine(num_cpus=2)
+
+
+def plan(*overrides, machine=TWO_CORES, source="cartpole-ppo"):
+    return make_plan(load_spec(source, overrides), machine)
+
+
+def test_the_tutorials_sweep():
+    made = plan()
+    assert (len(made.trials), made.num_points) == (20, 20)
+    assert (made.cpus_per_trial, made.gpus_per_trial, made.max_concurrent) == (1, 0, 2)
+    assert [trial.trial_id for trial in made.trials[:2]] == ["t0000", "t0001"]
+    assert len(made.evaluation_seeds) == 10
+    assert len(made.confirmation_seeds) == 100
+    assert made.env.env_id == "CartPole-v0"
+    assert made.notes == ()
+
+
+def test_each_trial_has_all_hyperparameters_its_point_among_them():
+    for trial in plan().trials:
+        assert trial.hyperparams["num_epochs"] == 6
+        assert trial.hyperparams["grad_clip"] is None
+        assert {name: trial.hyperparams[name] for name in trial.point} == trial.point
+        assert sorted(trial.point) == ["activation", "hidden_sizes", "lr"]
+    json.dumps(plan().to_json())
+
+
+def test_seeds_per_point_repeat_a_point_with_other_seeds():
+    made = plan("seeds_per_point=3", "num_samples=2")
+    assert (len(made.trials), made.num_points) == (24, 8)
+    assert [(trial.point_index, trial.seed_index) for trial in made.trials[:4]] == [
+        (0, 0),
+        (0, 1),
+        (0, 2),
+        (1, 0),
+    ]
+    assert made.trials[0].point == made.trials[2].point
+    assert len({trial.seed for trial in made.trials}) == 24
+
+
+def test_more_samples_append_trials():
+    assert plan("num_samples=7").trials[:20] == plan().trials
+
+
+@pytest.mark.parametrize(
+    "change", ["resources.max_concurrent=1", "stop.num_env_steps=1000", "evaluation.num_episodes=3"]
+)
+def test_trials_do_not_depend_on_anything_else(change):
+    assert plan(change, machine=Machine(num_cpus=64)).trials == plan().trials
+
+
+@pytest.mark.parametrize(
+    ("overrides", "machine", "expected"),
+    [
+        ([], Machine(1), 1),
+        ([], Machine(1.5), 1),
+        ([], Machine(64), 20),
+        (["resources.max_concurrent=3"], Machine(64), 3),
+        (["resources.num_env_runners=1"], Machine(5), 2),
+        (["resources.num_cpus=3"], Machine(8), 2),
+        (["resources.num_cpus=3"], Machine(8, nodes=((4, 0), (4, 0))), 2),
+        (["resources.num_cpus=3"], Machine(10, nodes=((5, 0), (5, 0))), 2),
+        (["resources.num_env_runners=2"], Machine(6, nodes=((2, 0), (2, 0), (2, 0))), 2),
+        (["resources.num_gpus=1"], Machine(64, 2), 2),
+        (["resources.num_gpus=0.3333333333333333"], Machine(64, 2), 6),
+        (["resources.num_gpus=0.6"], Machine(64, 2), 2),
+        (["resources.num_gpus=2"], Machine(64, 5), 2),
+        (["resources.num_gpus=1"], Machine(64, 1, nodes=((4, 1), (60, 0))), 1),
+    ],
+)
+def test_as_many_trials_at_once_as_fit(overrides, machine, expected):
+    assert plan(*overrides, machine=machine).max_concurrent == expected
+
+
+@pytest.mark.parametrize(
+    ("overrides", "machine", "parts"),
+    [
+        (
+            ["resources.num_env_runners=2"],
+            TWO_CORES,
+            ["3 CPUs (1 process and 2 env runners)", "has 2", "at most 1"],
+        ),
+        (
+            ["resources.num_cpus=4"],
+            TWO_CORES,
+            ["needs 4 CPUs", "this machine has 2", "resources.num_cpus to at most 2"],
+        ),
+        (["resources.num_gpus=0.5"], TWO_CORES, ["needs 0.5 GPUs", "has 0"]),
+        (
+            ["resources.num_cpus=4"],
+            Machine(6, 0, "the cluster at auto", ((3, 0), (3, 0))),
+            ["the cluster at auto", "3 and 0"],
+        ),
+        (["resources.num_gpus=1"], Machine(4, 1, "c", ((0, 1), (4, 0))), ["1 CPUs and 1 GPUs on one node"]),
+        ([], Machine(0.5), ["needs 1 CPUs", "has 0.5"]),
+    ],
+)
+def test_what_would_wait_for_ever_is_refused_with_the_numbers(overrides, machine, parts):
+    with pytest.raises(CannotRunError) as caught:
+        plan(*overrides, machine=machine)
+    assert caught.value.exit_code == 5
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_values_that_contradict_each_other_are_told_with_their_point():
+    with pytest.raises(SpecError) as caught:
+        plan("hyperparams.minibatch_size=", "space.minibatch_size={grid: [256, 2048]}")
+    assert caught.value.exit_code == 2
+    assert "point 1 (hidden_sizes [32], activation linear" in caught.value.message
+    assert "minibatch_size 2048 is larger than train_batch_size 1024" in caught.value.message
+    assert "t0001" in caught.value.message
+
+
+def test_sub_environments_have_to_fit_into_a_trials_seeds():
+    machine = Machine(64)
+    assert (
+        plan("hyperparams.num_envs=512", "resources.num_env_runners=2", machine=machine).max_concurrent == 20
+    )
+    with pytest.raises(SpecError, match=f"1536 sub-environments.*{SEEDS_PER_TRIAL}"):
+        plan("hyperparams.num_envs=512", "resources.num_env_runners=3", machine=machine)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "part"),
+    [
+        (["env=CartPole-v7"], "CartPole-v7"),
+        (["env=os:CartPole-v1"], "os:CartPole-v1"),
+        (["env.args.x=3"], "'x'"),
+        (["env=FrozenLake-v1"], "Box"),
+    ],
+)
+def test_environments_that_cannot_be_used(overrides, part):
+    with pytest.raises(EnvError, match=part):
+        plan(*overrides)
+
+
+def test_dqn_needs_discrete_actions():
+    with pytest.raises(EnvError, match="Pendulum-v1"):
+        plan(source={"env": "Pendulum-v1", "algorithm": "dqn"})
+    assert len(plan(source={"env": "Pendulum-v1", "algorithm": "ppo"}).trials) == 1
+
+
+def test_far_too_many_trials_are_refused_before_they_are_drawn():
+    with pytest.raises(SpecError, match="4,000,000 trials"):
+        plan("num_samples=1000000")
+
+
+def test_env_steps_are_bounded_by_the_cap_and_one_iteration_a_trial():
+    # 1,024 steps an iteration, 8 at a time, of which the last 8 may be one too many.
+    assert plan("num_samples=1").max_env_steps == 4 * (49_999 + 1_032)
+    assert plan("num_samples=1", "stop.num_iterations=2").max_env_steps == 4 * 2 * 1_032
+    dqn = {"env": "CartPole-v1", "algorithm": "dqn", "stop": {"num_env_steps": 5_000}}
+    assert plan(source=dqn).max_env_steps == 4_999 + 1_001
+
+
+def test_disk_grows_with_networks_checkpoints_and_trials():
+    least = plan("num_samples=1").max_disk_bytes
+    assert least < 50e6
+    assert plan().max_disk_bytes > least
+    assert plan("num_samples=1", "checkpoints.keep=4").max_disk_bytes > least
+    wide = plan(
+        "num_samples=1", "space.hidden_sizes=", "hyperparams.hidden_sizes=[1024, 1024]"
+    ).max_disk_bytes
+    # Two networks of a million weights, 4 bytes each, with Adam's two moments, in four checkpoints, for two
+    # trials.
+    assert wide - least > 2 * 4 * 2 * 1e6 * 4 * 3
+
+
+def test_notes_tell_what_may_not_be_meant():
+    assert "repeats every point" in plan("space.lr=").notes[0]
+    assert "below CartPole-v0's threshold 195" in plan("stop.training_return=100").notes[0]
+    assert "only 2 trials fit" in plan("resources.max_concurrent=8").notes[0]
+    assert plan("space=", "num_samples=1").notes == ()
+
+
+def test_trial_ids_sort_and_stay_distinct():
+    assert [trial_id(index) for index in (0, 7, 9_999, 10_000)] == ["t0000", "t0007", "t9999", "t10000"]
+
+
+def test_this_machine_has_no_more_cpus_than_may_be_used():
+    machine = local_machine()
+    assert 1 <= machine.num_cpus <= len(os.sched_getaffinity(0))
+    assert machine.num_cpus == math.floor(machine.num_cpus)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({"cpu.max": "150000 100000\n"}, 1.5),
+        ({"cpu.max": "max 100000\n"}, None),
+        ({"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 4),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, None),
+        ({}, None),
+    ],
+)
+def test_container_limits_are_read(tmp_path, files, expected):
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    assert plan_module._cgroup_quota(tmp_path) == expected
+
+
+@pytest.mark.parametrize(("visible", "expected"), [("", 0), ("-1", 0), ("0", 1), ("0,2", 2)])
+def test_gpus_are_those_that_cuda_would_see(monkeypatch, visible, expected):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert local_machine().num_gpus == expected

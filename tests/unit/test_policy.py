@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import dataclasses
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from policy_factory import make_policy, make_portable, register_test_envs
+
+from policies.errors import TuneJobsError
+from policies.hyperparams import ACTIVATIONS
+from policies.policy import (
+    NetworkPolicy,
+    NonFiniteWeightsError,
+    ObservationError,
+    RandomPolicy,
+    load_policy,
+)
+from policies.portable import save_policy
+
+register_test_envs()
+ENVS = ["CartPole-v1", "Pendulum-v1", "TestPushes-v0", "TestWalk-v0", "MountainCarContinuous-v0"]
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_the_network_computes_what_torch_computes(activation):
+    torch = pytest.importorskip("torch")
+    policy = make_policy("CartPole-v1", hidden=(48, 24), activation=activation)
+    kinds = {
+        "linear": "Identity",
+        "relu": "ReLU",
+        "tanh": "Tanh",
+        "silu": "SiLU",
+        "elu": "ELU",
+        "gelu": "GELU",
+    }
+    modules = []
+    for layer in policy.portable.network.layers:
+        linear = torch.nn.Linear(*layer.weight.shape[::-1])
+        linear.weight.data, linear.bias.data = torch.from_numpy(layer.weight), torch.from_numpy(layer.bias)
+        modules += [linear, getattr(torch.nn, kinds[layer.activation])()]
+    scale = np.array([1, 1, 10, 300])[np.arange(1000) % 4, None]  # far into the flat ends too
+    observations = (np.random.default_rng(0).normal(size=(1000, 4)) * scale).astype(np.float32)
+    with torch.no_grad():
+        expected = torch.nn.Sequential(*modules)(torch.from_numpy(observations)).numpy()
+    with np.errstate(all="raise", under="ignore"):
+        outputs = policy.outputs(observations)
+    assert outputs.dtype == np.float32
+    np.testing.assert_allclose(outputs, expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(policy.act(observations), expected.argmax(axis=1))
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("kind", [NetworkPolicy, RandomPolicy])
+def test_one_observation_gives_what_the_env_takes(env_id, kind):
+    env = gym.make(env_id)
+    policy = make_policy(env_id) if kind is NetworkPolicy else RandomPolicy.for_env(env_id)
+    observation, _ = env.reset(seed=0)
+    action = policy.act(observation)
+    if isinstance(env.action_space, gym.spaces.Discrete):
+        assert type(action) is int
+    else:
+        assert action.shape == env.action_space.shape
+        assert action.dtype == env.action_space.dtype
+    assert env.action_space.contains(action)
+    env.step(action)
+    actions = policy.act(np.stack([observation] * 5))
+    assert actions.shape == (5, *env.action_space.shape)
+    assert policy.act(np.zeros((0, len(observation)))).shape == (0, *env.action_space.shape)
+    assert policy.act(observation.tolist()) is not None
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("hidden", [(64, 64), (300, 7)])
+def test_an_action_does_not_depend_on_its_batch_to_the_last_bit(activation, hidden):
+    policy = make_policy("Pendulum-v1", hidden=hidden, activation=activation)
+    observations = np.random.default_rng(1).normal(size=(37, 3)).astype(np.float32)
+    batch = policy.act(observations)
+    for first in range(0, 37, 5):
+        np.testing.assert_array_equal(policy.act(observations[first : first + 5]), batch[first : first + 5])
+    for observation, action in zip(observations, batch, strict=True):
+        np.testing.assert_array_equal(policy.act(observation), action)
+
+
+def test_discrete_actions_start_where_their_space_does():
+    policy = make_policy("TestWalk-v0", seed=3)
+    observations = np.random.default_rng(0).normal(size=(200, 2))
+    assert set(policy.act(observations).tolist()) == {3, 4}
+    np.testing.assert_array_equal(policy.act(observations), policy.outputs(observations).argmax(axis=1) + 3)
+
+
+def test_q_values_act_by_the_largest():
+    policy = make_policy("CartPole-v1", algorithm="dqn")
+    assert policy.portable.network.kind == "q_values"
+    observations = np.random.default_rng(0).normal(size=(50, 4))
+    np.testing.assert_array_equal(policy.act(observations), policy.outputs(observations).argmax(axis=1))
+
+
+def _gaussian(env_id, transform):
+    policy = NetworkPolicy(dataclasses.replace(make_portable(env_id, seed=5), action_transform=transform))
+    observations = 3 * np.random.default_rng(0).normal(size=(300, policy.observation_space.shape[0]))
+    size = policy.action_space.shape[0]
+    return policy.outputs(observations)[:, :size], policy.act(observations)
+
+
+def test_bounded_actions_are_stretched_over_the_bounds_and_clipped():
+    mean, actions = _gaussian("Pendulum-v1", "unsquash")
+    assert (np.abs(mean) > 1).any()
+    np.testing.assert_array_equal(actions, np.clip(np.float32(2) * mean, -2, 2))
+
+
+def test_actions_with_an_open_bound_are_left_as_they_are():
+    mean, actions = _gaussian("TestPushes-v0", "unsquash")
+    assert (np.abs(mean) > 1).any()
+    np.testing.assert_array_equal(actions, mean)
+
+
+def test_clipping_keeps_each_bound():
+    mean, actions = _gaussian("TestPushes-v0", "clip")
+    assert (np.abs(mean[:, 0]) > 1).any()
+    np.testing.assert_array_equal(actions, np.stack([np.clip(mean[:, 0], -1, 1), mean[:, 1]], axis=1))
+    mean, actions = _gaussian("Pendulum-v1", "none")
+    np.testing.assert_array_equal(actions, mean)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (5,), (2, 3), (1, 2, 4)])
+def test_observations_of_another_shape_are_refused(shape):
+    with pytest.raises(ObservationError, match=r"shape \(4,\)"):
+        make_policy("CartPole-v1").act(np.zeros(shape))
+
+
+def test_observations_that_are_no_numbers_are_refused():
+    with pytest.raises(ObservationError, match="must be numbers"):
+        make_policy("CartPole-v1").act(["a", "b", "c", "d"])
+    with pytest.raises(ObservationError):
+        make_policy("CartPole-v1").act([[1, 2, 3, 4], [1, 2]])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite_are_named(value):
+    portable = make_portable("CartPole-v1")
+    NetworkPolicy(portable).check_finite()
+    portable.network.layers[1].bias[3] = value
+    with pytest.raises(NonFiniteWeightsError, match="1 weights .* in layer 1") as caught:
+        NetworkPolicy(portable).check_finite()
+    assert pickle.loads(pickle.dumps(caught.value)).message == caught.value.message
+
+
+def test_random_actions_follow_the_seed_alone():
+    one, two = RandomPolicy.for_env("Pendulum-v1", seed=4), RandomPolicy.for_env("Pendulum-v1", seed=5)
+    observations = np.zeros((20, 3))
+    first = one.act(observations)
+    assert not np.array_equal(first, two.act(observations))
+    two.reset(4)
+    np.testing.assert_array_equal(first, two.act(observations))
+    assert not np.array_equal(first, one.act(observations))
+
+
+def test_random_actions_are_uniform_and_of_another_stream_than_the_env():
+    policy = RandomPolicy.for_env("CartPole-v1", seed=7)
+    actions = policy.act(np.zeros((4000, 4)))
+    assert abs(actions.mean() - 0.5) < 0.05
+    space = gym.spaces.Discrete(2, seed=7)  # as env.reset(seed=7) seeds the env's generator
+    assert [space.sample() for _ in range(50)] != actions[:50].tolist()
+
+
+def test_a_random_policy_leaves_the_env_s_own_generator_alone():
+    env = gym.make("CartPole-v1")
+    env.action_space.seed(1)
+    expected = [env.action_space.sample() for _ in range(20)]
+    env.action_space.seed(1)
+    RandomPolicy(env.observation_space, env.action_space, env_id="CartPole-v1").act(np.zeros((9, 4)))
+    assert [env.action_space.sample() for _ in range(20)] == expected
+
+
+def test_random_actions_of_another_kind_are_refused():
+    with pytest.raises(TuneJobsError, match="MultiDiscrete"):
+        RandomPolicy(gym.spaces.Box(-1, 1, (2,)), gym.spaces.MultiDiscrete([2, 2]), env_id="x")
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_a_loaded_policy_acts_as_the_saved_one(env_id, tmp_path):
+    policy = make_policy(env_id, activation="gelu")
+    save_policy(policy.portable, tmp_path)
+    loaded = load_policy(str(tmp_path))
+    assert (loaded.env_id, loaded.env_args, loaded.description) == (env_id, {}, f"PPO on {env_id}")
+    observations = np.random.default_rng(0).normal(size=(40, policy.observation_space.shape[0]))
+    np.testing.assert_array_equal(loaded.act(observations), policy.act(observations))

@@ -1,0 +1,169 @@
+"""Where a sweep runs: this machine, a Ray cluster it is part of, or one it reaches as a Ray client.
+
+The same sweep runs on all of them; what differs is how Ray is joined and how it is known that every node reaches the
+storage.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from policies.errors import CannotRunError, TuneJobsError
+from policies.files import write_atomic
+from tune_jobs.plan import Machine
+from tune_jobs.runner import prepare_environment
+
+# Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
+_OBJECT_STORE_BYTES = 256 * 1024**2
+_PROBE_TIMEOUT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A joined cluster."""
+
+    address: str | None
+    is_client: bool
+    """Joined by `ray://`: the trials' driver has to run on the cluster."""
+    machine: Machine
+
+
+@contextlib.contextmanager
+def connect(address: str | None, machine: Machine | None = None) -> Iterator[Connection]:
+    """Join a cluster, or start Ray on this machine, for the time of the block.
+
+    A connection that the caller already has is used and kept, if it is to the wanted address or none is given.
+
+    Args:
+        address: None: this machine; `auto`, `host:port` or `ray://host:port`.
+        machine: What to start Ray with on this machine.
+
+    Raises:
+        CannotRunError: Nothing answers at the address, its Ray differs, or Ray does not start.
+    """
+    prepare_environment()
+    if ray.is_initialized():
+        yield Connection(address, _is_client(), cluster_machine("the connected Ray cluster"))
+        return
+    try:
+        _init(address, machine)
+    except TuneJobsError:
+        raise
+    except Exception as error:
+        where = "on this machine" if address is None else f"at {address}"
+        first_line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        hint = (
+            "See the Ray logs in /tmp/ray/session_latest/logs."
+            if address is None
+            else "Check that the cluster runs (`ray status`), that the address is right, and that its Ray, Python and "
+            "token (RAY_AUTH_TOKEN) are those of this machine."
+        )
+        raise CannotRunError(f"Ray cannot be joined {where}: {first_line}", hint) from error
+    try:
+        source = "this machine" if address is None else f"the cluster at {address}"
+        yield Connection(address, _is_client(), cluster_machine(source))
+    finally:
+        ray.shutdown()
+
+
+def _init(address: str | None, machine: Machine | None) -> None:
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address is None:
+        # A local sweep sends nothing anywhere; who wants Ray's usage statistics sets the variable.
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        resources: dict[str, Any] = {}
+        if machine is not None:
+            resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
+        # "local": a cluster of this sweep's own, even where one happens to run already.
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            object_store_memory=_OBJECT_STORE_BYTES,
+            **resources,
+            **quiet,
+        )
+    else:
+        ray.init(address=address, **quiet)
+
+
+def _is_client() -> bool:
+    return bool(ray.util.client.ray.is_connected())
+
+
+def _alive_nodes() -> list[dict[str, Any]]:
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
+def cluster_machine(source: str) -> Machine:
+    """The CPUs and GPUs of the joined cluster's nodes."""
+    nodes = tuple(
+        (float(node["Resources"].get("CPU", 0)), float(node["Resources"].get("GPU", 0))) for node in _alive_nodes()
+    )
+    return Machine(
+        num_cpus=sum(cpus for cpus, _ in nodes), num_gpus=sum(gpus for _, gpus in nodes), source=source, nodes=nodes
+    )
+
+
+def check_storage(folder: Path) -> None:
+    """Check, from a worker on every node, that it reads and writes the very folder that is seen here.
+
+    Raises:
+        CannotRunError: A node does not, or has another version of tune-jobs; the message names it.
+    """
+    token = secrets.token_hex(8)
+    probe = folder / ".probe"
+    probe.mkdir(parents=True, exist_ok=True)
+    write_atomic(probe / "question", token)
+    try:
+        tasks = {}
+        for node in _alive_nodes():
+            strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
+            remote = ray.remote(num_cpus=0, max_retries=0)(_answer).options(scheduling_strategy=strategy)
+            name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"
+            tasks[name] = remote.remote(str(probe), node["NodeID"])
+        for name, task in tasks.items():
+            _check_answer(name, task, probe, token)
+    finally:
+        for path in probe.iterdir():
+            path.unlink(missing_ok=True)
+        probe.rmdir()
+
+
+def _answer(probe: str, node_id: str) -> tuple[str, str]:
+    """On a node: read the question, leave an answer; returns both what was read and the version there."""
+    question = Path(probe, "question").read_text(encoding="utf-8")
+    write_atomic(Path(probe, node_id), question)
+    return question, version("tune-jobs")
+
+
+def _check_answer(name: str, task: Any, probe: Path, token: str) -> None:
+    folder = probe.parent
+    storage_hint = "Choose storage that every node reaches (a network file system) with --storage."
+    try:
+        question, their_version = ray.get(task, timeout=_PROBE_TIMEOUT_S)
+    except Exception as error:
+        cause = getattr(error, "cause", None) or error
+        if isinstance(cause, ImportError) or "ModuleNotFoundError" in str(error):
+            raise CannotRunError(
+                f"Node {name} has no tune-jobs.", "Install the same version on every node, or use its image."
+            ) from error
+        reason = (str(cause).strip().splitlines() or [type(cause).__name__])[-1]
+        raise CannotRunError(f"Node {name} cannot use the sweep folder {folder}: {reason}", storage_hint) from error
+    if question != token or not any(path.name != "question" for path in probe.iterdir()):
+        raise CannotRunError(f"Node {name} sees another folder under the name {folder}.", storage_hint)
+    if their_version != version("tune-jobs"):
+        raise CannotRunError(
+            f"Node {name} has tune-jobs {their_version}, {socket.gethostname()} has {version('tune-jobs')}.",
+            "Install the same version everywhere.",
+        )

@@ -1,0 +1,262 @@
+"""What happens to a sweep's trials afterwards: best, evaluate, video, report. None of it starts Ray."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord, TrialRecord
+from analysis.selection import NoUsableTrialError, score_trial, select_best
+from policies.envs import check_env
+from policies.errors import NotFoundError, SpecError
+from policies.evaluate import evaluate_policy
+from policies.policy import NetworkPolicy, Policy, RandomPolicy, load_policy
+from policies.portable import read_policy, save_policy
+from policies.video import record_side_by_side, record_video
+from tune_jobs.seeds import confirmation_seeds
+from tune_jobs.spec import SweepSpec
+from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
+
+DEFAULT_STORAGE = "sweeps"
+RANDOM = "random"
+# The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
+FRESH_SEED = 2**31
+
+
+def storage_folder(storage: str | Path | None) -> Path:
+    """The given folder, else $TUNE_JOBS_STORAGE, else ./sweeps; absolute."""
+    chosen = storage or os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
+    return Path(chosen).expanduser().absolute()
+
+
+def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepStore:
+    """A sweep by its folder, or by its name in the storage folder.
+
+    Raises:
+        NotFoundError: There is none.
+    """
+    as_folder = SweepStore(Path(sweep).expanduser())
+    if as_folder.exists():
+        return as_folder
+    root = storage_folder(storage)
+    store = SweepStore(root / str(sweep))
+    if store.exists():
+        return store
+    known = [item.name for item in list_sweep_stores(root)]
+    close = difflib.get_close_matches(str(sweep), known, n=1)
+    guess = f" Did you mean {close[0]!r}?" if close else ""
+    raise NotFoundError(
+        f"No sweep {str(sweep)!r} in {root}.{guess}",
+        "List the sweeps with `tune-jobs list`; name another storage folder with --storage.",
+    )
+
+
+def read_trials(store: SweepStore) -> list[TrialRecord]:
+    """The trials, with the checkpoints that are on disk now (a killed driver's records may lag behind them)."""
+    return [
+        record.model_copy(update={"checkpoints": tuple(store.trial(record.trial_id).checkpoints())})
+        for record in store.read_trials()
+    ]
+
+
+def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
+    """Every trial's results, by trial id."""
+    return {record.trial_id: store.trial(record.trial_id).read_iterations() for record in store.read_trials()}
+
+
+def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
+    """Select the winner, confirm it on seeds it was not chosen on, and copy its policy to best/.
+
+    Raises:
+        NoUsableTrialError: No trial can win; the message says why.
+        CheckpointError: The winner's checkpoint is damaged.
+    """
+    sweep = store.read_record()
+    spec = SweepSpec.model_validate(sweep.spec)
+    selection = select_best(read_trials(store))
+    folder = store.folder / selection.checkpoint.path
+    verify_checkpoint(folder)
+    portable = read_policy(folder)
+    seeds = confirmation_seeds(spec.seed, num_episodes)
+    policy = NetworkPolicy(portable, description=f"{store.name}/{selection.trial.trial_id}")
+    record = BestRecord(
+        checkpoint=selection.checkpoint,
+        point=selection.trial.point,
+        seed=selection.trial.seed,
+        selection_score=selection.score,
+        confirmation=run_evaluation(policy, spec.env.id, spec.env.args, seeds),
+        random=run_evaluation(_random_policy(spec.env.id, spec.env.args), spec.env.id, spec.env.args, seeds),
+    )
+    save_policy(portable, store.best_folder)
+    store.write_best(record)
+    return record
+
+
+def run_evaluation(policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int]) -> EvaluationRecord:
+    """Greedy episodes of a policy, one a seed."""
+    episodes = evaluate_policy(policy, env_id=env_id, env_args=env_args, seeds=seeds)
+    return EvaluationRecord(
+        policy=policy.description,
+        env_id=env_id,
+        env_args=env_args,
+        seeds=episodes.seeds,
+        returns=episodes.returns,
+        lengths=episodes.lengths,
+        threshold=check_env(env_id, env_args).threshold,
+    )
+
+
+def _random_policy(env_id: str, env_args: dict[str, Any]) -> RandomPolicy:
+    return RandomPolicy.for_env(env_id, env_args)
+
+
+@dataclass(frozen=True)
+class PolicySource:
+    """A policy, where it acts, and where it came from."""
+
+    policy: Policy
+    env_id: str
+    env_args: dict[str, Any]
+    store: SweepStore | None = None
+    """The sweep, where the policy is a sweep's best."""
+
+
+def find_policy(source: str | Path, storage: str | Path | None = None, env_id: str | None = None) -> PolicySource:
+    """A policy by any of its names.
+
+    Args:
+        source: A sweep (its best; chosen now if it has not been), `SWEEP/TRIAL` (its best checkpoint), a checkpoint
+            folder, a policy file, or `random`.
+        storage: Where sweeps are looked for by name.
+        env_id: Where it acts; needed for `random`, else the environment it was trained in.
+
+    Raises:
+        NotFoundError: There is no such thing.
+        CheckpointError: It is damaged.
+        SpecError: `random` without an environment.
+    """
+    text = str(source)
+    if text == RANDOM:
+        if env_id is None:
+            raise SpecError("A random policy needs an environment.", "Name one with --env, such as --env CartPole-v1.")
+        return PolicySource(_random_policy(env_id, {}), env_id, {})
+    path = Path(text).expanduser()
+    store: SweepStore | None = None
+    if (path / MANIFEST).is_file():
+        verify_checkpoint(path)
+        policy = load_policy(path)
+    elif path.is_file() or (path / "policy.json").is_file():
+        policy = load_policy(path)
+    else:
+        store, trial_id = _sweep_and_trial(text, storage)
+        if trial_id is None:
+            if not (store.best_folder / "evaluation.json").is_file():
+                choose_best(store)
+            policy = load_policy(store.best_folder)
+        else:
+            checkpoint = store.folder / best_checkpoint(store, trial_id).path
+            verify_checkpoint(checkpoint)
+            policy = load_policy(checkpoint)
+            store = None
+    if env_id is not None and env_id != policy.env_id:
+        return PolicySource(policy, env_id, {})
+    return PolicySource(policy, policy.env_id, dict(policy.env_args), store)
+
+
+def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[SweepStore, str | None]:
+    try:
+        return find_sweep(text, storage), None
+    except NotFoundError:
+        sweep, _, trial_id = text.rpartition("/")
+        if not sweep:
+            raise
+        try:
+            return find_sweep(sweep, storage), trial_id
+        except NotFoundError as error:
+            raise NotFoundError(
+                f"No sweep, trial, checkpoint or policy file {text!r}: {error.message}", error.hint
+            ) from error
+
+
+def best_checkpoint(store: SweepStore, trial_id: str) -> CheckpointRecord:
+    """The checkpoint of one trial with the highest evaluation return.
+
+    Raises:
+        NotFoundError: No such trial, or it has no evaluated checkpoint.
+    """
+    trials = {record.trial_id: record for record in read_trials(store)}
+    if trial_id not in trials:
+        raise NotFoundError(
+            f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)}.",
+            f"List them with `tune-jobs trials {store.name}`.",
+        )
+    # A trial that failed later may still be looked at, though it cannot win.
+    found = score_trial(trials[trial_id].model_copy(update={"status": "completed"}))
+    if found is None:
+        raise NotFoundError(
+            f"Trial {trial_id} of sweep {store.name} has no checkpoint with a score.",
+            f"See why with `tune-jobs trials {store.name}`.",
+        )
+    return found.checkpoint
+
+
+def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
+    """Film a random policy (before) and the winner (after) on one seed, alone and side by side, into best/.
+
+    Returns:
+        before_mp4, after_mp4, after_gif and before_after_mp4.
+    """
+    source = find_policy(store.folder)
+    best = store.read_best()
+    chosen = best.confirmation.seeds[0] if seed is None else seed
+    before = _random_policy(source.env_id, source.env_args)
+    names = {"before_mp4": "before.mp4", "after_mp4": "after.mp4", "after_gif": "after.gif",
+             "before_after_mp4": "before_after.mp4"}
+    paths = {key: store.best_folder / name for key, name in names.items()}
+    env = {"env_id": source.env_id, "env_args": source.env_args, "seeds": chosen}
+    record_video(before, **env, mp4=paths["before_mp4"], caption="before training: random")
+    caption = f"after training: {best.checkpoint.trial_id}"
+    record_video(source.policy, **env, mp4=paths["after_mp4"], gif=paths["after_gif"], caption=caption)
+    record_side_by_side(
+        before, source.policy, **env, mp4=paths["before_after_mp4"], captions=("before: random", "after training")
+    )
+    return paths
+
+
+def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]:
+    """Film one episode of any policy: MP4 and GIF, named by `output` with the two endings."""
+    mp4, gif = output.with_suffix(".mp4"), output.with_suffix(".gif")
+    record_video(
+        source.policy, env_id=source.env_id, env_args=source.env_args, seeds=seed, mp4=mp4, gif=gif,
+    )  # fmt: skip
+    return {"mp4": mp4, "gif": gif}
+
+
+def make_report(store: SweepStore) -> Path:
+    """Write the sweep's tables, figures and HTML report; works without a winner, and says why there is none."""
+    from analysis.report import build_report
+
+    try:
+        best = store.read_best()
+    except NotFoundError:
+        try:
+            best = choose_best(store)
+        except NoUsableTrialError:
+            best = None
+    videos = {
+        key: path
+        for key, name in (("before", "before.mp4"), ("after", "after.mp4"))
+        if (path := store.best_folder / name).is_file()
+    }
+    return build_report(
+        store.report_folder,
+        sweep=store.read_record(),
+        trials=read_trials(store),
+        results=read_results(store),
+        best=best,
+        videos=videos,
+    )
