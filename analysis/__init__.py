@@ -1,0 +1,1 @@
+"""What a sweep left behind: records, selection, tables, figures, report."""

@@ -81,7 +81,7 @@ def group_names(trials: Sequence[TrialRecord], axis: str | None) -> list[str]:
 
 
 def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[str, Style]:
-    """A style for each trial id: colour by combination of values, marker by the first value, line by the last.
+    """A style for each trial id: colour by combination of values, marker by the first, line by the last.
 
     Without names all trials share one style with an empty label.
     """
@@ -121,6 +121,59 @@ def style_axes(axes: Axes, *, xlabel: str, ylabel: str, title: str = "") -> None
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color(MUTED)
+
+
+def steps_axis(axes: Axes) -> None:
+    """A horizontal axis of env steps from 0, with short numbers."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+
+
+def _short(value: float) -> str:
+    """12000 as "12k", 1500000 as "1.5M"."""
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= unit:
+            return f"{value / unit:g}{letter}"
+    return f"{value:g}"
+
+
+def goal_line(axes: Axes, threshold: float | None) -> None:
+    """The return to reach, dashed; nothing if there is none."""
+    if threshold is not None:
+        axes.axhline(
+            threshold,
+            color=ACCENT,
+            linewidth=1.6,
+            linestyle=(0, (6, 3)),
+            label=f"goal {threshold:g}",
+            zorder=1.5,
+        )
+
+
+def add_legend(
+    figure: Figure, axes: Axes, names: Sequence[str], size: tuple[float, float], *, below: bool = False
+) -> None:
+    """Beside a wide figure, below a narrow one or where asked; never over the data."""
+    handles, labels = axes.get_legend_handles_labels()
+    if not handles:
+        return
+    narrow = size[0] < 6
+    legend = figure.legend(
+        handles,
+        labels,
+        title=escape(" · ".join(names)) or None,
+        title_fontproperties={"size": 9, "weight": "bold"},
+        loc="outside lower left" if narrow or below else "outside right upper",
+        ncols=2 if narrow else 4 if below else 1,
+        frameon=False,
+        labelcolor=INK,
+        fontsize=9,
+        alignment="left",
+    )
+    legend.get_title().set_color(INK)
 
 
 def to_png(figure: Figure, *, dpi: int = 160) -> bytes:

@@ -18,11 +18,14 @@ from analysis.plot_style import (
     MUTED,
     PALETTE,
     Style,
+    add_legend,
     escape,
+    goal_line,
     group_names,
     group_styles,
     new_figure,
     numeric_names,
+    steps_axis,
     style_axes,
 )
 from analysis.records import IterationRecord, TrialRecord
@@ -77,7 +80,7 @@ def learning_curves(
             linestyle="-" if wins else style.line,
             linewidth=3.0 if wins else 1.3,
             alpha=1.0 if wins else 0.65,
-            label="" if style.label in labelled else escape(style.label),
+            label=escape(_curve_label(style.label, wins=wins, known=style.label in labelled)),
             rasterized=total > _MAX_VECTOR_POINTS,
             # A trial of one iteration is a line of no length: show its end.
             marker=style.marker if steps.size == 1 else "",
@@ -85,15 +88,15 @@ def learning_curves(
         )
         labelled.add(style.label)
         if trial.status == "failed":
-            axes.plot(
-                steps[-1], returns[-1], marker="x", markersize=8, color=MUTED, markeredgewidth=2, zorder=5
-            )
+            label = "" if "failed" in labelled else "failed"
+            axes.plot(steps[-1:], returns[-1:], "x", ms=8, color=MUTED, mew=2, zorder=5, label=label)
+            labelled.add(label)
         if wins:
             _draw_winner(axes, trial, trials, results, style)
     style_axes(axes, xlabel="env steps", ylabel="training return, mean of last 100 episodes")
-    _steps_axis(axes)
-    _goal(axes, threshold)
-    _legend(figure, axes, names, size)
+    steps_axis(axes)
+    goal_line(axes, threshold)
+    add_legend(figure, axes, names, size)
     return figure
 
 
@@ -145,8 +148,8 @@ def score_by_lr(
     _mark_lost_and_winner(axes, trials, positions, winner)
     style_axes(axes, xlabel=escape(name or " · ".join(names)), ylabel="best evaluation return")
     _value_axis(axes, list(positions.values()), name, styles)
-    _goal(axes, threshold)
-    _legend(figure, axes, names if name is not None else [], size)
+    goal_line(axes, threshold)
+    add_legend(figure, axes, names if name is not None else [], size)
     return figure
 
 
@@ -173,11 +176,9 @@ def score_per_episode(
         raise ValueError(f"expected the returns of at least one episode, got shape {scores.shape}")
     figure = new_figure(size)
     tall = size[1] > size[0]
-    left, right = figure.subplots(
-        2 if tall else 1,
-        1 if tall else 2,
-        gridspec_kw={"height_ratios": [3, 2]} if tall else {"width_ratios": [2, 1]},
-    )
+    # Ratios are heights or widths, so the long axis of the figure is the one that is shared out.
+    grid = figure.add_gridspec(2, 1, height_ratios=[3, 2]) if tall else figure.add_gridspec(1, 2, width_ratios=[2, 1])
+    left, right = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     episodes = np.arange(1, scores.size + 1)
     left.plot(
         episodes,
@@ -191,9 +192,7 @@ def score_per_episode(
     )
     if scores.size >= 2 * _MEAN_EPISODES:
         means = np.convolve(scores, np.full(_MEAN_EPISODES, 1 / _MEAN_EPISODES), mode="valid")
-        left.plot(
-            episodes[_MEAN_EPISODES - 1 :], means, color=PALETTE[0], linewidth=2.2, label="mean of last 100"
-        )
+        left.plot(episodes[_MEAN_EPISODES - 1 :], means, color=PALETTE[0], linewidth=2.2, label="mean of last 100")
     if scores.size > 1:
         slope, offset = np.polyfit(episodes, scores, 1)
         left.plot(
@@ -205,12 +204,14 @@ def score_per_episode(
             label="linear trend",
         )
     style_axes(left, xlabel="episode", ylabel="score (episode return)", title=escape(title))
-    _goal(left, goal)
-    _, top = left.get_ylim()
-    left.set_ylim(bottom=min(0.0, float(scores.min())), top=top)
-    left.legend(frameon=False, labelcolor=INK, fontsize=9, loc="best")
+    goal_line(left, goal)
+    # The trend of a learner that has arrived overshoots what can be scored: it must not set the scale.
+    low, high = float(scores.min()), max(float(scores.max()), goal if goal is not None else -np.inf)
+    left.set_ylim(min(0.0, low), high + 0.06 * max(high - min(0.0, low), 1.0))
+    add_legend(figure, left, [], size, below=True)
     last = scores[-_HISTOGRAM_EPISODES:]
-    right.hist(last, bins=min(20, max(5, last.size // 3)), color=PALETTE[4], edgecolor="white", linewidth=0.6)
+    # Bins over the range of the whole training: fifty equal scores are then a bar, and its place says how high.
+    right.hist(last, bins=20, range=(min(0.0, low), high), color=PALETTE[4], rwidth=0.92)
     style_axes(right, xlabel="score", ylabel="episodes", title=f"last {last.size} episodes")
     if goal is not None:
         right.axvline(goal, color=ACCENT, linewidth=1.6, linestyle=(0, (6, 3)))
@@ -226,6 +227,13 @@ def _curve(items: Sequence[IterationRecord]) -> tuple[NDArray[np.float64], NDArr
     if len(array) > _MAX_LINE_POINTS:
         array = array[np.linspace(0, len(array) - 1, _MAX_LINE_POINTS).round().astype(int)]
     return array[:, 0], array[:, 1]
+
+
+def _curve_label(group: str, *, wins: bool, known: bool) -> str:
+    """Legend text of a curve: the winner always has one, a group only once."""
+    if wins:
+        return f"winner: {group}" if group else "winner"
+    return "" if known else group
 
 
 def _draw_winner(
@@ -249,7 +257,7 @@ def _draw_winner(
             markerfacecolor="none",
             markeredgecolor=INK,
             markeredgewidth=1.3,
-            label="winner, greedy evaluation",
+            label="winner: greedy evaluation",
             zorder=5,
         )
     curves = [_curve(results.get(t.trial_id, ())) for t in trials if t.point_index == winner.point_index]
@@ -272,14 +280,10 @@ def _draw_winner(
             )
 
 
-def _positions(
-    trials: Sequence[TrialRecord], name: str | None, styles: Mapping[str, Style]
-) -> dict[str, float]:
+def _positions(trials: Sequence[TrialRecord], name: str | None, styles: Mapping[str, Style]) -> dict[str, float]:
     """Where each trial stands on the horizontal axis: its value, or the number of its group."""
     if name is not None:
-        return {
-            trial.trial_id: float(trial.point[name]) for trial in trials if trial.point.get(name) is not None
-        }
+        return {trial.trial_id: float(trial.point[name]) for trial in trials if trial.point.get(name) is not None}
     labels = list(dict.fromkeys(style.label for style in styles.values()))
     positions = {}
     for i, label in enumerate(labels):
@@ -310,7 +314,7 @@ def _mark_lost_and_winner(
             clip_on=False,
         )
     best = next((score_trial(t) for t in trials if t.trial_id == winner), None)
-    if best is not None and winner in positions:
+    if best is not None and winner is not None and winner in positions:
         axes.scatter(
             [positions[winner]],
             [best.score],
@@ -331,51 +335,3 @@ def _value_axis(axes: Axes, values: Sequence[float], name: str | None, styles: M
         axes.set_xlim(-0.6, len(labels) - 0.4)
     elif values and min(values) > 0 and max(values) > 10 * min(values):
         axes.set_xscale("log")
-
-
-def _steps_axis(axes: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter, MaxNLocator
-
-    axes.set_xlim(left=0)
-    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
-
-
-def _short(value: float) -> str:
-    """12000 as "12k", 1500000 as "1.5M"."""
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if abs(value) >= unit:
-            return f"{value / unit:g}{letter}"
-    return f"{value:g}"
-
-
-def _goal(axes: Axes, threshold: float | None) -> None:
-    if threshold is not None:
-        axes.axhline(
-            threshold,
-            color=ACCENT,
-            linewidth=1.6,
-            linestyle=(0, (6, 3)),
-            label=f"goal {threshold:g}",
-            zorder=1.5,
-        )
-
-
-def _legend(figure: Figure, axes: Axes, names: Sequence[str], size: tuple[float, float]) -> None:
-    """Beside a wide figure, below a narrow one; never over the data."""
-    handles, labels = axes.get_legend_handles_labels()
-    if not handles:
-        return
-    narrow = size[0] < 6
-    figure.legend(
-        handles,
-        labels,
-        title=escape(" · ".join(names)) or None,
-        title_fontproperties={"size": 9, "weight": "bold"},
-        loc="outside lower left" if narrow else "outside right upper",
-        ncols=2 if narrow else 1,
-        frameon=False,
-        labelcolor=INK,
-        fontsize=9,
-        alignment="left",
-    )

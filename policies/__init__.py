@@ -1,0 +1,1 @@
+"""Policies and environments: hyperparameters, networks, evaluation, video."""

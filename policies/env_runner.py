@@ -47,7 +47,7 @@ class _Stream:
         self.tail: dict[str, NDArray[Any]] = {}
 
 
-class ArrayEnvRunner(SingleAgentEnvRunner):
+class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     """Samples fragments of (T, N) arrays; flat Box observations, Discrete or flat Box actions.
 
     `finished_episodes` gathers (return, length) of every whole episode, over fragment boundaries, until
@@ -55,6 +55,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):
     """
 
     def __init__(self, **kwargs: Any) -> None:
+        self.env: Any = None
         self.finished_episodes: list[tuple[float, int]] = []
         self._streams: list[_Stream] = []
         self._obs: NDArray[Any] | None = None
@@ -109,15 +110,16 @@ class ArrayEnvRunner(SingleAgentEnvRunner):
         random_actions: bool = False,
         force_reset: bool = False,
     ) -> list[SingleAgentEpisode]:
+        if random_actions:
+            # PPO and DQN never ask for them.
+            raise ValueError("ArrayEnvRunner samples with the policy only, not with random actions")
         if num_timesteps is None:
             # Whole episodes on request: not on any hot path here, and RLlib's own way resets the envs anyway.
-            episodes: list[SingleAgentEpisode] = super()._sample(
-                num_episodes=num_episodes, explore=explore, random_actions=random_actions
-            )
+            episodes: list[SingleAgentEpisode] = super()._sample(num_episodes=num_episodes, explore=explore)
             return episodes
         if force_reset or self._needs_initial_reset or self._obs is None:
             self._reset_arrays()
-        fragment = self._collect(num_timesteps, explore=explore, random_actions=random_actions)
+        fragment = self._collect(num_timesteps, explore=explore)
         done, ongoing = self._cut(fragment)
         self._done_episodes_for_metrics.extend(done)
         for episode in ongoing:
@@ -127,7 +129,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):
         self._increase_sampled_metrics(num_steps, len(done))
         return done + ongoing
 
-    def _collect(self, num_timesteps: int, *, explore: bool, random_actions: bool) -> dict[str, NDArray[Any]]:
+    def _collect(self, num_timesteps: int, *, explore: bool) -> dict[str, NDArray[Any]]:
         """Step until at least num_timesteps env steps were made; returns columns of shape (T, N, ...).
 
         Raises:
@@ -142,15 +144,16 @@ class ArrayEnvRunner(SingleAgentEnvRunner):
         num_steps = 0
         with torch.no_grad():
             while num_steps < num_timesteps:
-                if random_actions:
-                    row = {Columns.ACTIONS: np.asarray(env.action_space.sample())}
-                else:
-                    steps_so_far = (self.num_env_steps_sampled_lifetime // num_runners + num_steps) * num_runners
-                    row = self._actions(self._obs, explore=explore, num_env_steps=steps_so_far)
+                steps_so_far = (self.num_env_steps_sampled_lifetime // num_runners + num_steps) * num_runners
+                row = self._actions(self._obs, explore=explore, num_env_steps=steps_so_far)
                 to_env = self._for_env(row[Columns.ACTIONS])
                 self._obs, rewards, terminated, truncated, _ = env.step(to_env)
-                row |= {"rewards": rewards, "terminated": terminated, "truncated": truncated,
-                        "stepped": ~self._just_ended}
+                row |= {
+                    "rewards": rewards,
+                    "terminated": terminated,
+                    "truncated": truncated,
+                    "stepped": ~self._just_ended,
+                }
                 # NEXT_STEP autoreset: the step after an episode's last one only resets; it is no env step.
                 num_steps += int(row["stepped"].sum())
                 self._just_ended = np.logical_or(terminated, truncated)
@@ -163,8 +166,9 @@ class ArrayEnvRunner(SingleAgentEnvRunner):
         """One forward pass: actions and what RLlib's learner wants beside them, each of shape (N, ...)."""
         batch = {Columns.OBS: torch.from_numpy(np.ascontiguousarray(obs, dtype=np.float32)).to(self._device)}
         if explore:
-            out = self.module._forward_exploration(batch, t=num_env_steps)  # noqa: SLF001 (forward_exploration walks
-            # the module tree twice a step to switch eval and train mode; this runner's module stays in eval mode)
+            # Not `forward_exploration`: it walks the module tree twice a step to switch between eval and train mode,
+            # and this runner's module stays in eval mode.
+            out = self.module._forward_exploration(batch, t=num_env_steps)  # noqa: SLF001
         else:
             out = self.module._forward_inference(batch)  # noqa: SLF001
         if Columns.ACTIONS not in out:
@@ -189,9 +193,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):
             return np.asarray(clip_action(actions, space), dtype=space.dtype)
         return actions
 
-    def _cut(
-        self, fragment: dict[str, NDArray[Any]]
-    ) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
+    def _cut(self, fragment: dict[str, NDArray[Any]]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
         """Cut (T, N) columns into episode chunks: the finished ones in order of their end, then the running ones."""
         done: list[tuple[int, int, SingleAgentEpisode]] = []
         ongoing: list[SingleAgentEpisode] = []

@@ -209,10 +209,10 @@ class RandomPolicy(Policy):
 
     def reset(self, seed: int) -> None:
         """Start again from a seed: the same seed gives the same actions."""
-        # Gymnasium seeds an env's generator with SeedSequence(seed). The spawn key makes this another stream,
-        # or the actions would be drawn from the very numbers that the env's start states and noise come from.
-        sequence = np.random.SeedSequence(seed, spawn_key=(1,))
-        self.action_space.seed(int(sequence.generate_state(1, np.uint64)[0]))
+        # Gymnasium seeds an env's generator with this very seed. Another one is derived from it, or the
+        # actions would be drawn from the numbers that the env's start states and noise come from.
+        derived = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
+        self.action_space.seed(int(derived))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         actions = [self.action_space.sample() for _ in range(len(observations))]

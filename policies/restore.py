@@ -18,7 +18,14 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 
 from policies.errors import CheckpointError
 from policies.hyperparams import Hyperparams, PPOHyperparams
-from policies.portable import ActionTransform, Layer, NetworkKind, PolicyNetwork, PortablePolicy, describe_space
+from policies.portable import (
+    ActionTransform,
+    Layer,
+    NetworkKind,
+    PolicyNetwork,
+    PortablePolicy,
+    describe_space,
+)
 
 Weights = Mapping[str, NDArray[Any]]
 
@@ -126,7 +133,9 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     try:
         algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
     except Exception as error:
-        raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
+        raise CheckpointError(
+            f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT
+        ) from error
     if expected is not None:
         try:
             check_weights(algorithm, expected)
@@ -147,7 +156,9 @@ def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
     if runner is not None and runner.module is not None:
         sources["env runner"] = runner.module.get_state()
     for source, weights in sources.items():
-        held = {array.tobytes() for array in (np.asarray(value, dtype=np.float32) for value in weights.values())}
+        held = {
+            array.tobytes() for array in (np.asarray(value, dtype=np.float32) for value in weights.values())
+        }
         for number, layer in enumerate(expected.layers):
             if layer.weight.tobytes() not in held or layer.bias.tobytes() not in held:
                 raise CheckpointError(

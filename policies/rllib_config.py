@@ -7,6 +7,7 @@ PPO's value layers).
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeAlias
 
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -84,7 +85,7 @@ def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
         grad_clip_by="global_norm",
         lambda_=hyperparams.gae_lambda,
         clip_param=hyperparams.clip_param,
-        vf_clip_param=hyperparams.vf_clip_param,
+        vf_clip_param=math.inf if hyperparams.vf_clip_param is None else hyperparams.vf_clip_param,
         vf_loss_coeff=hyperparams.vf_loss_coeff,
         entropy_coeff=hyperparams.entropy_coeff,
         use_kl_loss=hyperparams.use_kl_loss,

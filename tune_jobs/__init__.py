@@ -1,0 +1,55 @@
+"""Hyperparameter search for reinforcement learning: one sweep file, one call, the best policy on video.
+
+The names below are the Python API. They are imported when they are first used, so that `import tune_jobs` is instant
+and needs neither ray nor torch.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from policies.errors import TuneJobsError as TuneJobsError
+    from policies.policy import load_policy as load_policy
+    from tune_jobs.spec import SweepSpec as SweepSpec
+    from tune_jobs.spec_file import list_presets as list_presets
+    from tune_jobs.spec_file import load_spec as load_spec
+    from tune_jobs.sweeps import SweepResult as SweepResult
+    from tune_jobs.sweeps import SweepStatus as SweepStatus
+    from tune_jobs.sweeps import best as best
+    from tune_jobs.sweeps import dataframe as dataframe
+    from tune_jobs.sweeps import evaluate as evaluate
+    from tune_jobs.sweeps import extend as extend
+    from tune_jobs.sweeps import launch as launch
+    from tune_jobs.sweeps import list_sweeps as list_sweeps
+    from tune_jobs.sweeps import report as report
+    from tune_jobs.sweeps import restore as restore
+    from tune_jobs.sweeps import resume as resume
+    from tune_jobs.sweeps import status as status
+    from tune_jobs.sweeps import stop as stop
+    from tune_jobs.sweeps import trials as trials
+    from tune_jobs.sweeps import video as video
+
+_SWEEPS = (
+    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "report",
+    "restore", "resume", "status", "stop", "trials", "video",
+)  # fmt: skip
+_HOME = {
+    "TuneJobsError": "policies.errors",
+    "load_policy": "policies.policy",
+    "SweepSpec": "tune_jobs.spec",
+    "list_presets": "tune_jobs.spec_file",
+    "load_spec": "tune_jobs.spec_file",
+    **dict.fromkeys(_SWEEPS, "tune_jobs.sweeps"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'tune_jobs' has no attribute {name!r}; it has {sorted(_HOME)}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

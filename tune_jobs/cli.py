@@ -6,147 +6,34 @@ standard output holds one JSON document, also when a command fails; everything e
 
 from __future__ import annotations
 
-import contextlib
-import sys
-import tempfile
-import traceback
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
-from policies.errors import SpecError, TuneJobsError
-
-_INTERRUPTED = 130
-_JSON, _DEBUG = "tune_jobs.json", "tune_jobs.debug"
-_Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-class _Group(click.Group):
-    """A group whose commands end with a clear message and the right exit code, never with a traceback."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; exit codes as in the design."""
-        try:
-            return super().invoke(ctx)
-        except (click.exceptions.Exit, click.Abort, BrokenPipeError):
-            raise
-        except click.ClickException as error:
-            if ctx.meta.get(_JSON):
-                _print_json_error(error.format_message(), "", error.exit_code)
-            raise
-        except KeyboardInterrupt:
-            runs_trials = ctx.invoked_subcommand in ("launch", "resume", "extend")
-            hint = "What is done is kept; `tune-jobs resume SWEEP` goes on with it." if runs_trials else ""
-            _print_error(ctx, "Interrupted.", hint, _INTERRUPTED)
-            ctx.exit(_INTERRUPTED)
-        except TuneJobsError as error:
-            if ctx.meta.get(_DEBUG):
-                traceback.print_exc()
-            _print_error(ctx, error.message, error.hint, error.exit_code)
-            ctx.exit(error.exit_code)
-        except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback on a user's terminal
-            message = f"Unexpected {type(error).__name__}: {error}"
-            if ctx.meta.get(_DEBUG):
-                traceback.print_exc()
-                hint = ""
-            else:
-                hint = (
-                    f"This is a bug in tune-jobs. The traceback is in {_save_traceback()}; --debug prints it."
-                )
-            _print_error(ctx, message, hint, TuneJobsError.exit_code)
-            ctx.exit(TuneJobsError.exit_code)
-
-
-def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) -> None:
-    click.echo(f"error: {message}" + (f"\n{hint}" if hint else ""), err=True)
-    if ctx.meta.get(_JSON):
-        _print_json_error(message, hint, exit_code)
-
-
-def _print_json_error(message: str, hint: str, exit_code: int) -> None:
-    from tune_jobs.cli_output import print_json
-
-    print_json({"error": message, "hint": hint, "exit_code": exit_code})
-
-
-def _save_traceback() -> str:
-    with tempfile.NamedTemporaryFile(
-        "w", prefix="tune-jobs-error-", suffix=".txt", delete=False, encoding="utf-8"
-    ) as file:
-        traceback.print_exc(file=file)
-    return file.name
-
-
-def _remember_json(ctx: click.Context, _: click.Parameter, value: bool) -> bool:  # noqa: FBT001 - click's signature
-    ctx.meta[_JSON] = value
-    return value
-
-
-def _print_version(ctx: click.Context, _: click.Parameter, value: bool) -> None:  # noqa: FBT001 - click's signature
-    if not value or ctx.resilient_parsing:
-        return
-    from importlib import metadata
-
-    try:
-        version = metadata.version("tune-jobs")
-    except metadata.PackageNotFoundError:
-        version = "(not installed)"
-    click.echo(f"tune-jobs {version}")
-    ctx.exit()
-
-
-_json_option = click.option(
-    "--json", "as_json", is_flag=True, callback=_remember_json, is_eager=True,
-    help="Print one JSON document on standard output.",
-)  # fmt: skip
-_storage_option = click.option(
-    "--storage", metavar="FOLDER", help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]"
-)
-_num_episodes_option = click.option(
-    "--num-episodes", type=click.IntRange(1, 2**18), default=100, show_default=True, help="Greedy episodes."
-)
-_set_option = click.option(
-    "--set", "overrides", multiple=True, metavar="A.B=VALUE",
-    help="Override one field of the sweep file; VALUE is YAML, empty takes the field out. May be repeated.",
-)  # fmt: skip
-_env_option = click.option(
-    "--env", "env_id", metavar="ID", help="Environment; needed for 'random', else the policy's own."
+from policies.errors import SpecError
+from tune_jobs.cli_base import (
+    DEBUG,
+    CommandGroup,
+    env_option,
+    json_option,
+    num_episodes_option,
+    print_version,
+    run_options,
+    set_option,
+    stdout_for,
+    storage_option,
 )
 
 
-def _run_options(command: _Command) -> _Command:
-    """Options of the commands that run trials."""
-    for option in (
-        click.option(
-            "--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."
-        ),
-        click.option(
-            "--address", metavar="ADDRESS", help="Ray cluster: auto or ray://...; without it, this machine."
-        ),
-        _storage_option,
-        _json_option,
-    ):
-        command = option(command)
-    return command
-
-
-@contextlib.contextmanager
-def _stdout_for(*, as_json: bool) -> Iterator[None]:
-    """With --json nothing but the document may reach standard output, whatever a library prints."""
-    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-        yield
-
-
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.option("--debug", is_flag=True, help="Print the traceback of an error.")
 @click.option(
     "--version",
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_print_version,
+    callback=print_version,
     help="Print the version.",
 )
 @click.pass_context
@@ -158,49 +45,39 @@ def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's sign
     Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials failed, 4 no such sweep, trial or
     checkpoint, 5 cannot run here, 130 interrupted.
     """
-    ctx.meta[_DEBUG] = debug
+    ctx.meta[DEBUG] = debug
 
 
 @cli.command()
 @click.argument("spec")
-@_set_option
+@set_option
 @click.option("--name", help="Name of the sweep.  [default: made from SPEC and the time]")
 @click.option("--dry-run", is_flag=True, help="Print the plan and start nothing.")
-@click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report.")
-@_run_options
+@run_options
 @click.pass_context
 def launch(
     ctx: click.Context,
+    /,
     *,
     spec: str,
     overrides: tuple[str, ...],
     name: str | None,
     dry_run: bool,
-    finish: bool,
-    progress: str,
-    address: str | None,
     storage: str | None,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Run a sweep: all trials, then the best policy, its video and a report."""
     from tune_jobs import cli_output
 
     if dry_run:
-        loaded, plan = _plan(spec, overrides, name=name, address=address)
+        loaded, plan = _plan(spec, overrides, name=name, address=options["address"])
         cli_output.show_plan(loaded, plan, as_json=as_json)
         return
     from tune_jobs import sweeps
 
-    with _stdout_for(as_json=as_json):
-        result = sweeps.launch(
-            spec,
-            overrides=overrides,
-            name=name,
-            storage=storage,
-            address=address,
-            finish=finish,
-            progress=progress,
-        )
+    with stdout_for(as_json=as_json):
+        result = sweeps.launch(spec, overrides=overrides, name=name, storage=storage, **options)
     cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
 
@@ -221,121 +98,109 @@ def _plan(spec: str, overrides: tuple[str, ...], *, name: str | None, address: s
 
 
 @cli.command(name="list")
-@_storage_option
-@_json_option
+@storage_option
+@json_option
 def list_command(*, storage: str | None, as_json: bool) -> None:
     """List the sweeps of a storage folder."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         statuses = sweeps.list_sweeps(storage)
     cli_output.show_sweeps(statuses, as_json=as_json)
 
 
 @cli.command()
 @click.argument("sweep")
-@_storage_option
-@_json_option
+@storage_option
+@json_option
 def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Say how far a sweep is."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         state = sweeps.status(sweep, storage=storage)
     cli_output.show_status(state, as_json=as_json)
 
 
 @cli.command()
 @click.argument("sweep")
-@_storage_option
-@_json_option
+@storage_option
+@json_option
 def trials(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """List the trials of a sweep with their points, scores and errors."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         records = sweeps.trials(sweep, storage=storage)
     cli_output.show_trials(records, as_json=as_json)
 
 
 @cli.command()
 @click.argument("sweep")
-@_run_options
+@click.option("--retry-failed", is_flag=True, help="Run the failed trials again, too.")
+@run_options
 @click.pass_context
-def resume(
-    ctx: click.Context, *, sweep: str, progress: str, address: str | None, storage: str | None, as_json: bool
-) -> None:
+def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: bool, **options: Any) -> None:
     """Go on with a sweep that was interrupted: what is done stays, trials go on from their checkpoints."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
-        result = sweeps.resume(sweep, storage=storage, address=address, progress=progress)
+    with stdout_for(as_json=as_json):
+        result = sweeps.resume(sweep, storage=storage, **options)
     cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
 
 
 @cli.command()
 @click.argument("sweep")
-@click.option(
-    "--num-samples", type=click.IntRange(min=1), required=True, help="How many more samples to run."
-)
-@_run_options
+@click.option("--num-samples", type=click.IntRange(min=1), required=True, help="How many more samples to run.")
+@run_options
 @click.pass_context
 def extend(
-    ctx: click.Context,
-    *,
-    sweep: str,
-    num_samples: int,
-    progress: str,
-    address: str | None,
-    storage: str | None,
-    as_json: bool,
+    ctx: click.Context, /, *, sweep: str, num_samples: int, storage: str | None, as_json: bool, **options: Any
 ) -> None:
     """Add trials to a sweep: more samples of its space, the earlier points stay as they are."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
-        result = sweeps.extend(sweep, num_samples, storage=storage, address=address, progress=progress)
+    with stdout_for(as_json=as_json):
+        result = sweeps.extend(sweep, num_samples, storage=storage, **options)
     cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
 
 
 @cli.command()
 @click.argument("sweep")
-@_storage_option
-@_json_option
+@storage_option
+@json_option
 def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Ask a running sweep to stop; it can be resumed."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         was_running = sweeps.stop(sweep, storage=storage)
     cli_output.show_stop(sweep, was_running=was_running, as_json=as_json)
 
 
 @cli.command()
 @click.argument("sweep")
-@_num_episodes_option
-@_storage_option
-@_json_option
+@num_episodes_option
+@storage_option
+@json_option
 def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -> None:
     """Choose the best checkpoint, confirm it on fresh seeds and export its policy."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         record = sweeps.best(sweep, storage=storage, num_episodes=num_episodes)
     cli_output.show_best(record, as_json=as_json)
 
 
 @cli.command()
 @click.argument("source")
-@_num_episodes_option
-@click.option(
-    "--first-seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the first episode; they count up."
-)
-@_env_option
-@_storage_option
-@_json_option
+@num_episodes_option
+@click.option("--first-seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the first episode; they count up.")
+@env_option
+@storage_option
+@json_option
 def evaluate(
     *,
     source: str,
@@ -353,7 +218,7 @@ def evaluate(
     from tune_jobs import cli_output, sweeps
 
     _check_random(source, env_id)
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         policy, random = sweeps.evaluate(
             source, storage=storage, num_episodes=num_episodes, first_seed=first_seed, env_id=env_id
         )
@@ -363,14 +228,12 @@ def evaluate(
 @cli.command()
 @click.argument("source")
 @click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the files go.")
-@click.option(
-    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of the episode."
-)
-@_env_option
-@_storage_option
-@_json_option
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the episode.")
+@env_option
+@storage_option
+@json_option
 def video(
-    *, source: str, output: Path | None, seed: int, env_id: str | None, storage: str | None, as_json: bool
+    *, source: str, output: Path | None, seed: int | None, env_id: str | None, storage: str | None, as_json: bool
 ) -> None:
     """Film a policy: MP4 and GIF; of a sweep also before and after training side by side.
 
@@ -379,34 +242,32 @@ def video(
     from tune_jobs import cli_output, sweeps
 
     _check_random(source, env_id)
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         paths = sweeps.video(source, storage=storage, output=output, seed=seed, env_id=env_id)
     cli_output.show_paths(paths, as_json=as_json)
 
 
 def _check_random(source: str, env_id: str | None) -> None:
     if source == "random" and env_id is None:
-        raise SpecError(
-            "A random policy has no environment of its own.", "Add --env, such as --env CartPole-v1."
-        )
+        raise SpecError("A random policy has no environment of its own.", "Add --env, such as --env CartPole-v1.")
 
 
 @cli.command()
 @click.argument("sweep")
-@_storage_option
-@_json_option
+@storage_option
+@json_option
 def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Write the report of a sweep: one HTML page, tables and figures."""
     from tune_jobs import cli_output, sweeps
 
-    with _stdout_for(as_json=as_json):
+    with stdout_for(as_json=as_json):
         path = sweeps.report(sweep, storage=storage)
     cli_output.show_paths({"report": path}, as_json=as_json)
 
 
 @cli.command()
 @click.argument("name", required=False)
-@_json_option
+@json_option
 def presets(*, name: str | None, as_json: bool) -> None:
     """List the presets, or print the sweep file of one."""
     from tune_jobs import cli_output
@@ -419,7 +280,7 @@ def presets(*, name: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@_json_option
+@json_option
 def schema(*, as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON either way
     """Print the JSON Schema of the sweep file, for editors."""
     from tune_jobs.cli_output import print_json

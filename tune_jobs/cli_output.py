@@ -150,9 +150,8 @@ def _plan_table(trials: Sequence[TrialPlan]) -> Table:
 
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
     """Print what a launch, resume or extend came to, and where everything lies."""
-    name = result.sweep.name
     at = "" if storage is None else f" --storage {shlex.quote(storage)}"
-    how_to_resume = f"tune-jobs resume {shlex.quote(name)}{at}"
+    how_to_resume = f"tune-jobs resume {shlex.quote(result.sweep.name)}{at}"
     if as_json:
         print_json({**to_json(result), "exit_code": result.exit_code})
     else:
@@ -162,9 +161,10 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
             _print_best(console, result.best)
         elif result.why_no_best is not None:
             console.print(f"no best policy: {result.why_no_best}", style="yellow")
-        _print_facts(
-            console, {"sweep": str(result.folder), **{k: str(v) for k, v in result.artifacts.items()}}
-        )
+        paths = {"sweep": result.folder, **result.artifacts}
+        _print_facts(console, {name.replace("_", " "): str(path) for name, path in paths.items()})
+        for note in result.notes:
+            console.print(f"note: {note}", style="yellow")
     if result.interrupted:
         click.echo(f"Interrupted; what is done is kept. Go on with: {how_to_resume}", err=True)
 
@@ -229,9 +229,7 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
     from rich.text import Text
 
     names = list(dict.fromkeys(name for trial in trials for name in trial.point))
-    table = _table(
-        "trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by"
-    )
+    table = _table("trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by")
     for trial in trials:
         table.add_row(
             trial.trial_id,
@@ -303,9 +301,7 @@ def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
     if as_json:
         print_json({"sweep": sweep, "was_running": was_running})
     elif was_running:
-        click.echo(
-            f"{sweep} stops after the iterations now running; `tune-jobs resume {sweep}` goes on with it."
-        )
+        click.echo(f"{sweep} stops after the iterations now running; `tune-jobs resume {sweep}` goes on with it.")
     else:
         click.echo(f"{sweep} is not running.")
 

@@ -108,10 +108,14 @@ def _alive_nodes() -> list[dict[str, Any]]:
 def cluster_machine(source: str) -> Machine:
     """The CPUs and GPUs of the joined cluster's nodes."""
     nodes = tuple(
-        (float(node["Resources"].get("CPU", 0)), float(node["Resources"].get("GPU", 0))) for node in _alive_nodes()
+        (float(node["Resources"].get("CPU", 0)), float(node["Resources"].get("GPU", 0)))
+        for node in _alive_nodes()
     )
     return Machine(
-        num_cpus=sum(cpus for cpus, _ in nodes), num_gpus=sum(gpus for _, gpus in nodes), source=source, nodes=nodes
+        num_cpus=sum(cpus for cpus, _ in nodes),
+        num_gpus=sum(gpus for _, gpus in nodes),
+        source=source,
+        nodes=nodes,
     )
 
 
@@ -159,7 +163,9 @@ def _check_answer(name: str, task: Any, probe: Path, token: str) -> None:
                 f"Node {name} has no tune-jobs.", "Install the same version on every node, or use its image."
             ) from error
         reason = (str(cause).strip().splitlines() or [type(cause).__name__])[-1]
-        raise CannotRunError(f"Node {name} cannot use the sweep folder {folder}: {reason}", storage_hint) from error
+        raise CannotRunError(
+            f"Node {name} cannot use the sweep folder {folder}: {reason}", storage_hint
+        ) from error
     if question != token or not any(path.name != "question" for path in probe.iterdir()):
         raise CannotRunError(f"Node {name} sees another folder under the name {folder}.", storage_hint)
     if their_version != version("tune-jobs"):

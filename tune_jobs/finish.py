@@ -204,6 +204,27 @@ def best_checkpoint(store: SweepStore, trial_id: str) -> CheckpointRecord:
     return found.checkpoint
 
 
+def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Path:
+    """A verified checkpoint folder: a sweep's best, `SWEEP/TRIAL`'s best, or the given folder.
+
+    Raises:
+        NotFoundError: There is no such checkpoint.
+        CheckpointError: It is damaged.
+    """
+    folder = Path(source).expanduser()
+    if not (folder / MANIFEST).is_file():
+        store, trial_id = _sweep_and_trial(str(source), storage)
+        if trial_id is not None:
+            record = best_checkpoint(store, trial_id)
+        elif (store.best_folder / "evaluation.json").is_file():
+            record = store.read_best().checkpoint
+        else:
+            record = choose_best(store).checkpoint
+        folder = store.folder / record.path
+    verify_checkpoint(folder)
+    return folder
+
+
 def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     """Film a random policy (before) and the winner (after) on one seed, alone and side by side, into best/.
 
@@ -214,15 +235,23 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
     before = _random_policy(source.env_id, source.env_args)
-    names = {"before_mp4": "before.mp4", "after_mp4": "after.mp4", "after_gif": "after.gif",
-             "before_after_mp4": "before_after.mp4"}
+    names = {
+        "before_mp4": "before.mp4",
+        "after_mp4": "after.mp4",
+        "after_gif": "after.gif",
+        "before_after_mp4": "before_after.mp4",
+    }
     paths = {key: store.best_folder / name for key, name in names.items()}
-    env = {"env_id": source.env_id, "env_args": source.env_args, "seeds": chosen}
+    env: dict[str, Any] = {"env_id": source.env_id, "env_args": source.env_args, "seeds": chosen}
     record_video(before, **env, mp4=paths["before_mp4"], caption="before training: random")
     caption = f"after training: {best.checkpoint.trial_id}"
     record_video(source.policy, **env, mp4=paths["after_mp4"], gif=paths["after_gif"], caption=caption)
     record_side_by_side(
-        before, source.policy, **env, mp4=paths["before_after_mp4"], captions=("before: random", "after training")
+        before,
+        source.policy,
+        **env,
+        mp4=paths["before_after_mp4"],
+        captions=("before: random", "after training"),
     )
     return paths
 

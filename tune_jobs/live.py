@@ -32,7 +32,10 @@ _MAX_RUNNING_ROWS = 12
 
 def describe_point(record: TrialRecord) -> str:
     """A trial's sampled values in a line."""
-    return ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items()) or "no searched values"
+    return (
+        ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items())
+        or "no searched values"
+    )
 
 
 def render(monitor: SweepMonitor) -> RenderableType:
@@ -49,13 +52,17 @@ def render(monitor: SweepMonitor) -> RenderableType:
     )
     parts: list[RenderableType] = [head, _facts(monitor), _running(monitor)]
     if monitor.stopping:
-        parts.append(Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow"))
+        parts.append(
+            Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow")
+        )
     return Group(*parts)
 
 
 def _status_line(counts: dict[str, int]) -> Text:
     words = [
-        Text(f"{counts[status]} {status}", style=style) for status, style in _STATUS_STYLES.items() if counts.get(status)
+        Text(f"{counts[status]} {status}", style=style)
+        for status, style in _STATUS_STYLES.items()
+        if counts.get(status)
     ]
     return Text("  ").join(words)
 
@@ -75,8 +82,10 @@ def _best_text(best: Selection | None) -> Text:
     if best is None:
         return Text("no evaluation yet", style="dim")
     text = Text(f"{format_score(best.point_score)}", style="bold green")
-    text.append(f"  {describe_point(best.trial)}  ({best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps)",
-                style="default")
+    text.append(
+        f"  {describe_point(best.trial)}  ({best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps)",
+        style="default",
+    )
     return text
 
 
@@ -107,9 +116,15 @@ def summary_line(monitor: SweepMonitor) -> str:
     counts = ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items()))
     estimate = monitor.estimate()
     best = monitor.best()
-    words = [f"{monitor.name}: {format_duration(monitor.elapsed_s)}", counts, f"{monitor.num_env_steps:,} env steps"]
+    words = [
+        f"{monitor.name}: {format_duration(monitor.elapsed_s)}",
+        counts,
+        f"{monitor.num_env_steps:,} env steps",
+    ]
     if best is not None:
-        words.append(f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})")
+        words.append(
+            f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})"
+        )
     if estimate.time_left_s is not None:
         words.append(f"about {format_duration(estimate.time_left_s)} left")
     return "; ".join(words)

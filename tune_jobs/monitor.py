@@ -72,8 +72,8 @@ class SweepMonitor:
         self._history.append((now, self._num_env_steps))
         while len(self._history) > 2 and self._history[1][0] < now - _RATE_WINDOW_S:
             self._history.popleft()
-        changed = before is None or before.best_evaluation_return != record.best_evaluation_return
-        if changed or before.status != record.status:
+        seen = None if before is None else (before.status, before.best_evaluation_return)
+        if seen != (record.status, record.best_evaluation_return):
             try:
                 self._selection = select_best(list(self.records.values()))
             except NoUsableTrialError:
@@ -92,7 +92,11 @@ class SweepMonitor:
         now = self._clock()
         first_time, first_steps = self._history[0]
         span = now - first_time
-        rate = (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
+        rate = (
+            (self._num_env_steps - first_steps) / span
+            if span > 0 and self._num_env_steps > first_steps
+            else None
+        )
         records = list(self.records.values())
         left = [record for record in records if record.status not in FINISHED]
         ended = [r for r in records if r.status == "completed" and r.trial_id not in self._finished_before]

@@ -157,9 +157,7 @@ def _trials(spec: SweepSpec) -> tuple[tuple[TrialPlan, ...], list[Hyperparams]]:
         dumped = values.model_dump(mode="json")
         for seed_index in range(spec.seeds_per_point):
             index = len(trials)
-            trials.append(
-                TrialPlan(trial_id(index), index, point_index, seed_index, seeds[index], point, dumped)
-            )
+            trials.append(TrialPlan(trial_id(index), index, point_index, seed_index, seeds[index], point, dumped))
     return tuple(trials), hyperparams
 
 
@@ -231,9 +229,7 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
             "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
         )
     main = cpus - runners
-    if machine.nodes and not any(
-        main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes
-    ):
+    if machine.nodes and not any(main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes):
         nodes = ", ".join(f"{node_cpus:g} and {node_gpus:g}" for node_cpus, node_gpus in machine.nodes)
         raise CannotRunError(
             f"One trial's process needs {main} CPUs and {gpus:g} GPUs on one node; no node of "
@@ -259,9 +255,7 @@ def _max_trial_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
     wanted = values.env_steps_per_iteration if isinstance(values, DQNHyperparams) else values.train_batch_size
     iterations = min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / wanted))
     num_outputs = (
-        2 * int(env.action_space.n)
-        if hasattr(env.action_space, "n")
-        else 2 * math.prod(env.action_space.shape or ())
+        2 * int(env.action_space.n) if hasattr(env.action_space, "n") else 2 * math.prod(env.action_space.shape or ())
     )
     sizes = [math.prod(env.observation_space.shape or ()), *values.hidden_sizes, num_outputs + 1]
     weights = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
@@ -307,9 +301,7 @@ def _cgroup_quota(root: Path) -> float | None:
         pass
     try:
         micros = int((root / "cpu/cpu.cfs_quota_us").read_text(encoding="ascii"))
-        return (
-            None if micros < 0 else micros / int((root / "cpu/cpu.cfs_period_us").read_text(encoding="ascii"))
-        )
+        return None if micros < 0 else micros / int((root / "cpu/cpu.cfs_period_us").read_text(encoding="ascii"))
     except (OSError, ValueError, ZeroDivisionError):
         return None
 

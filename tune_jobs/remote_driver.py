@@ -1,7 +1,7 @@
 """The driver of a sweep as an actor on the cluster: for clients that join by `ray://`.
 
-A Ray client cannot run Ray Tune's loop itself. The actor runs it and writes the records to the shared storage; the client
-asks it for what has changed, and shows the same table.
+A Ray client cannot run Ray Tune's loop itself. The actor runs it and writes the records to the shared storage; the
+client asks it for what has changed, and shows the same table.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         self._keeper = keeper
         self._asked_at: float | None = None
 
-    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:  # noqa: ARG002 (Tune's signature)
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
         return False
 
     def stop_all(self) -> bool:
@@ -152,7 +152,7 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         self._store.trial(trial_id).write_record(record)
         self._listener(record)
 
-    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:  # noqa: ARG002
+    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A process took the trial."""
         trial_id = _trial_id(trial)
         self.running.add(trial_id)
@@ -160,7 +160,12 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         self._change(trial_id, status="running", started_at=started_at, ended_at=None, error=None)
 
     def on_trial_result(
-        self, iteration: int, trials: list[Trial], trial: Trial, result: dict[str, Any], **info: Any  # noqa: ARG002
+        self,
+        iteration: int,
+        trials: list[Trial],
+        trial: Trial,
+        result: dict[str, Any],
+        **info: Any,
     ) -> None:
         """A report, about once a second and after each evaluation."""
         trial_id = _trial_id(trial)
@@ -173,7 +178,7 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         self._change(trial_id, status=status, node=result["node"], pid=result["pid"], **fields)
         self._scalars.write(self._records[trial_id], evaluated=evaluated)
 
-    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:  # noqa: ARG002
+    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Tune is done with the trial: its own end, the scheduler's decision, or the end of the run."""
         trial_id = _trial_id(trial)
         self.running.discard(trial_id)
@@ -185,25 +190,26 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         else:
             steps = self._records[trial_id].num_env_steps
             self._change(
-                trial_id, status="stopped", stop_reason=f"scheduler, at {steps} env steps", ended_at=time.time()
+                trial_id,
+                status="stopped",
+                stop_reason=f"scheduler, at {steps} env steps",
+                ended_at=time.time(),
             )
 
-    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:  # noqa: ARG002
+    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will be retried."""
         trial_id = _trial_id(trial)
         self.running.discard(trial_id)
         failures = self._records[trial_id].num_failures + 1
         self._change(trial_id, status="pending", num_failures=failures, error=self._error(trial))
 
-    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:  # noqa: ARG002
+    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will not."""
         trial_id = _trial_id(trial)
         self.running.discard(trial_id)
         self._scalars.close(trial_id)
         failures = self._records[trial_id].num_failures + 1
-        self._change(
-            trial_id, status="failed", num_failures=failures, error=self._error(trial), ended_at=time.time()
-        )
+        self._change(trial_id, status="failed", num_failures=failures, error=self._error(trial), ended_at=time.time())
 
     def _error(self, trial: Trial) -> str:
         # Trial.get_pickled_error looks where Tune syncs to, and nothing has been synced yet; this is where it writes.

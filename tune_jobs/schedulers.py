@@ -9,7 +9,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from ray.tune.schedulers import ASHAScheduler, FIFOScheduler, HyperBandScheduler, MedianStoppingRule, TrialScheduler
+from ray.tune.schedulers import (
+    ASHAScheduler,
+    FIFOScheduler,
+    HyperBandScheduler,
+    MedianStoppingRule,
+    TrialScheduler,
+)
 
 from tune_jobs.spec import SchedulerSpec
 
@@ -23,7 +29,7 @@ METRIC = "score"
 WORST_SCORE = -1e300
 
 
-class _OnEvaluations(TrialScheduler):
+class _OnEvaluations(TrialScheduler):  # type: ignore[misc]
     """Mixin: passes on only results of an iteration that was evaluated."""
 
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:

@@ -212,9 +212,7 @@ class QLogUniform(_Range):
 
     kind: ClassVar[str] = "qloguniform"
     is_log: ClassVar[bool] = True
-    qloguniform: tuple[Number, Number, Number] = Field(
-        description="[low, high, q]: multiples of q, log scale."
-    )
+    qloguniform: tuple[Number, Number, Number] = Field(description="[low, high, q]: multiples of q, log scale.")
 
 
 class RandInt(_Range):
@@ -331,10 +329,7 @@ def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) 
         sequence = np.random.SeedSequence(sweep_seed, spawn_key=(POINTS_SPAWN_KEY, len(points)))
         rng = np.random.default_rng(sequence)
         points.append(
-            {
-                name: combination[name] if name in combination else domain.sample(rng)
-                for name, domain in space.items()
-            }
+            {name: combination[name] if name in combination else domain.sample(rng) for name, domain in space.items()}
         )
     return points
 

@@ -92,9 +92,7 @@ class SchedulerSpec(_Section):
 class EvaluationSpec(_Section):
     """Greedy episodes during training, on seeds that are the same for all trials."""
 
-    every_iterations: PositiveWhole = Field(
-        5, description="Evaluate at each multiple of this, and at the end."
-    )
+    every_iterations: PositiveWhole = Field(5, description="Evaluate at each multiple of this, and at the end.")
     num_episodes: Annotated[WholeNumber, Field(ge=1, le=MAX_EPISODES)] = Field(
         10, description="Episodes of an evaluation."
     )
@@ -110,9 +108,7 @@ class CheckpointSpec(_Section):
 class ResourcesSpec(_Section):
     """What one trial may use, and how many run at once."""
 
-    num_cpus: PositiveWhole | None = Field(
-        None, description="CPUs a trial; null: 1 and 1 for each env runner."
-    )
+    num_cpus: PositiveWhole | None = Field(None, description="CPUs a trial; null: 1 and 1 for each env runner.")
     num_gpus: Annotated[Number, Field(ge=0)] = Field(0.0, description="GPUs a trial, fractions allowed.")
     num_env_runners: Annotated[WholeNumber, Field(ge=0, le=SEEDS_PER_TRIAL)] = Field(
         0, description="Processes that sample for one trial; 0: the trial's own process does."
@@ -137,27 +133,19 @@ class SweepSpec(_Section):
         pattern=f"^{_NAME_PATTERN}$",
         description="Name of the sweep and of its folder; null: made from the file's name and the time.",
     )
-    env: Annotated[EnvSpec, _from_text("id")] = Field(
-        description="Gymnasium id, or a mapping of id and args."
-    )
+    env: Annotated[EnvSpec, _from_text("id")] = Field(description="Gymnasium id, or a mapping of id and args.")
     algorithm: Algorithm = Field(description="ppo or dqn.")
     hyperparams: dict[str, Any] = Field(default_factory=dict, description="Fixed hyperparameters.")
     space: dict[str, Domain] = Field(default_factory=dict, description="Searched hyperparameters.")
-    num_samples: PositiveWhole = Field(
-        1, description="Random draws for each combination of the grids' values."
-    )
+    num_samples: PositiveWhole = Field(1, description="Random draws for each combination of the grids' values.")
     seeds_per_point: PositiveWhole = Field(1, description="Trials a point, each with its own seed.")
-    seed: Annotated[WholeNumber, Field(ge=0)] = Field(
-        0, description="Sweep seed: fixes points and all other seeds."
-    )
+    seed: Annotated[WholeNumber, Field(ge=0)] = Field(0, description="Sweep seed: fixes points and all other seeds.")
     stop: StopSpec = Field(default_factory=StopSpec, description="When a trial ends.")
     scheduler: Annotated[SchedulerSpec, _from_text("type")] = Field(
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
     )
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
-    checkpoints: CheckpointSpec = Field(
-        default_factory=CheckpointSpec, description="What is kept of a trial."
-    )
+    checkpoints: CheckpointSpec = Field(default_factory=CheckpointSpec, description="What is kept of a trial.")
     resources: ResourcesSpec = Field(default_factory=ResourcesSpec, description="CPUs, GPUs, env runners.")
     max_retries: NonNegativeWhole = Field(2, description="How often a failed trial is tried again.")
     iteration_timeout_s: PositiveNumber = Field(
@@ -210,9 +198,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     names = list(known)
     close = difflib.get_close_matches(name, names, n=1)
     # `environment` and `epochs` look unlike `env` and `num_epochs`, but mean them.
-    inside = [
-        other for other in names if min(len(name), len(other)) >= 3 and (other in name or name in other)
-    ]
+    inside = [other for other in names if min(len(name), len(other)) >= 3 and (other in name or name in other)]
     nearest = close[0] if close else max(inside, key=len, default=None)
     return "" if nearest is None else f" Did you mean {nearest!r}?"
 
@@ -254,9 +240,7 @@ def hyperparam_problems(
     problems = []
     for section, names in (("hyperparams", hyperparams), ("space", space)):
         problems += [
-            Problem(f"{section}.{name}", _unknown_hyperparam(algorithm, name))
-            for name in names
-            if name not in fields
+            Problem(f"{section}.{name}", _unknown_hyperparam(algorithm, name)) for name in names if name not in fields
         ]
     for name, value in hyperparams.items():
         if name in fields:
@@ -286,9 +270,7 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
         path = f"space.{name}.{domain.kind}"
         found = _value_problems(algorithm, name, value, path=path if index is None else f"{path}[{index}]")
         if found and index is None:
-            text = (
-                f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
-            )
+            text = f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
             found = [Problem(path, text)]
         problems += found
         if found and domain.kind not in ("grid", "choice"):
@@ -318,9 +300,7 @@ def _same_kind(raw: Any, checked: Any) -> bool:
     """Whether pydantic left the kind of a value alone: it would read true as 1, 1 as true and "5" as 5."""
     if isinstance(checked, tuple):
         return isinstance(raw, list | tuple) and all(map(_same_kind, raw, checked))
-    return isinstance(raw, str) == isinstance(checked, str) and isinstance(raw, bool) == isinstance(
-        checked, bool
-    )
+    return isinstance(raw, str) == isinstance(checked, str) and isinstance(raw, bool) == isinstance(checked, bool)
 
 
 def dotted(location: Iterable[int | str], *, root: bool = True) -> str:

@@ -27,9 +27,7 @@ from tune_jobs.spec import (
     hyperparam_problems,
 )
 
-_HINT = (
-    "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
-)
+_HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
 
 
 class Preset(NamedTuple):
@@ -242,9 +240,7 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
             section[parent] = child
         if not isinstance(child, dict):
             here = ".".join(parents[: index + 1])
-            raise SpecError(
-                f"--set {override}: {here} is {child!r}, which has no fields", f"Set {here} itself."
-            )
+            raise SpecError(f"--set {override}: {here} is {child!r}, which has no fields", f"Set {here} itself.")
         section = child
     if text.strip():
         section[last] = json.loads(json.dumps(_parse_yaml(text, f"--set {override}"), default=str))

@@ -1,8 +1,8 @@
 """The sweep folder: who writes what, and how it is read back.
 
-Layout: see `docs/design.md`, "On disk". Who may write: the process that drives a sweep holds the folder's lock and writes
-`sweep.json` and every `trial.json`; the process that trains a trial writes that trial's `results.jsonl`, `checkpoints/`
-and `log.txt`. Everybody may read at any time: a file appears whole or not at all.
+Layout: see `docs/design.md`, "On disk". Who may write: the process that drives a sweep holds the folder's lock and
+writes `sweep.json` and every `trial.json`; the process that trains a trial writes that trial's `results.jsonl`,
+`checkpoints/` and `log.txt`. Everybody may read at any time: a file appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ from typing import IO, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from analysis.records import FORMAT_VERSION, BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
+from analysis.records import (
+    FORMAT_VERSION,
+    BestRecord,
+    CheckpointRecord,
+    IterationRecord,
+    SweepRecord,
+    TrialRecord,
+)
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.files import sha256_file, write_atomic
 
@@ -34,7 +41,8 @@ def _read_record(path: Path, kind: type[_RecordT], what: str) -> _RecordT:
         raise NotFoundError(f"No {what} at {path}.", "List the sweeps here with `tune-jobs list`.") from error
     except (OSError, ValueError) as error:
         raise CheckpointError(
-            f"{path} cannot be read as {what}: {error}.", "Restore the file from a backup, or delete the folder."
+            f"{path} cannot be read as {what}: {error}.",
+            "Restore the file from a backup, or delete the folder.",
         ) from error
     version = data.get("format_version", FORMAT_VERSION) if isinstance(data, dict) else FORMAT_VERSION
     if version > FORMAT_VERSION:
@@ -111,10 +119,11 @@ class TrialStore:
         """The complete checkpoints, oldest first (those being written have no final name yet)."""
         if not self.checkpoints_folder.is_dir():
             return []
-        records = []
-        for folder in sorted(self.checkpoints_folder.iterdir()):
-            if folder.is_dir() and not folder.name.startswith("."):
-                records.append(read_manifest(folder))
+        records = [
+            read_manifest(folder)
+            for folder in self.checkpoints_folder.iterdir()
+            if folder.is_dir() and not folder.name.startswith(".")
+        ]
         return sorted(records, key=lambda record: record.iteration)
 
     def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None]) -> None:
@@ -352,7 +361,8 @@ class SweepStore:
             return self._lock_path.open("a")
         except OSError as error:
             raise CannotRunError(
-                f"The sweep folder {self.folder} cannot be written: {error.strerror}.", "Check its permissions."
+                f"The sweep folder {self.folder} cannot be written: {error.strerror}.",
+                "Check its permissions.",
             ) from error
 
 

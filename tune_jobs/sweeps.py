@@ -1,30 +1,23 @@
 """Everything one can do with a sweep; the command line and the Python API are this.
 
-Words: *launch* starts a new sweep, *resume* goes on with an interrupted one, *extend* adds trials to one, *stop* ends one
-that another process runs. A sweep is named by its folder, or by its name in the storage folder.
+Words: *launch* starts a new sweep, *resume* goes on with an interrupted one, *extend* adds trials to one, *stop* ends
+one that another process runs. A sweep is named by its folder, or by its name in the storage folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-import platform
 import shutil
-import signal
-import subprocess
-import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from analysis.records import FINISHED, BestRecord, EvaluationRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, NotFoundError, SpecError, TuneJobsError
-from tune_jobs.monitor import SweepMonitor
-from tune_jobs.plan import Machine, SweepPlan, TrialPlan, local_machine, make_plan
+from analysis.records import BestRecord, EvaluationRecord, SweepRecord, TrialRecord
+from policies.errors import SpecError
+from tune_jobs.driving import SweepResult, check_same_trials, connected, pending_record, run_sweep, write_new
+from tune_jobs.plan import Machine, local_machine, make_plan
 from tune_jobs.spec import SweepSpec, check_sweep_name
 from tune_jobs.spec_file import load_spec
 from tune_jobs.store import SweepStore, list_sweep_stores
@@ -33,31 +26,12 @@ if TYPE_CHECKING:
     import pandas as pd
     from ray.rllib.algorithms.algorithm import Algorithm
 
-_PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
+__all__ = [
+    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "machine", "report",
+    "restore", "resume", "status", "stop", "trials", "video",
+]  # fmt: skip
+
 Source = str | Path | Mapping[str, Any] | SweepSpec
-
-
-@dataclass(frozen=True)
-class SweepResult:
-    """What a launch, resume or extend left."""
-
-    folder: Path
-    sweep: SweepRecord
-    trials: list[TrialRecord]
-    best: BestRecord | None = None
-    why_no_best: str | None = None
-    artifacts: dict[str, Path] = field(default_factory=dict)
-    """Where each result lies: policy, before_mp4, after_mp4, after_gif, before_after_mp4, report."""
-    interrupted: bool = False
-    notes: tuple[str, ...] = ()
-    """What could not be made (a video of an environment that can't be drawn, say), and why."""
-
-    @property
-    def exit_code(self) -> int:
-        """130 if it was interrupted, 3 if a trial failed, else 0."""
-        if self.interrupted:
-            return 130
-        return 3 if any(trial.status == "failed" for trial in self.trials) else 0
 
 
 @dataclass(frozen=True)
@@ -106,7 +80,7 @@ def launch(
     plan = make_plan(spec, machine) if machine is not None else None
     with contextlib.ExitStack() as stack:
         if plan is None:
-            connection = stack.enter_context(_connected(address, None))
+            connection = stack.enter_context(connected(address, None))
             plan = make_plan(spec, connection.machine)
         store.create()
         try:
@@ -115,12 +89,12 @@ def launch(
                 from tune_jobs.cluster import check_storage
 
                 check_storage(store.folder)
-            _write_new(store, spec, plan, address)
+            write_new(store, spec, plan, address)
         except BaseException:
             stack.pop_all().close()
             shutil.rmtree(store.folder, ignore_errors=True)
             raise
-        return _run(store, plan, address=address, machine=machine, finish=finish, progress=progress)
+        return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
 def resume(
@@ -198,21 +172,21 @@ def _go_on(
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
         machine = local_machine() if address is None else None
         if machine is None:
-            connection = stack.enter_context(_connected(address, None))
+            connection = stack.enter_context(connected(address, None))
             from tune_jobs.cluster import check_storage
 
             check_storage(store.folder)
         plan = make_plan(spec, machine or connection.machine)
-        _check_same_trials(store, plan)
+        check_same_trials(store, plan)
         for trial in plan.trials:
             trial_store = store.trial(trial.trial_id)
             if not trial_store.record_path.is_file():
-                trial_store.write_record(_pending(trial))
+                trial_store.write_record(pending_record(trial))
             elif retry_failed and (known := trial_store.read_record()).status == "failed":
                 trial_store.write_record(known.model_copy(update={"status": "pending", "error": None}))
         changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
         store.write_record(record.model_copy(update=changes))
-        return _run(store, plan, address=address, machine=machine, finish=finish, progress=progress)
+        return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
 def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
@@ -387,20 +361,9 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
     """
     from policies.portable import read_policy
     from policies.restore import restore_algorithm
-    from tune_jobs import finish
-    from tune_jobs.store import MANIFEST, verify_checkpoint
+    from tune_jobs.finish import find_checkpoint
 
-    folder = Path(source).expanduser()
-    if not (folder / MANIFEST).is_file():
-        store, trial_id = finish._sweep_and_trial(str(source), storage)  # noqa: SLF001 (one package)
-        if trial_id is None:
-            with contextlib.suppress(NotFoundError):
-                folder = store.folder / store.read_best().checkpoint.path
-            if not folder.is_dir():
-                folder = store.folder / finish.choose_best(store).checkpoint.path
-        else:
-            folder = store.folder / finish.best_checkpoint(store, trial_id).path
-    verify_checkpoint(folder)
+    folder = find_checkpoint(source, storage)
     return restore_algorithm(folder / "rllib", read_policy(folder).network)
 
 
@@ -410,9 +373,8 @@ def machine(address: str) -> Machine:
     Raises:
         CannotRunError: Nothing answers at the address.
     """
-    with _connected(address, None) as connection:
-        found: Machine = connection.machine
-        return found
+    with connected(address, None) as connection:
+        return connection.machine
 
 
 def _load(source: Source, overrides: Sequence[str]) -> SweepSpec:
@@ -440,205 +402,3 @@ def _new_store(spec: SweepSpec, source: Source, name: str | None, storage: str |
     while (root / (candidate := stem if number == 1 else f"{stem}-{number}")).exists():
         number += 1
     return SweepStore(root / check_sweep_name(candidate))
-
-
-def _write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None) -> None:
-    for trial in plan.trials:
-        store.trial(trial.trial_id).write_record(_pending(trial))
-    # Last: a folder without it is no sweep, so nobody sees half of one.
-    store.write_record(
-        SweepRecord(
-            name=store.name,
-            state="running",
-            spec=spec.model_copy(update={"name": store.name}).model_dump(mode="json"),
-            evaluation_seeds=plan.evaluation_seeds,
-            confirmation_seeds=plan.confirmation_seeds,
-            num_trials=len(plan.trials),
-            created_at=time.time(),
-            versions=_versions(),
-            git_commit=_git_commit(),
-            address=address,
-        )
-    )
-
-
-def _pending(trial: TrialPlan) -> TrialRecord:
-    return TrialRecord(
-        trial_id=trial.trial_id,
-        index=trial.index,
-        point_index=trial.point_index,
-        seed_index=trial.seed_index,
-        seed=trial.seed,
-        point=trial.point,
-        hyperparams=trial.hyperparams,
-    )
-
-
-def _check_same_trials(store: SweepStore, plan: SweepPlan) -> None:
-    """Planning again must give the trials that are there: else a resumed trial would train with other values."""
-    planned = {trial.trial_id: trial for trial in plan.trials}
-    for record in store.read_trials():
-        trial = planned.get(record.trial_id)
-        if trial is None or trial.seed != record.seed or trial.hyperparams != record.hyperparams:
-            raise CannotRunError(
-                f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: sweep.json was changed, "
-                "or was written by a version that draws other points.",
-                "Restore sweep.json, or launch a new sweep.",
-            )
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
-
-
-def _git_commit() -> str | None:
-    """The commit of the working directory's repository, so that a sweep can be traced to a user's own code."""
-    try:
-        done = subprocess.run(  # noqa: S603 (fixed arguments)
-            ["git", "rev-parse", "HEAD"],  # noqa: S607 (git as the user has it)
-            capture_output=True, text=True, timeout=5, check=False,
-        )  # fmt: skip
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() or None if done.returncode == 0 else None
-
-
-def _connected(address: str | None, here: Machine | None) -> Any:
-    from tune_jobs.cluster import connect
-
-    return connect(address, here)
-
-
-def _run(
-    store: SweepStore,
-    plan: SweepPlan,
-    *,
-    address: str | None,
-    machine: Machine | None,
-    finish: bool,
-    progress: str,
-) -> SweepResult:
-    """Run the unfinished trials of a sweep whose lock is held, then what comes after."""
-    started = time.time()
-    store.clear_stop_request()
-    record = store.read_record()
-    store.write_record(
-        record.model_copy(
-            update={"state": "running", "started_at": record.started_at or started, "ended_at": None}
-        )
-    )
-    todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
-    spec = SweepSpec.model_validate(record.spec)
-    monitor = SweepMonitor(
-        store.name,
-        store.read_trials(),
-        max_env_steps_per_trial=spec.stop.num_env_steps,
-        max_concurrent=plan.max_concurrent,
-    )
-    if todo:
-        _run_trials(store, plan, todo, monitor, address=address, machine=machine, progress=progress)
-    interrupted = _close(store, started)
-    records = trials(store.folder)
-    result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
-    return result if interrupted or not finish else _finished(store, result)
-
-
-def _run_trials(
-    store: SweepStore,
-    plan: SweepPlan,
-    todo: tuple[str, ...],
-    monitor: SweepMonitor,
-    *,
-    address: str | None,
-    machine: Machine | None,
-    progress: str,
-) -> None:
-    from tune_jobs.live import shown
-
-    with shown(monitor, progress, store.folder / "driver.log"), _stopping_on_signals(store, monitor):
-        from tune_jobs.runner import RunJob, run_trials
-
-        job = RunJob(store.folder, todo, plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent)
-        with contextlib.suppress(KeyboardInterrupt), _connected(address, machine) as connection:
-            if connection.is_client:
-                from tune_jobs.remote_driver import run_trials_remotely
-
-                run_trials_remotely(job, monitor.update)
-            else:
-                run_trials(job, monitor.update)
-
-
-def _close(store: SweepStore, started: float) -> bool:
-    """Write down how the run ended; returns whether it was interrupted."""
-    interrupted = False
-    for trial in store.read_trials():
-        if trial.status not in FINISHED:
-            interrupted = True
-            if trial.status == "running":
-                store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "paused"}))
-    record = store.read_record()
-    now = time.time()
-    store.write_record(
-        record.model_copy(
-            update={
-                "state": "interrupted" if interrupted else "completed",
-                "ended_at": now,
-                "run_time_s": record.run_time_s + now - started,
-            }
-        )
-    )
-    store.clear_stop_request()
-    return interrupted
-
-
-def _finished(store: SweepStore, result: SweepResult) -> SweepResult:
-    """Choose, confirm and film the winner, and write the report; what can't be made is noted, not raised."""
-    from tune_jobs import finish
-
-    chosen: BestRecord | None = None
-    why: str | None = None
-    notes: list[str] = []
-    artifacts: dict[str, Path] = {}
-    try:
-        chosen = finish.choose_best(store)
-        artifacts["policy"] = store.best_folder / "policy.json"
-    except TuneJobsError as error:
-        why = str(error)
-
-    def attempt(what: str, make: Callable[[], dict[str, Path]]) -> None:
-        try:
-            artifacts.update(make())
-        except TuneJobsError as error:
-            notes.append(f"No {what}: {error}")
-
-    if chosen is not None:
-        attempt("video", lambda: finish.make_videos(store))
-    attempt("report", lambda: {"report": finish.make_report(store)})
-    return SweepResult(
-        result.folder, result.sweep, result.trials, chosen, why, artifacts, result.interrupted, tuple(notes)
-    )
-
-
-@contextlib.contextmanager
-def _stopping_on_signals(store: SweepStore, monitor: SweepMonitor) -> Iterator[None]:
-    """Let the first Ctrl-C (or SIGTERM) ask the trials to save and stop, and the second end them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def ask(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 (the signature of a handler)
-        if monitor.stopping:
-            raise KeyboardInterrupt
-        monitor.stopping = True
-        store.request_stop()
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

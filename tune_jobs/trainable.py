@@ -1,7 +1,7 @@
 """The Ray Tune Trainable: one warm process that runs one trial after another.
 
-Tune gives it a sweep folder and a trial id and nothing else; what to run is read from the sweep folder, so a trial that
-is started again anywhere goes on from what is on disk there.
+Tune gives it a sweep folder and a trial id and nothing else; what to run is read from the sweep folder, so a trial
+that is started again anywhere goes on from what is on disk there.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         latest = max((record.iteration for record in SweepStore(folder).trial(trial_id).checkpoints()), default=0)
         if latest != pointer["iteration"]:
             raise CheckpointError(
-                f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is of {latest}.",
+                f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is {latest}.",
                 "Resume the sweep: its trials go on from their latest checkpoints.",
             )
         self._loop = None

@@ -160,7 +160,11 @@ class TrialLoop:
         self._last = record.model_copy(update={"time_s": self._clock() - self._started})
         self._unwritten.append(self._last)
         score = record.evaluation_return
-        if self._improves(score) or reason is not None or record.iteration % self.task.checkpoints.every_iterations == 0:
+        if (
+            self._improves(score)
+            or reason is not None
+            or record.iteration % self.task.checkpoints.every_iterations == 0
+        ):
             self._checkpoint(score)
         status = "running" if reason is None else "completed"
         return self._progress(status, evaluated=evaluated, reason=reason)
@@ -186,13 +190,11 @@ class TrialLoop:
     def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
         stop = self.task.stop
         full_window = len(self._window) == TRAINING_RETURN_EPISODES
-        if stop.training_return is not None and full_window and record.training_return is not None:
-            # Over fewer than 100 episodes a lucky start would count as solved.
-            if record.training_return >= stop.training_return:
-                return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
-        if stop.evaluation_return is not None and evaluation_return is not None:
-            if evaluation_return >= stop.evaluation_return:
-                return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
+        # Over fewer than 100 episodes a lucky start would count as solved.
+        if full_window and _reaches(record.training_return, stop.training_return):
+            return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
+        if _reaches(evaluation_return, stop.evaluation_return):
+            return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
         if record.num_env_steps >= stop.num_env_steps:
             return f"num_env_steps {record.num_env_steps} >= {stop.num_env_steps}"
         if record.iteration >= stop.num_iterations:
@@ -257,6 +259,10 @@ class TrialLoop:
             started_at=self._started_at,
             ended_at=None if status == "running" else time.time(),
         )
+
+
+def _reaches(value: float | None, target: float | None) -> bool:
+    return value is not None and target is not None and value >= target
 
 
 def _best_of(checkpoints: list[CheckpointRecord]) -> CheckpointRecord | None:

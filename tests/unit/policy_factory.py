@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algor
     num_outputs = int(info.action_space.n) if discrete else 2 * info.action_space.shape[0]
     sizes = [info.observation_space.shape[0], *hidden, num_outputs]
     layers = []
-    for index, (num_in, num_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for index, (num_in, num_out) in enumerate(itertools.pairwise(sizes)):
         weight = rng.normal(size=(num_out, num_in)) / np.sqrt(num_in)
         bias = 0.1 * rng.normal(size=num_out)
         last = index == len(sizes) - 2
@@ -45,12 +46,18 @@ def make_policy(env_id: str, **kwargs: Any) -> NetworkPolicy:
     return NetworkPolicy(make_portable(env_id, **kwargs))
 
 
-def balancing_policy(env_id: str = "CartPole-v0", noise: float = 0.0, seed: int = 0) -> NetworkPolicy:
-    """A linear CartPole policy that balances the pole; with noise on its weights it balances it for a "
-    "while."""
-    rng = np.random.default_rng(seed)
-    push = np.array([0.1, 0.5, 10.0, 2.0]) * (1 + noise * rng.normal(size=4))
-    weight = np.array([np.zeros(4), push], dtype=np.float32)
+# Weights on CartPole's position, velocity, angle and angular velocity, and how long they keep the pole up.
+PUSHES = {
+    "good": (0.1, 0.5, 10.0, 2.0),  # for ever
+    "fair": (-0.1, 0.0, 1.0, 0.3),  # 200 to 500 steps
+    "wobbly": (0.0, 0.0, 0.0, 1.0),  # 140 to 320
+    "poor": (0.0, 0.0, 1.0, 0.0),  # 24 to 68
+}
+
+
+def balancing_policy(env_id: str = "CartPole-v0", skill: str = "good") -> NetworkPolicy:
+    """A linear CartPole policy that balances the pole more or less well."""
+    weight = np.array([np.zeros(4), PUSHES[skill]], dtype=np.float32)
     base = make_portable(env_id, hidden=())
     layers = (Layer(weight, np.zeros(2, np.float32)),)
     return NetworkPolicy(

@@ -92,17 +92,15 @@ def make_sweep(
 
 def make_iterations(point, rng, *, num_iterations, steps_per_iteration, cap, threshold):
     log_lr = math.log10(point.get("lr", 3e-3))
-    speed = math.exp(-((log_lr + 2.5) ** 2) / 0.5) * (
-        1.6 if sum(point.get("hidden_sizes", [64])) >= 64 else 1.0
-    )
-    ceiling = cap * (0.75 if point.get("activation") == "linear" else 1.1)
+    speed = math.exp(-((log_lr + 2.5) ** 2) / 0.5) * (1.6 if sum(point.get("hidden_sizes", [64])) >= 64 else 1.0)
+    ceiling = cap * (0.75 if point.get("activation") == "linear" else 1.4)
     rows, last, num_episodes, seen = [], [], 0, []
     for iteration in range(1, num_iterations + 1):
         progress = 1 - math.exp(-speed * iteration / 10)
-        mean = 20 + (ceiling - 20) * progress**1.5
+        mean = min(1.04 * cap, 20 + (ceiling - 20) * progress**1.5)
         returns = []
         while sum(returns) < steps_per_iteration:
-            returns.append(float(min(cap, max(8, round(rng.normal(mean, 0.25 * mean))))))
+            returns.append(float(min(cap, max(8, round(rng.normal(mean, 0.2 * mean * (mean < 0.97 * cap)))))))
         num_episodes += len(returns)
         last = (last + returns)[-100:]
         evaluation = float(np.mean(np.clip(rng.normal(1.08 * mean, 8, size=10), 9, cap)))

@@ -165,3 +165,21 @@ def test_a_reset_of_another_shape_than_declared_is_refused():
             check_env("TestLiar-v0", None, "ppo")
     finally:
         del gym.registry["TestLiar-v0"]
+
+
+def test_a_vectorised_version_that_cannot_keep_the_time_limit_is_not_used():
+    def without_limit(num_envs):
+        raise AssertionError(num_envs)
+
+    def with_limit(num_envs, max_episode_steps):
+        raise AssertionError(num_envs)
+
+    cartpole = "gymnasium.envs.classic_control:CartPoleEnv"
+    for entry_point, used in ((without_limit, False), (with_limit, True)):
+        gym.register("TestVector-v0", cartpole, vector_entry_point=entry_point, max_episode_steps=9)
+        try:
+            assert check_env("TestVector-v0", None, "ppo").has_vector_entry_point == used
+            if not used:
+                assert isinstance(make_vector_env("TestVector-v0", None, 2), gym.vector.SyncVectorEnv)
+        finally:
+            del gym.registry["TestVector-v0"]

@@ -31,18 +31,23 @@ def test_others_may_read_what_is_written(tmp_path):
 def test_an_error_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError), atomic_path(path) as temporary:
-        temporary.write_text("half")
-        assert temporary.suffix == ".mp4"
-        assert path.read_text() == "old"
-        raise ZeroDivisionError
+
+    def write_half():
+        with atomic_path(path) as temporary:
+            temporary.write_text("half")
+            assert temporary.suffix == ".mp4"
+            assert path.read_text() == "old"
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        write_half()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(CannotRunError, match="Cannot write .*file/a.json") as caught:
+    with pytest.raises(CannotRunError, match=r"Cannot write .*file/a\.json") as caught:
         write_atomic(tmp_path / "file" / "a.json", "x")
     assert caught.value.exit_code == 5
     assert caught.value.hint
@@ -51,3 +56,12 @@ def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
 def test_sha256_of_a_file(tmp_path):
     (tmp_path / "a").write_bytes(b"abc" * 100_000)
     assert sha256_file(tmp_path / "a") == hashlib.sha256(b"abc" * 100_000).hexdigest()
+
+
+def test_the_content_is_on_disk_before_the_name_is(tmp_path, monkeypatch):
+    events = []
+    replace = type(tmp_path).replace
+    monkeypatch.setattr(os, "fsync", lambda descriptor: events.append("sync"))
+    monkeypatch.setattr(type(tmp_path), "replace", lambda *args: (events.append("replace"), replace(*args)))
+    write_atomic(tmp_path / "a", "x")
+    assert events == ["sync", "replace", "sync"]

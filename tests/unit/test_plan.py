@@ -128,9 +128,7 @@ def test_values_that_contradict_each_other_are_told_with_their_point():
 
 def test_sub_environments_have_to_fit_into_a_trials_seeds():
     machine = Machine(64)
-    assert (
-        plan("hyperparams.num_envs=512", "resources.num_env_runners=2", machine=machine).max_concurrent == 20
-    )
+    assert plan("hyperparams.num_envs=512", "resources.num_env_runners=2", machine=machine).max_concurrent == 20
     with pytest.raises(SpecError, match=f"1536 sub-environments.*{SEEDS_PER_TRIAL}"):
         plan("hyperparams.num_envs=512", "resources.num_env_runners=3", machine=machine)
 
@@ -173,9 +171,7 @@ def test_disk_grows_with_networks_checkpoints_and_trials():
     assert least < 50e6
     assert plan().max_disk_bytes > least
     assert plan("num_samples=1", "checkpoints.keep=4").max_disk_bytes > least
-    wide = plan(
-        "num_samples=1", "space.hidden_sizes=", "hyperparams.hidden_sizes=[1024, 1024]"
-    ).max_disk_bytes
+    wide = plan("num_samples=1", "space.hidden_sizes=", "hyperparams.hidden_sizes=[1024, 1024]").max_disk_bytes
     # Two networks of a million weights, 4 bytes each, with Adam's two moments, in four checkpoints, for two
     # trials.
     assert wide - least > 2 * 4 * 2 * 1e6 * 4 * 3

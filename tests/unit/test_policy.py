@@ -107,7 +107,9 @@ def _gaussian(env_id, transform):
 def test_bounded_actions_are_stretched_over_the_bounds_and_clipped():
     mean, actions = _gaussian("Pendulum-v1", "unsquash")
     assert (np.abs(mean) > 1).any()
-    np.testing.assert_array_equal(actions, np.clip(np.float32(2) * mean, -2, 2))
+    np.testing.assert_allclose(actions, np.clip(2 * mean, -2, 2), rtol=1e-5, atol=1e-6)
+    low, high = np.full(1, -2, np.float32), np.full(1, 2, np.float32)
+    np.testing.assert_array_equal(actions, np.clip(low + (mean + 1.0) * (high - low) / 2.0, low, high))
 
 
 def test_actions_with_an_open_bound_are_left_as_they_are():
@@ -142,7 +144,7 @@ def test_weights_that_are_not_finite_are_named(value):
     portable = make_portable("CartPole-v1")
     NetworkPolicy(portable).check_finite()
     portable.network.layers[1].bias[3] = value
-    with pytest.raises(NonFiniteWeightsError, match="1 weights .* in layer 1") as caught:
+    with pytest.raises(NonFiniteWeightsError, match=r"1 weights .* in layer 1") as caught:
         NetworkPolicy(portable).check_finite()
     assert pickle.loads(pickle.dumps(caught.value)).message == caught.value.message
 

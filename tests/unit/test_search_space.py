@@ -147,8 +147,7 @@ def test_points_are_what_they_always_were():
     # A change here breaks `extend` and `resume` of the sweeps people already have.
     space = {"lr": domain(loguniform=[1e-5, 1e-2]), "n": domain(randint=[0, 1000])}
     assert draw_points(space, 2, sweep_seed=7) == [
-        pytest.approx(point)
-        for point in [{"lr": 0.000150079572571204, "n": 804}, {"lr": 0.004156478866087, "n": 479}]
+        pytest.approx(point) for point in [{"lr": 0.000150079572571204, "n": 804}, {"lr": 0.004156478866087, "n": 479}]
     ]
 
 

@@ -22,9 +22,7 @@ def checkpoint(trial_id, iteration, evaluation, *, steps=None, training=None):
     )
 
 
-def trial(
-    index, *evaluations, point=None, seed_index=0, status="completed", steps=None, error=None, training=None
-):
+def trial(index, *evaluations, point=None, seed_index=0, status="completed", steps=None, error=None, training=None):
     trial_id = f"t{index:04d}"
     return TrialRecord(
         trial_id=trial_id,
@@ -36,8 +34,7 @@ def trial(
         status=status,
         error=error,
         checkpoints=tuple(
-            checkpoint(trial_id, i + 1, value, steps=steps, training=training)
-            for i, value in enumerate(evaluations)
+            checkpoint(trial_id, i + 1, value, steps=steps, training=training) for i, value in enumerate(evaluations)
         ),
     )
 

@@ -30,7 +30,6 @@ def write(tmp_path, text):
 
 
 # -- what is read
-# ------------------------------------------------------------------------------------------------------
 
 
 def test_the_smallest_sweep_has_finite_caps():
@@ -62,8 +61,15 @@ stop: {num_env_steps: 5e4, time_s: 1e+2}
 
 
 def test_zero_and_null_are_values_of_their_own():
-    spec = load_spec({**MINIMAL, "hyperparams": {"entropy_coeff": 0}, "stop": {"training_return": 0},
-                      "checkpoints": {"keep": 0}, "max_retries": 0})  # fmt: skip
+    spec = load_spec(
+        {
+            **MINIMAL,
+            "hyperparams": {"entropy_coeff": 0},
+            "stop": {"training_return": 0},
+            "checkpoints": {"keep": 0},
+            "max_retries": 0,
+        }
+    )
     assert spec.stop.training_return == 0.0
     assert spec.stop.evaluation_return is None
     assert (spec.checkpoints.keep, spec.max_retries, spec.hyperparams["entropy_coeff"]) == (0, 0, 0)
@@ -93,9 +99,7 @@ def test_a_resolved_spec_round_trips_through_json():
 
 
 def test_domains_can_be_given_as_objects():
-    spec = load_spec(
-        {**MINIMAL, "space": {"lr": Uniform(uniform=(1e-4, 1e-3)), "activation": Grid(grid=("relu",))}}
-    )
+    spec = load_spec({**MINIMAL, "space": {"lr": Uniform(uniform=(1e-4, 1e-3)), "activation": Grid(grid=("relu",))}})
     assert spec.space["lr"] == Uniform(uniform=(1e-4, 1e-3))
 
 
@@ -105,7 +109,6 @@ def test_a_spec_cannot_be_changed():
 
 
 # -- presets
-# -----------------------------------------------------------------------------------------------------------
 
 
 def test_every_preset_loads_has_a_description_and_no_name():
@@ -142,7 +145,6 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
 
 
 # -- what is wrong
-# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -242,8 +244,15 @@ def test_every_problem_is_told_at_once():
         space={"gamma": {"grid": []}, "taau": {"uniform": [0, 1]}, "tau": {"uniform": [0, 2]}},
     )
     assert message.startswith("sweep: 7 problems:\n  ")
-    for part in ("env: is missing", "num_samples: 'x'", "hyperparams.num_epochs", "hyperparams.lr", "space.gamma.grid",
-                 "space.taau", "space.tau.uniform[1]"):  # fmt: skip
+    for part in (
+        "env: is missing",
+        "num_samples: 'x'",
+        "hyperparams.num_epochs",
+        "hyperparams.lr",
+        "space.gamma.grid",
+        "space.taau",
+        "space.tau.uniform[1]",
+    ):
         assert part in message
 
 
@@ -292,16 +301,23 @@ def test_good_sweep_names(name):
 
 
 # -- --set
-# -------------------------------------------------------------------------------------------------------------
 
 
 def test_set_overrides_and_creates_fields():
     spec = load_spec(
         "cartpole-ppo",
-        ["stop.num_env_steps=1000", "env=CartPole-v1", "env.args.sutton_barto_reward=true", "scheduler=asha",
-         "scheduler.grace_env_steps=50", "space.lr={grid: [1e-3, 2e-3]}", "resources.max_concurrent=1",
-         "hyperparams.grad_clip=null", "name=ab"],
-    )  # fmt: skip
+        [
+            "stop.num_env_steps=1000",
+            "env=CartPole-v1",
+            "env.args.sutton_barto_reward=true",
+            "scheduler=asha",
+            "scheduler.grace_env_steps=50",
+            "space.lr={grid: [1e-3, 2e-3]}",
+            "resources.max_concurrent=1",
+            "hyperparams.grad_clip=null",
+            "name=ab",
+        ],
+    )
     assert spec.stop.num_env_steps == 1000
     assert spec.stop.training_return == 195
     assert (spec.env.id, spec.env.args) == ("CartPole-v1", {"sutton_barto_reward": True})
@@ -343,9 +359,7 @@ def test_bad_overrides(override, part):
 def test_a_problem_says_that_it_came_from_set():
     message = errors(num_samples=0, overrides=["seed=-1"])
     lines = message.splitlines()
-    assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(
-        True
-    ) == 1
+    assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(True) == 1
     assert any(line.strip().startswith("seed:") and line.endswith("(from --set)") for line in lines)
 
 
@@ -356,7 +370,6 @@ def test_overrides_leave_the_mapping_they_were_given_alone():
 
 
 # -- JSON Schema
-# -------------------------------------------------------------------------------------------------------
 
 
 def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
@@ -372,9 +385,16 @@ def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
     }
     assert list(validator.iter_errors(good)) == []
     assert list(validator.iter_errors({**good, "env": {"id": "x", "args": {}}, "space": None})) == []
-    bad = [{"algorithm": "ppo"}, {**good, "x": 1}, {**good, "hyperparams": {"dueling": True}},
-           {**good, "space": {"tau": {"grid": [1]}}}, {**good, "space": {"lr": {"grid": 1}}},
-           {**good, "hyperparams": {"lr": 0}}, {**good, "stop": {"x": 1}}, {**good, "scheduler": {"type": "x"}}]  # fmt: skip
+    bad = [
+        {"algorithm": "ppo"},
+        {**good, "x": 1},
+        {**good, "hyperparams": {"dueling": True}},
+        {**good, "space": {"tau": {"grid": [1]}}},
+        {**good, "space": {"lr": {"grid": 1}}},
+        {**good, "hyperparams": {"lr": 0}},
+        {**good, "stop": {"x": 1}},
+        {**good, "scheduler": {"type": "x"}},
+    ]
     for wrong in bad:
         assert list(validator.iter_errors(wrong)), wrong
 

@@ -19,6 +19,7 @@ from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
 from policies.video import record_side_by_side, record_video
 
 register_test_envs()
+pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
 
 
 def read_mp4(path):
@@ -40,7 +41,7 @@ def gif_frames(path):
 
 
 def test_the_filmed_episode_is_the_evaluated_one_and_plays_in_real_time(tmp_path):
-    policy = balancing_policy("CartPole-v0", noise=3.0, seed=1)
+    policy = balancing_policy(skill="poor")
     mp4, gif = tmp_path / "new" / "a.mp4", tmp_path / "new" / "a.gif"
     episodes = record_video(policy, env_id="CartPole-v0", seeds=[4, 5], mp4=mp4, gif=gif, caption="me")
     assert episodes == evaluate_policy(policy, env_id="CartPole-v0", seeds=[4, 5])
@@ -82,7 +83,7 @@ def test_a_random_policy_is_filmed_as_it_is_evaluated(tmp_path):
 
 
 def test_side_by_side_the_shorter_one_holds_its_last_frame(tmp_path):
-    left, right = balancing_policy("CartPole-v0", 3.0, seed=1), balancing_policy("CartPole-v0")
+    left, right = balancing_policy(skill="poor"), balancing_policy()
     results = record_side_by_side(
         left,
         right,
@@ -90,12 +91,12 @@ def test_side_by_side_the_shorter_one_holds_its_last_frame(tmp_path):
         seeds=4,
         mp4=tmp_path / "a.mp4",
         gif=tmp_path / "a.gif",
-        max_steps=40,
+        max_steps=80,
     )
     for policy, result in zip((left, right), results, strict=True):
-        assert result == evaluate_policy(policy, env_id="CartPole-v0", seeds=[4], max_episode_steps=40)
+        assert result == evaluate_policy(policy, env_id="CartPole-v0", seeds=[4], max_episode_steps=80)
     short, long = results[0].lengths[0], results[1].lengths[0]
-    assert short < long == 40
+    assert short < long == 80
     meta, frames = read_mp4(tmp_path / "a.mp4")
     assert len(frames) == long + 1 + 50
     assert meta["size"][0] == 600 + 12 + 600
@@ -183,6 +184,11 @@ def test_an_encoder_that_fails_is_one_clear_error(tmp_path, monkeypatch):
         writer.add(picture, 50)
     assert list(tmp_path.iterdir()) == [broken]
 
+    broken.write_text("#!/bin/sh\ncat > /dev/null\necho 'disk on fire' >&2\nexit 1\n")
+    with pytest.raises(CannotRunError, match="disk on fire"), Mp4Writer(tmp_path / "a.mp4", 30) as writer:
+        writer.add(picture, 5)
+    assert list(tmp_path.iterdir()) == [broken]
+
     def none_there():
         raise RuntimeError("no binary for this machine")
 
@@ -203,8 +209,12 @@ def test_a_gif_stays_within_its_size_and_its_time(tmp_path, monkeypatch):
         drawn.append(1)
         return Image.fromarray(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8))
 
+    def red():
+        return Image.new("RGB", (80, 60), (255, 0, 0))
+
     for step in range(300):
-        writer.add(noise, hold_s=1.0 if step in {99, 299} else 0.0)
+        last = step in {99, 299}
+        writer.add(red if last else noise, hold_s=1.0 if last else 0.0)
     assert len(drawn) < 150  # what is passed over is not drawn
     writer.save()
     size, loop, frames = gif_frames(tmp_path / "a.gif")
@@ -213,7 +223,10 @@ def test_a_gif_stays_within_its_size_and_its_time(tmp_path, monkeypatch):
     assert loop == 0
     assert sum(duration for duration, _ in frames) == pytest.approx(8000, abs=20)
     assert frames[-1][0] >= 1000
-    assert sum(duration >= 1000 for duration, _ in frames) == 2
+    held = [frame for duration, frame in frames if duration >= 1000]
+    assert len(held) == 2
+    for frame in held:
+        np.testing.assert_allclose(frame.mean(axis=(0, 1)), (255, 0, 0), atol=5)
 
 
 def test_a_gif_without_pictures_is_refused(tmp_path):
@@ -238,3 +251,10 @@ def test_a_white_background_stays_white_and_nothing_is_printed(tmp_path):
     assert done.stdout == done.stderr == ""
     _, _, frames = gif_frames(tmp_path / "a.gif")
     assert all(frame[100, 10].min() >= 254 for _, frame in frames)
+
+
+def test_odd_sizes_become_even(tmp_path):
+    with Mp4Writer(tmp_path / "a.mp4", 12.5) as writer:
+        writer.add(Image.new("RGB", (31, 21), (255, 255, 255)), 4)
+    meta, frames = read_mp4(tmp_path / "a.mp4")
+    assert (meta["size"], meta["fps"], len(frames)) == ((32, 22), 12.5, 4)

@@ -129,8 +129,12 @@ class RLlibEngine:
         assert self._task is not None
         assert self._hyperparams is not None
         task = self._task
-        training = {"trial_id": task.trial_id, "seed": task.seed, "hyperparams": task.hyperparams,
-                    "iteration": self.algorithm.iteration}
+        training = {
+            "trial_id": task.trial_id,
+            "seed": task.seed,
+            "hyperparams": task.hyperparams,
+            "iteration": self.algorithm.iteration,
+        }
         return portable_policy(
             self.algorithm, self._hyperparams, env_id=task.env_id, env_args=task.env_args, training=training
         )

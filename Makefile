@@ -1,0 +1,53 @@
+# make sweep   install into .venv, run the tutorial's sweep, show where its results lie
+# make test    install the test tools too, then lint, types and every test that can run here
+# make bench   the benchmarks, beside their peers, in one table
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+# torch first and pinned: whatever depends on it then takes it as it is.
+TORCH := $(shell grep '^torch==' constraints.txt)
+
+.PHONY: install sweep test lint types bench clean
+
+sweep: install
+	$(BIN)/tune-jobs launch cartpole-ppo
+
+install: $(VENV)/installed
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "tune-jobs needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=python3.11"; exit 5; }
+	$(PYTHON) -m venv $(VENV)
+
+# Editable, so that an edit acts at once; the wheel is tested on its own.
+$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP) install --quiet --constraint constraints.txt $(TORCH)
+	$(PIP) install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(VENV)/installed-test: $(VENV)/installed
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+$(VENV)/installed-bench: $(VENV)/installed
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
+	@touch $@
+
+test: $(VENV)/installed-test lint types
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+types: $(VENV)/installed-test
+	$(BIN)/mypy
+
+bench: $(VENV)/installed-bench
+	$(BIN)/python -m tests.benchmarks
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,236 @@
+"""The report of a sweep: one HTML file that needs nothing else; figures and tables also as files beside it.
+
+    report/index.html   figures as inline SVG, videos as base64: it can be mailed as it is
+    report/trials.csv, iterations.csv, figures/*.png
+
+Everything in the page is escaped (error texts and env ids come from elsewhere), and the page's own content
+security policy keeps it from running or loading anything but its one script.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis import plots, report_data, report_tables, wording
+from analysis.plot_style import CSS_DARK, CSS_LIGHT, group_names, numeric_names, to_png, to_svg
+from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord
+from analysis.selection import score_trial
+from analysis.tables import iterations_frame, trials_frame, write_csv
+from policies.files import write_atomic
+
+if TYPE_CHECKING:
+    import jinja2
+    from matplotlib.figure import Figure
+
+_WIDE = (9.0, 4.2)
+_NARROW = (4.4, 5.0)
+_MEDIA_TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
+_VIDEO_TITLES = {
+    "before": "Before training: random actions",
+    "after": "After training: the winner, greedy",
+    "side_by_side": "Before and after, on the same seed",
+}
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """What a report is made from."""
+
+    folder: Path
+    sweep: SweepRecord
+    trials: Sequence[TrialRecord]
+    results: Mapping[str, Sequence[IterationRecord]]
+    best: BestRecord | None
+    goal: float | None
+
+    @property
+    def axis(self) -> str | None:
+        """The searched number that stands on the horizontal axis."""
+        return next(iter(numeric_names(self.trials)), None)
+
+    @property
+    def winner(self) -> str | None:
+        """Trial id of the confirmed winner."""
+        return None if self.best is None else self.best.checkpoint.trial_id
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A figure that can be drawn at two sizes."""
+
+    stem: str
+    title: str
+    caption: str
+    draw: Callable[[tuple[float, float]], Figure]
+
+
+def build_report(
+    folder: Path,
+    *,
+    sweep: SweepRecord,
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    best: BestRecord | None,
+    videos: Mapping[str, Path],
+) -> Path:
+    """Write the report of a sweep into its folder.
+
+    Args:
+        folder: The sweep folder; the report goes to `report/` in it.
+        sweep: What was asked for, and where it ran.
+        trials: All trials, in any status.
+        results: Iterations by trial id, oldest first; a trial may have none.
+        best: The confirmed winner; None: the report says why there is none.
+        videos: Files to embed, by "before", "after" or another name; those that do not exist are left out.
+
+    Returns:
+        Path of index.html.
+
+    Raises:
+        CannotRunError: A file cannot be written.
+    """
+    target = folder / "report"
+    goal = report_data.goal_of(sweep, best)
+    write_csv(target / "trials.csv", trials_frame(trials, results, threshold=goal))
+    write_csv(target / "iterations.csv", iterations_frame(results))
+    source = _Sweep(folder, sweep, trials, results, best, goal)
+    figures = []
+    for picture in _pictures(source):
+        write_atomic(target / "figures" / f"{picture.stem}.png", to_png(picture.draw(_WIDE)))
+        sizes = {"wide": _WIDE, "narrow": _NARROW}
+        drawings = {
+            kind: to_svg(picture.draw(size), label=picture.title, prefix=f"{picture.stem}-{kind}")
+            for kind, size in sizes.items()
+        }
+        figures.append({"title": picture.title, "caption": picture.caption} | drawings)
+    page = _render(
+        **_content(source),
+        figures=figures,
+        videos=[_embed(name, path) for name, path in videos.items() if path.is_file()],
+    )
+    write_atomic(target / "index.html", page)
+    return target / "index.html"
+
+
+def _content(source: _Sweep) -> dict[str, Any]:
+    """Everything the template shows except figures and videos."""
+    import yaml
+
+    sweep, trials, results, best, goal = source.sweep, source.trials, source.results, source.best, source.goal
+    groups = group_names(trials, source.axis)
+    return {
+        "sweep": sweep,
+        "env_id": report_data.env_of(sweep),
+        "algorithm": str(sweep.spec.get("algorithm", "?")).upper(),
+        "goal": goal,
+        "headline": report_data.headline(sweep, trials, results, goal),
+        "winner": None if best is None else report_data.winner_card(best, trials, sweep, source.folder),
+        "why_no_best": None if best is not None else report_data.why_no_best(trials, source.folder),
+        "sweep_path": report_data.shown_path(source.folder),
+        "trial_table": report_tables.trial_table(trials, results, goal=goal, best=best),
+        "group_table": report_tables.group_table(trials, results, groups, goal=goal),
+        "point_table": report_tables.point_table(trials),
+        "failures": report_data.failures(trials),
+        "facts": report_data.facts(sweep),
+        "spec_yaml": yaml.safe_dump(sweep.spec, sort_keys=False, allow_unicode=True, default_flow_style=None),
+    }
+
+
+def _pictures(source: _Sweep) -> list[_Picture]:
+    """The figures there is data for."""
+    trials, results, goal, winner = source.trials, source.results, source.goal, source.winner
+    pictures = []
+    if any(item.training_return is not None for items in results.values() for item in items):
+        pictures.append(
+            _Picture(
+                "learning_curves",
+                "Learning curves",
+                "Mean return of the last 100 whole training episodes, exploring. "
+                "Circles: greedy evaluations of the winner.",
+                lambda size: plots.learning_curves(trials, results, threshold=goal, winner=winner, size=size),
+            )
+        )
+    # One dot says less than the winner's card.
+    if sum(score_trial(trial) is not None for trial in trials) > 1:
+        pictures.append(
+            _Picture(
+                f"score_by_{_stem(source.axis)}",
+                f"Score against {source.axis}" if source.axis is not None else "Score by trial",
+                "Best greedy evaluation of each trial, on the sweep's evaluation seeds.",
+                lambda size: plots.score_by_lr(trials, threshold=goal, winner=winner, size=size),
+            )
+        )
+    episodes = [value for item in results.get(winner or "", ()) for value in item.episode_returns]
+    returns = [value for value in episodes if math.isfinite(value)]
+    if returns:
+        pictures.append(
+            _Picture(
+                "score_per_episode",
+                "The winner, episode by episode",
+                "Every whole training episode of the winning trial, exploring, and how the last ones spread.",
+                lambda size: plots.score_per_episode(returns, goal=goal, size=size),
+            )
+        )
+    return pictures
+
+
+def _stem(name: str | None) -> str:
+    """A hyperparameter's name as part of a file name: it is an identifier, but records are not trusted."""
+    return "".join(letter if letter.isalnum() or letter == "_" else "_" for letter in name or "trial")
+
+
+def _embed(name: str, path: Path) -> dict[str, str]:
+    media_type = _MEDIA_TYPES.get(path.suffix.lower(), "video/mp4")
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    return {
+        "title": _VIDEO_TITLES.get(name, name),
+        "kind": media_type.partition("/")[0],
+        "source": f"data:{media_type};base64,{data}",
+    }
+
+
+def _render(**content: Any) -> str:
+    from markupsafe import Markup
+
+    environment = _environment()
+    # Markup marks text as HTML. It is given only what this package made: figures, its script, its style.
+    figures = [
+        figure | {"wide": Markup(figure["wide"]), "narrow": Markup(figure["narrow"])}  # noqa: S704
+        for figure in content.pop("figures")
+    ]
+    script = _source(environment, "report.js")
+    digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+    return environment.get_template("report.html.j2").render(
+        **content,
+        figures=figures,
+        css_light=CSS_LIGHT,
+        css_dark=CSS_DARK,
+        style=Markup(_source(environment, "report.css")),  # noqa: S704
+        script=Markup(script),  # noqa: S704
+        script_hash=f"sha256-{digest}",
+        interval_text=wording.interval_text,
+        number=wording.number,
+    )
+
+
+def _environment() -> jinja2.Environment:
+    import jinja2
+
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("analysis", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _source(environment: jinja2.Environment, name: str) -> str:
+    assert environment.loader is not None  # noqa: S101  (for the type checker: _environment sets it)
+    return environment.loader.get_source(environment, name)[0]

@@ -1,0 +1,152 @@
+"""What the report says, taken from the records and worded for a reader; `report.py` draws and writes it."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord, finite_or_none
+from analysis.selection import NoUsableTrialError, error_summary, select_best
+from analysis.statistics import mean_with_ci, paired_difference
+from analysis.tables import format_value, trials_frame
+from analysis.wording import NONE, duration, moment, number, seed_range
+
+_MAX_ERROR_CHARS = 4_000
+
+
+def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
+    """The return that counts as solved: the env's threshold, else the stop rule's; None without both."""
+    if best is not None and best.confirmation.threshold is not None:
+        return best.confirmation.threshold
+    import gymnasium
+
+    # The registry itself, not gymnasium.spec(): that would import what a "module:Env-v0" names.
+    env_spec = gymnasium.registry.get(env_of(sweep))
+    if env_spec is not None and env_spec.reward_threshold is not None:
+        return float(env_spec.reward_threshold)
+    stop = sweep.spec.get("stop") or {}
+    wanted = [finite_or_none(stop.get(name)) for name in ("evaluation_return", "training_return")]
+    return next((value for value in wanted if value is not None), None)
+
+
+def env_of(sweep: SweepRecord) -> str:
+    """The env id of a sweep, from its resolved spec."""
+    env = sweep.spec.get("env")
+    return str(env.get("id", "?")) if isinstance(env, Mapping) else str(env)
+
+
+def headline(
+    sweep: SweepRecord,
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    goal: float | None,
+) -> list[tuple[str, str]]:
+    """The sweep in a few numbers: label and value."""
+    frame = trials_frame(trials, results, threshold=goal)
+    statuses = Counter(trial.status for trial in trials)
+    facts = [
+        ("trials", ", ".join(f"{count} {status}" for status, count in statuses.most_common()) or "none"),
+        ("env steps", number(sum(trial.num_env_steps for trial in trials))),
+        ("wall time", duration(sweep.run_time_s)),
+    ]
+    if goal is not None:
+        solved = frame["num_env_steps_to_solve"].dropna()
+        facts.append(("solved in training", f"{len(solved)} of {len(trials)}"))
+        if len(solved):
+            facts.append(("fewest env steps to solve", number(int(solved.min()))))
+    return facts
+
+
+def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRecord, folder: Path) -> dict[str, Any]:
+    """The winner: its point, both scores, the random baseline, and how to load it."""
+    confirmation, random = best.confirmation, best.random
+    rng = np.random.default_rng(0)
+    interval = gain = None
+    if _all_finite(confirmation.returns):
+        interval = mean_with_ci(confirmation.returns, rng=rng)
+        if _all_finite(random.returns) and random.seeds == confirmation.seeds:
+            gain = paired_difference(confirmation.returns, random.returns, rng=rng)
+    policy = shown_path(folder / "best" / "policy.json")
+    return {
+        "trial_id": best.checkpoint.trial_id,
+        "iteration": best.checkpoint.iteration,
+        "num_env_steps": best.checkpoint.num_env_steps,
+        "seed": best.seed,
+        "point": [(name, number(format_value(value))) for name, value in best.point.items()],
+        "selection_score": best.selection_score,
+        "num_selection_episodes": len(sweep.evaluation_seeds),
+        "confirmation": confirmation,
+        "interval": interval,
+        "gain": gain,
+        "random": random,
+        "optimism_gap": best.optimism_gap,
+        "evaluate_command": f"tune-jobs evaluate {shlex.quote(policy)}",
+        "policy_path": repr(policy),
+        "stale": _is_stale(best, trials),
+    }
+
+
+def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
+    """Message and hint for a sweep that has no confirmed winner."""
+    try:
+        selection = select_best(trials)
+    except NoUsableTrialError as error:
+        return error.message, error.hint
+    return (
+        f"{selection.trial.trial_id} leads with {selection.score:.1f}, not confirmed on fresh seeds yet.",
+        f"Run: tune-jobs best {shlex.quote(shown_path(folder))}",
+    )
+
+
+def failures(trials: Sequence[TrialRecord]) -> list[dict[str, str]]:
+    """Failed trials with the line that names the error and the end of the whole text."""
+    return [
+        {
+            "trial_id": trial.trial_id,
+            "summary": error_summary(trial.error),
+            "text": (trial.error or "")[-_MAX_ERROR_CHARS:],
+            "point": ", ".join(f"{name} {number(format_value(value))}" for name, value in trial.point.items()),
+            "num_failures": str(trial.num_failures),
+        }
+        for trial in sorted(trials, key=lambda item: item.index)
+        if trial.status == "failed"
+    ]
+
+
+def facts(sweep: SweepRecord) -> list[tuple[str, str]]:
+    """When, with what and on which seeds the sweep ran."""
+    rows = [
+        ("started", moment(sweep.started_at)),
+        ("ended", moment(sweep.ended_at)),
+        ("time in all", duration(sweep.run_time_s)),
+        ("sweep seed", str(sweep.spec.get("seed", NONE))),
+        ("evaluation seeds", seed_range(sweep.evaluation_seeds)),
+        ("confirmation seeds", seed_range(sweep.confirmation_seeds)),
+        ("address", sweep.address or "this machine"),
+        ("git commit", sweep.git_commit or NONE),
+    ]
+    return rows + sorted(sweep.versions.items())
+
+
+def shown_path(path: Path) -> str:
+    """A path as a user would type it: relative where it lies below the current folder."""
+    absolute = path.absolute()
+    return str(absolute.relative_to(Path.cwd())) if absolute.is_relative_to(Path.cwd()) else str(absolute)
+
+
+def _is_stale(best: BestRecord, trials: Sequence[TrialRecord]) -> bool:
+    """Whether the selection has since moved to another checkpoint (the sweep was extended, say)."""
+    try:
+        return select_best(trials).checkpoint.path != best.checkpoint.path
+    except NoUsableTrialError:
+        return False
+
+
+def _all_finite(values: Sequence[float]) -> bool:
+    return len(values) > 0 and all(map(math.isfinite, values))

@@ -1,0 +1,59 @@
+"""Numbers, times and seeds as text for a reader."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from numbers import Real
+from typing import Any
+
+from analysis.statistics import Estimate
+
+NONE = "\u2013"
+"""What stands for a value that is not known."""
+
+
+def number(value: Any) -> str:
+    """A cell's text: thousands apart, four significant digits, a dash for what is not known."""
+    if value is None:
+        return NONE
+    if isinstance(value, bool | str) or not is_number(value):
+        return str(value)
+    if float(value).is_integer() and abs(value) < 1e15:
+        return f"{int(value):,}"
+    return f"{value:.4g}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds as "42 s", "1 min 10 s" or "2 h 5 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def moment(unix_time: float | None) -> str:
+    """A Unix time as UTC, to the minute."""
+    return NONE if unix_time is None else f"{datetime.fromtimestamp(unix_time, tz=UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def seed_range(seeds: Sequence[int]) -> str:
+    """Seeds as "10 (4711 to 4720)"; listed where they are not contiguous."""
+    if not seeds:
+        return "none"
+    if tuple(seeds) == tuple(range(seeds[0], seeds[0] + len(seeds))):
+        return f"{len(seeds)} ({seeds[0]} to {seeds[-1]})" if len(seeds) > 1 else str(seeds[0])
+    return f"{len(seeds)} ({', '.join(map(str, seeds))})"
+
+
+def interval_text(estimate: Estimate) -> str:
+    """An interval as "188.1 to 199.9"."""
+    return f"{estimate.lower:.1f} to {estimate.upper:.1f}"
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a real number, NumPy's included; True and False are not."""
+    return isinstance(value, Real) and not isinstance(value, bool)

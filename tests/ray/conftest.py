@@ -1,0 +1,47 @@
+"""One Ray for all tests here, and a package of test environments that its worker processes find too."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+PLUGIN = Path(__file__).parent / "env_plugin"
+
+
+@pytest.fixture(scope="session")
+def env_plugin(tmp_path_factory):
+    """Install `env_plugin` for this process and those it starts: a metadata folder with Gymnasium's entry point."""
+    folder = tmp_path_factory.mktemp("site")
+    metadata = folder / "tune_jobs_test_envs-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: tune-jobs-test-envs\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[gymnasium.envs]\n__root__ = tune_jobs_test_envs:register\n")
+    paths = [str(PLUGIN), str(folder)]
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths + ([before] if before else []))
+    sys.path[:0] = paths
+    import tune_jobs_test_envs
+
+    # Gymnasium has looked for entry points already, when this process imported it.
+    tune_jobs_test_envs.register()
+    yield
+    if before is None:
+        del os.environ["PYTHONPATH"]
+    else:
+        os.environ["PYTHONPATH"] = before
+    for path in paths:
+        sys.path.remove(path)
+
+
+@pytest.fixture(scope="session")
+def ray_session(env_plugin):
+    """A Ray of two CPUs, started as a sweep starts its own; RLlib would start one without these settings."""
+    import ray
+
+    from tune_jobs.runner import prepare_environment
+
+    prepare_environment()
+    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+    yield
+    ray.shutdown()

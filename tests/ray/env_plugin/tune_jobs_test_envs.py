@@ -1,0 +1,107 @@
+"""Small environments that go wrong on request, registered the way a user's package does it: by an entry point.
+
+They are in a folder of their own, so that worker processes can import them from PYTHONPATH.
+"""
+
+import os
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+# The block of seeds that belongs to one trial: those of its sub-environments.
+SEEDS_PER_TRIAL = 1024
+
+
+class Ticks(gym.Env):
+    """The observation counts the steps of the episode; every number in it tells where it came from.
+
+    An episode is terminated after `end` steps if it is given, and truncated by the time limit of its registration.
+    The reward of step t of the episode with number k is t + k / 1000.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, *, end=None):
+        self.end = end
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        self.action_space = gym.spaces.Discrete(3, start=5)
+        self.episode, self.ticks, self.stream = 0, 0, 0.0
+
+    def _observation(self):
+        return np.array([self.ticks, self.episode, self.stream], np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.stream = float(self.np_random.normal())
+        self.episode, self.ticks = self.episode + 1, 0
+        return self._observation(), {}
+
+    def step(self, action):
+        assert action in {5, 6, 7}, action
+        self.ticks += 1
+        ended = self.end is not None and self.ticks >= self.end + self.episode % 3
+        return self._observation(), self.ticks + self.episode / 1000, ended, False, {"ticks": self.ticks}
+
+
+class Trouble(gym.Env):
+    """One-step-memory env whose step raises or hangs in the trial whose seeds begin at `seed`.
+
+    Args:
+        seed: First seed of the trial; None: no trial, all is well.
+        how: `raise`, `hang`, or `exit` (the process dies).
+        at: Step of this environment's life, over all its episodes.
+        marker: File that is made when it happens; where it is there already, all is well.
+        pause_s: Seconds that every step takes, in any trial.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, *, seed=None, how="raise", at=1, marker=None, pause_s=0.0):
+        self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = gym.spaces.Discrete(2)
+        self.trial_seed, self.how, self.at, self.marker, self.pause_s = seed, how, at, marker, pause_s
+        self.life, self.ticks, self.chosen = 0, 0, False
+        self.state = np.zeros(2, np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None and self.trial_seed is not None:
+            self.chosen = self.trial_seed <= seed < self.trial_seed + SEEDS_PER_TRIAL
+        self.ticks = 0
+        self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.state, {}
+
+    def step(self, action):
+        self.life += 1
+        self.ticks += 1
+        if self.chosen and self.life >= self.at:
+            self._go_wrong()
+        if self.pause_s:
+            time.sleep(self.pause_s)
+        reward = float(action == (self.state[0] > 0))
+        self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.state, reward, self.ticks >= 10, False, {}
+
+    def _go_wrong(self):
+        if self.marker is not None:
+            if Path(self.marker).exists():
+                return
+            Path(self.marker).touch()
+        if self.how == "raise":
+            raise ZeroDivisionError("the cart left the track")
+        if self.how == "exit":
+            os._exit(1)
+        time.sleep(10_000)
+
+
+def register():
+    """What the entry point names; more than once does no harm."""
+    for env_id, entry_point, limit in (
+        ("TestTicks-v0", Ticks, 7),
+        ("TestTrouble-v0", Trouble, None),
+    ):
+        if env_id not in gym.registry:
+            gym.register(env_id, entry_point, max_episode_steps=limit)

@@ -1,0 +1,301 @@
+"""ArrayEnvRunner gives the episodes that RLlib's own runner gives, to the last bit."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from policies.hyperparams import DQNHyperparams, PPOHyperparams
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+SEED = 5 * 1024
+MODULE = "default_policy"
+# (env id, env args, num_envs, how RLlib makes its vector env). Fragments end in the middle of episodes in all of them.
+ENVS = {
+    "cartpole": ("CartPole-v1", {}, 4, "vector_entry_point"),
+    "cartpole-scalar": ("CartPole-v1", {"sutton_barto_reward": False}, 1, "sync"),
+    "pendulum": ("Pendulum-v1", {}, 3, "sync"),
+    "acrobot-truncated": ("Acrobot-v1", {"max_episode_steps": 9}, 3, "sync"),
+    "ticks": ("TestTicks-v0", {"end": 4}, 3, "sync"),
+}
+CASES = [
+    pytest.param(algorithm, env, id=f"{algorithm}-{env}")
+    for env in ENVS
+    for algorithm in ("ppo", "dqn")
+    if (algorithm, env) != ("dqn", "pendulum")
+]
+
+
+def make_config(algorithm, env):
+    from policies.rllib_config import build_algorithm_config
+
+    env_id, env_args, num_envs, _ = ENVS[env]
+    kwargs = {"hidden_sizes": (16,), "activation": "tanh", "num_envs": num_envs}
+    hyperparams = (
+        PPOHyperparams(**kwargs)
+        if algorithm == "ppo"
+        else DQNHyperparams(**kwargs, epsilon_initial=0.9, epsilon_final=0.1, epsilon_decay_steps=150)
+    )
+    return build_algorithm_config(hyperparams, env_id=env_id, env_args=env_args, seed=SEED)
+
+
+def make_runners(algorithm, env):
+    """(ours, RLlib's), with the same weights and seeds."""
+    from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+
+    from policies.env_runner import ArrayEnvRunner
+
+    config = make_config(algorithm, env)
+    ours = ArrayEnvRunner(config=config, worker_index=0)
+    theirs_config = config.copy(copy_frozen=False).env_runners(
+        env_runner_cls=SingleAgentEnvRunner, gym_env_vectorize_mode=ENVS[env][3]
+    )
+    shift_actions = isinstance(ours.env.single_action_space, gym.spaces.Discrete) and bool(
+        ours.env.single_action_space.start
+    )
+    if shift_actions:
+        # RLlib sends 0, 1, 2 whatever the space's start is; the env would refuse them.
+        theirs_config = theirs_config.env_runners(module_to_env_connector=lambda env, spaces, device: ShiftActions())
+    theirs = SingleAgentEnvRunner(config=theirs_config, worker_index=0)
+    theirs.module.set_state(ours.module.get_state())
+    return ours, theirs
+
+
+def ShiftActions():  # noqa: N802 (made like a class, imported late)
+    from ray.rllib.connectors.connector_v2 import ConnectorV2
+    from ray.rllib.core.columns import Columns
+
+    class Shift(ConnectorV2):
+        def __call__(self, *, rl_module, batch, episodes, explore=None, shared_data=None, **kwargs):
+            for column in list(batch):
+                if column == Columns.ACTIONS:
+                    batch[Columns.ACTIONS_FOR_ENV] = [int(action) + 5 for action in batch[Columns.ACTIONS]]
+            return batch
+
+    return Shift()
+
+
+def sample(runner, sizes, **kwargs):
+    """Episode lists of several fragments, with the exploration of one seed."""
+    torch.manual_seed(1)
+    fragments = []
+    for size in sizes:
+        fragments.append(runner.sample(num_timesteps=size, **kwargs))
+        # What Algorithm.train does between two fragments: the lifetime count moves epsilon on.
+        runner.get_metrics()
+    return fragments
+
+
+def by_stream(episodes, ids):
+    """Episodes with ids replaced by numbers in order of first sight: ids are random."""
+    return [(ids.setdefault(episode.id_, len(ids)), episode) for episode in episodes]
+
+
+def assert_equal_episodes(ours, theirs):
+    # The whole object, lookback included: what the learner can see of it.
+    assert ours.t_started == theirs.t_started
+    assert len(ours) == len(theirs)
+    assert (ours.is_terminated, ours.is_truncated) == (theirs.is_terminated, theirs.is_truncated)
+    assert set(ours.extra_model_outputs) == set(theirs.extra_model_outputs)
+    pairs = {
+        "observations": (ours.observations, theirs.observations),
+        "actions": (ours.actions, theirs.actions),
+        "rewards": (ours.rewards, theirs.rewards),
+    } | {key: (ours.extra_model_outputs[key], theirs.extra_model_outputs[key]) for key in ours.extra_model_outputs}
+    for name, (mine, other) in pairs.items():
+        assert mine.lookback == other.lookback, name
+        mine, other = np.asarray(mine.data), np.asarray(other.data)
+        assert mine.shape == other.shape, name
+        assert mine.dtype == other.dtype, name
+        np.testing.assert_array_equal(mine, other, err_msg=name)
+    assert len(ours.infos.data) == len(theirs.infos.data)
+
+
+@pytest.mark.parametrize(("algorithm", "env"), CASES)
+def test_episodes_are_those_of_rllibs_runner(algorithm, env):
+    # Sizes that are no multiples of the sub-environments, one of less than an episode, one of a single step.
+    sizes = [50, 1, 33, 64, 7]
+    ours, theirs = make_runners(algorithm, env)
+    mine, others = sample(ours, sizes, explore=True), sample(theirs, sizes, explore=True)
+    my_ids, other_ids = {}, {}
+    num_ended = num_continued = 0
+    for fragment, (my_list, other_list) in enumerate(zip(mine, others, strict=True)):
+        my_pairs, other_pairs = by_stream(my_list, my_ids), by_stream(other_list, other_ids)
+        # Equal numbers: the same chunks belong to one episode, in the same order.
+        assert [number for number, _ in my_pairs] == [number for number, _ in other_pairs], fragment
+        for (_, my_episode), (_, other_episode) in zip(my_pairs, other_pairs, strict=True):
+            assert_equal_episodes(my_episode, other_episode)
+            num_ended += my_episode.is_done
+            num_continued += my_episode.t_started > 0
+    # The case would prove nothing if no episode ended in, or went on over, a fragment.
+    assert num_continued > 0
+    assert num_ended > 0 or env == "pendulum"  # 200 steps an episode
+    assert ours.num_env_steps_sampled_lifetime == theirs.num_env_steps_sampled_lifetime
+
+
+def test_greedy_and_random_sampling_too():
+    for kwargs in ({"explore": False}, {"explore": True, "random_actions": True}):
+        ours, theirs = make_runners("ppo", "pendulum")
+        for runner in (ours, theirs):
+            runner.env.action_space.seed(3)
+        for mine, others in zip(sample(ours, [20, 30], **kwargs), sample(theirs, [20, 30], **kwargs), strict=True):
+            for my_episode, other_episode in zip(mine, others, strict=True):
+                if "random_actions" in kwargs:
+                    np.testing.assert_array_equal(my_episode.rewards.data, other_episode.rewards.data)
+                    np.testing.assert_array_equal(my_episode.observations.data, other_episode.observations.data)
+                else:
+                    assert_equal_episodes(my_episode, other_episode)
+
+
+@pytest.mark.parametrize(("algorithm", "env"), CASES)
+def test_the_batches_that_reach_the_learner_are_equal(algorithm, env):
+    """Both episode lists through the Algorithm's own learner connector, over two fragments."""
+    config = make_config(algorithm, env)
+    algo = config.build_algo()
+    learner = algo.learner_group._learner
+    sizes = [60, 40]
+    ours, theirs = make_runners(algorithm, env)
+    weights = learner.module[MODULE].get_state(inference_only=True)
+    for runner in (ours, theirs):
+        runner.module.set_state(weights)
+    mine, others = sample(ours, sizes, explore=True), sample(theirs, sizes, explore=True)
+    for my_list, other_list in zip(mine, others, strict=True):
+        my_batch, other_batch = (train_batch(algo, algorithm, episodes) for episodes in (my_list, other_list))
+        assert set(my_batch) == set(other_batch)
+        for column, value in my_batch.items():
+            np.testing.assert_array_equal(np.asarray(value), np.asarray(other_batch[column]), err_msg=column)
+    expected = {"advantages", "value_targets", "action_logp"} if algorithm == "ppo" else {"new_obs", "n_step"}
+    assert expected <= set(my_batch)
+    algo.stop()
+
+
+def train_batch(algo, algorithm, episodes):
+    """The batch of one module that the loss is computed from; for DQN, by way of a replay buffer."""
+    learner = algo.learner_group._learner
+    if algorithm == "dqn":
+        from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer
+
+        buffer = EpisodeReplayBuffer(capacity=1_000)
+        buffer.add(episodes)
+        buffer.rng = np.random.default_rng(0)
+        episodes = buffer.sample(num_items=32, n_step=2, gamma=0.9, batch_length_T=0, sample_episodes=True)
+    from ray.rllib.core.learner.training_data import TrainingData
+
+    batch = learner._make_batch_if_necessary(TrainingData(episodes=episodes))
+    return dict(batch[MODULE])
+
+
+def test_no_transition_leads_from_the_end_of_an_episode_to_the_start_of_the_next():
+    """The env counts: within an episode, each observation has one tick more than the one before."""
+    ours, _ = make_runners("ppo", "ticks")
+    num_ends = 0
+    for fragment in sample(ours, [40, 40, 40], explore=True):
+        for chunk in fragment:
+            ticks, episode, stream = chunk.get_observations().T
+            assert list(np.diff(ticks)) == [1.0] * (len(ticks) - 1)
+            assert len(set(episode)) == 1
+            assert len(set(stream)) == 1
+            assert ticks[0] == chunk.t_started
+            np.testing.assert_allclose(chunk.get_rewards(), ticks[1:] + episode[1:] / 1000, rtol=1e-6)
+            # 7 is the time limit; the env itself ends after 4, 5 or 6 steps.
+            num_ends += chunk.is_terminated
+            assert chunk.is_terminated == (ticks[-1] >= 4 + episode[-1] % 3)
+    assert num_ends > 10
+
+
+def test_every_env_step_is_in_exactly_one_chunk():
+    ours, _ = make_runners("ppo", "ticks")
+    seen = []
+    num_steps = 0
+    for fragment in sample(ours, [13, 1, 29, 5], explore=True):
+        for chunk in fragment:
+            _, episode, stream = chunk.get_observations(0)
+            seen += [(stream, episode, chunk.t_started + step) for step in range(len(chunk))]
+            num_steps += len(chunk)
+    assert len(set(seen)) == len(seen) == num_steps == ours.num_env_steps_sampled_lifetime
+    # No gaps: of each episode of each sub-environment, steps 0 to the last one.
+    last_steps = {}
+    for stream, episode, step in seen:
+        last_steps[stream, episode] = max(step, last_steps.get((stream, episode), 0))
+    assert len(seen) == sum(last + 1 for last in last_steps.values())
+
+
+def test_returns_are_of_whole_episodes_over_fragment_boundaries():
+    """Fragments of 5 vector steps, episodes of 4 to 7: nearly all are cut. RLlib's own count sees the chunks."""
+    ours, _ = make_runners("ppo", "ticks")
+    finished = []
+    for _ in range(12):
+        ours.sample(num_timesteps=15, explore=True)
+        finished += ours.pop_finished_episodes()
+    assert ours.pop_finished_episodes() == []
+    # end 4, plus 0, 1 or 2 by the number of the episode, whose number is in the rewards.
+    assert len(finished) > 15
+    for episode_return, length in finished:
+        assert isinstance(length, int)
+        assert length in {4, 5, 6}
+        number = (episode_return - length * (length + 1) / 2) / length * 1000
+        assert number == pytest.approx(round(number), abs=0.05)
+        assert length == 4 + round(number) % 3
+
+
+def test_truncated_episodes_are_whole_too():
+    ours, _ = make_runners("ppo", "acrobot-truncated")
+    for _ in range(8):
+        ours.sample(num_timesteps=12, explore=True)
+    finished = ours.pop_finished_episodes()
+    assert len(finished) >= 6
+    assert set(finished) == {(-9.0, 9)}
+
+
+def test_a_reset_on_request_drops_the_running_episodes():
+    ours, _ = make_runners("ppo", "ticks")
+    ours.sample(num_timesteps=8, explore=True)
+    ours.pop_finished_episodes()
+    chunks = ours.sample(num_timesteps=9, explore=True, force_reset=True)
+    assert [chunk.t_started for chunk in chunks] == [0, 0, 0]
+    assert all(chunk.observations.lookback == 0 for chunk in chunks)
+
+
+def test_whole_episodes_can_be_asked_for():
+    ours, _ = make_runners("ppo", "cartpole")
+    episodes = ours.sample(num_episodes=3, explore=True)
+    assert len(episodes) == 3
+    assert all(episode.is_done and episode.t_started == 0 for episode in episodes)
+
+
+def test_seeds_make_the_episodes():
+    def observations(**reseed):
+        ours, _ = make_runners("ppo", "cartpole")
+        for value in reseed.values():
+            ours.reseed(value)
+        return np.concatenate([chunk.get_observations() for chunk in sample(ours, [40], explore=True)[0]])
+
+    first = observations()
+    np.testing.assert_array_equal(first, observations())
+    np.testing.assert_array_equal(first, observations(seed=SEED))
+    assert not np.array_equal(first[0], observations(seed=SEED + 1)[0])
+
+
+def test_neighbouring_env_runners_share_no_environment_seed():
+    """RLlib gives worker w, sub-environment i the seed s + w + i: worker 2's first is worker 1's second."""
+    from policies.env_runner import ArrayEnvRunner
+
+    config = make_config("ppo", "ticks").env_runners(num_env_runners=2)
+    streams = []
+    for worker_index in (1, 2):
+        runner = ArrayEnvRunner(config=config, worker_index=worker_index)
+        streams += [chunk.get_observations(0)[2] for chunk in runner.sample(num_timesteps=6, explore=True)]
+    assert len(set(streams)) == len(streams) == 6
+
+
+def test_what_the_environment_raises_is_raised():
+    from policies.env_runner import ArrayEnvRunner
+    from policies.rllib_config import build_algorithm_config
+
+    config = build_algorithm_config(
+        PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args={"seed": SEED, "at": 5}, seed=SEED
+    )
+    runner = ArrayEnvRunner(config=config, worker_index=0)
+    with pytest.raises(ZeroDivisionError, match="the cart left the track"):
+        runner.sample(num_timesteps=40, explore=True)

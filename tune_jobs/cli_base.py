@@ -1,0 +1,130 @@
+"""What every command shares: options, errors as messages with exit codes, a clean standard output."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import click
+
+from policies.errors import TuneJobsError
+
+_INTERRUPTED = 130
+_JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+class CommandGroup(click.Group):
+    """A group whose commands end with a clear message and the right exit code, never with a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the chosen command; exit codes as in the design."""
+        try:
+            return super().invoke(ctx)
+        except (click.exceptions.Exit, click.Abort, BrokenPipeError):
+            raise
+        except click.ClickException as error:
+            if ctx.meta.get(_JSON):
+                _print_json_error(error.format_message(), "", error.exit_code)
+            raise
+        except KeyboardInterrupt:
+            runs_trials = ctx.invoked_subcommand in ("launch", "resume", "extend")
+            hint = "What is done is kept; `tune-jobs resume SWEEP` goes on with it." if runs_trials else ""
+            _print_error(ctx, "Interrupted.", hint, _INTERRUPTED)
+            ctx.exit(_INTERRUPTED)
+        except TuneJobsError as error:
+            if ctx.meta.get(DEBUG):
+                traceback.print_exc()
+            _print_error(ctx, error.message, error.hint, error.exit_code)
+            ctx.exit(error.exit_code)
+        except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback on a user's terminal
+            message = f"Unexpected {type(error).__name__}: {error}"
+            if ctx.meta.get(DEBUG):
+                traceback.print_exc()
+                hint = ""
+            else:
+                hint = f"This is a bug in tune-jobs. The traceback is in {_save_traceback()}; --debug prints it."
+            _print_error(ctx, message, hint, TuneJobsError.exit_code)
+            ctx.exit(TuneJobsError.exit_code)
+
+
+def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) -> None:
+    click.echo(f"error: {message}" + (f"\n{hint}" if hint else ""), err=True)
+    if ctx.meta.get(_JSON):
+        _print_json_error(message, hint, exit_code)
+
+
+def _print_json_error(message: str, hint: str, exit_code: int) -> None:
+    from tune_jobs.cli_output import print_json
+
+    print_json({"error": message, "hint": hint, "exit_code": exit_code})
+
+
+def _save_traceback() -> str:
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="tune-jobs-error-", suffix=".txt", delete=False, encoding="utf-8"
+    ) as file:
+        traceback.print_exc(file=file)
+    return file.name
+
+
+def _remember_json(ctx: click.Context, _: click.Parameter, value: bool) -> bool:  # noqa: FBT001 - click's signature
+    ctx.meta[_JSON] = value
+    return value
+
+
+def print_version(ctx: click.Context, _: click.Parameter, value: bool) -> None:  # noqa: FBT001 - click's signature
+    """Callback of --version: print it and leave."""
+    if not value or ctx.resilient_parsing:
+        return
+    from importlib import metadata
+
+    try:
+        version = metadata.version("tune-jobs")
+    except metadata.PackageNotFoundError:
+        version = "(not installed)"
+    click.echo(f"tune-jobs {version}")
+    ctx.exit()
+
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, callback=_remember_json, is_eager=True,
+    help="Print one JSON document on standard output.",
+)  # fmt: skip
+storage_option = click.option(
+    "--storage", metavar="FOLDER", help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]"
+)
+num_episodes_option = click.option(
+    "--num-episodes", type=click.IntRange(1, 2**18), default=100, show_default=True, help="Greedy episodes."
+)
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="A.B=VALUE",
+    help="Override one field of the sweep file; VALUE is YAML, empty takes the field out. May be repeated.",
+)  # fmt: skip
+env_option = click.option(
+    "--env", "env_id", metavar="ID", help="Environment; needed for 'random', else the policy's own."
+)
+
+
+def run_options(command: _Command) -> _Command:
+    """Options of the commands that run trials."""
+    for option in (
+        click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report."),
+        click.option("--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."),
+        click.option("--address", metavar="ADDRESS", help="Ray cluster: auto or ray://...; without it, this machine."),
+        storage_option,
+        json_option,
+    ):
+        command = option(command)
+    return command
+
+
+@contextlib.contextmanager
+def stdout_for(*, as_json: bool) -> Iterator[None]:
+    """With --json nothing but the document may reach standard output, whatever a library prints."""
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        yield
