@@ -275,7 +275,7 @@ def _draw_winner(
                 color=style.color,
                 alpha=0.18,
                 linewidth=0,
-                label=f"range of the winning point, {len(curves)} seeds",
+                label=f"winner: range of {len(curves)} seeds",
                 zorder=1,
             )
 

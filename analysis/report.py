@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDE = (9.0, 4.2)
-_NARROW = (4.4, 5.0)
+_NARROW = (3.8, 4.8)
 _MEDIA_TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
 _VIDEO_TITLES = {
     "before": "Before training: random actions",

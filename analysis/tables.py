@@ -156,7 +156,7 @@ def groups_frame(
 
     Returns:
         The columns `names`, num_trials, num_failed, num_solved, min_num_env_steps_to_solve, best_score,
-        mean_score; best score first.
+        mean_score; those that solved in the fewest env steps first, then by best score.
     """
     frame = trials_frame(trials, results, threshold=threshold)
     groups = frame.groupby(list(names), sort=False, dropna=False)
@@ -168,7 +168,8 @@ def groups_frame(
         best_score=("score", "max"),
         mean_score=("score", "mean"),
     )
-    return table.reset_index().sort_values("best_score", ascending=False, kind="stable", ignore_index=True)
+    order = ["min_num_env_steps_to_solve", "best_score"]
+    return table.reset_index().sort_values(order, ascending=[True, False], na_position="last", ignore_index=True)
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:

@@ -195,7 +195,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
 
     def _cut(self, fragment: dict[str, NDArray[Any]]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
         """Cut (T, N) columns into episode chunks: the finished ones in order of their end, then the running ones."""
-        done: list[tuple[int, int, SingleAgentEpisode]] = []
+        done: list[tuple[int, int, SingleAgentEpisode, tuple[float, int]]] = []
         ongoing: list[SingleAgentEpisode] = []
         length = len(fragment["stepped"])
         ended = np.logical_or(fragment["terminated"], fragment["truncated"])
@@ -204,8 +204,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             for end in np.flatnonzero(ended[:, index]):
                 start += not fragment["stepped"][start, index]
                 chunk = self._chunk(fragment, stream, index, start, int(end) + 1)
-                done.append((int(end), index, chunk))
-                self.finished_episodes.append((stream.episode_return, stream.num_steps))
+                done.append((int(end), index, chunk, (stream.episode_return, stream.num_steps)))
                 stream.start()
                 start = int(end) + 1
             if start < length:
@@ -215,7 +214,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                 ongoing.append(chunk)
                 self._keep_tail(stream, chunk)
         done.sort(key=lambda item: item[:2])
-        return [chunk for _, _, chunk in done], ongoing
+        self.finished_episodes.extend(whole for *_, whole in done)
+        return [chunk for _, _, chunk, _ in done], ongoing
 
     def _chunk(
         self, fragment: dict[str, NDArray[Any]], stream: _Stream, index: int, start: int, stop: int
@@ -226,7 +226,6 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             for key, values in fragment.items()
             if key not in ("stepped", "terminated", "truncated")
         }
-        columns["rewards"] = columns["rewards"].astype(np.float32)
         num_steps = stop - start
         columns[_WEIGHTS_SEQ_NO] = np.full(num_steps, self._weights_seq_no, dtype=np.int64)
         lookback = len(stream.tail.get("rewards", ()))

@@ -197,7 +197,7 @@ def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -
 @cli.command()
 @click.argument("source")
 @num_episodes_option
-@click.option("--first-seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the first episode; they count up.")
+@click.option("--first-seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the first episode; they count up.")
 @env_option
 @storage_option
 @json_option
@@ -228,7 +228,7 @@ def evaluate(
 @cli.command()
 @click.argument("source")
 @click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the files go.")
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the episode.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
 @storage_option
 @json_option

@@ -114,7 +114,7 @@ def _versions() -> dict[str, str]:
 def _git_commit() -> str | None:
     """The commit of the working directory's repository, so that a sweep can be traced to a user's own code."""
     try:
-        done = subprocess.run(  # noqa:
+        done = subprocess.run(
             ["git", "rev-parse", "HEAD"],  # noqa: S607 (git as the user has it)
             capture_output=True, text=True, timeout=5, check=False,
         )  # fmt: skip

@@ -282,7 +282,7 @@ def make_report(store: SweepStore) -> Path:
         if (path := store.best_folder / name).is_file()
     }
     return build_report(
-        store.report_folder,
+        store.folder,
         sweep=store.read_record(),
         trials=read_trials(store),
         results=read_results(store),

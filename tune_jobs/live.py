@@ -50,7 +50,9 @@ def render(monitor: SweepMonitor) -> RenderableType:
         f"{finished} of {total} trials",
         _status_line(counts),
     )
-    parts: list[RenderableType] = [head, _facts(monitor), _running(monitor)]
+    parts: list[RenderableType] = [head, _facts(monitor)]
+    if counts.get("running"):
+        parts.append(_running(monitor))
     if monitor.stopping:
         parts.append(
             Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow")
@@ -74,7 +76,9 @@ def _facts(monitor: SweepMonitor) -> RenderableType:
     grid = Table.grid(padding=(0, 2))
     grid.add_row("best so far", _best_text(monitor.best()))
     grid.add_row("env steps/s", f"{rate}   ({monitor.num_env_steps:,} env steps in all)")
-    grid.add_row("time", f"{format_duration(monitor.elapsed_s)}   left: about {left}")
+    unfinished = any(record.status not in FINISHED for record in monitor.records.values())
+    time_left = f"   left: about {left}" if unfinished and not monitor.stopping else ""
+    grid.add_row("time", f"{format_duration(monitor.elapsed_s)}{time_left}")
     return grid
 
 
@@ -125,7 +129,7 @@ def summary_line(monitor: SweepMonitor) -> str:
         words.append(
             f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})"
         )
-    if estimate.time_left_s is not None:
+    if estimate.time_left_s:
         words.append(f"about {format_duration(estimate.time_left_s)} left")
     return "; ".join(words)
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from ray.rllib.algorithms.algorithm import Algorithm
 
 __all__ = [
-    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "machine", "report",
-    "restore", "resume", "status", "stop", "trials", "video",
+    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "machine",
+    "report", "restore", "resume", "status", "stop", "trials", "video",
 ]  # fmt: skip
 
 Source = str | Path | Mapping[str, Any] | SweepSpec
@@ -224,10 +224,12 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
 
 def _status(store: SweepStore) -> SweepStatus:
     record, alive = store.read_record(), store.is_driven()
+    counts = Counter(trial.status for trial in store.read_trials())
     if record.state == "running" and not alive:
         # Its process was killed before it could write so.
         record = record.model_copy(update={"state": "interrupted"})
-    return SweepStatus(record, dict(Counter(trial.status for trial in store.read_trials())), alive)
+        counts["paused"] += counts.pop("running", 0)
+    return SweepStatus(record, {name: number for name, number in counts.items() if number}, alive)
 
 
 def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[TrialRecord]:

@@ -94,7 +94,7 @@ def make_iterations(point, rng, *, num_iterations, steps_per_iteration, cap, thr
     log_lr = math.log10(point.get("lr", 3e-3))
     speed = math.exp(-((log_lr + 2.5) ** 2) / 0.5) * (1.6 if sum(point.get("hidden_sizes", [64])) >= 64 else 1.0)
     ceiling = cap * (0.75 if point.get("activation") == "linear" else 1.4)
-    rows, last, num_episodes, seen = [], [], 0, []
+    rows, last, num_episodes = [], [], 0
     for iteration in range(1, num_iterations + 1):
         progress = 1 - math.exp(-speed * iteration / 10)
         mean = min(1.04 * cap, 20 + (ceiling - 20) * progress**1.5)
@@ -117,11 +117,10 @@ def make_iterations(point, rng, *, num_iterations, steps_per_iteration, cap, thr
                 learner={"policy_loss": 0.01, "entropy": 0.6},
             )
         )
-        if len(last) == 100 and np.mean(last) >= threshold:
+        if threshold is not None and len(last) == 100 and np.mean(last) >= threshold:
             if rows[-1].evaluation_return is None:
                 rows[-1] = rows[-1].model_copy(update={"evaluation_return": evaluation})
             break
-        seen.append(mean)
     return rows
 
 

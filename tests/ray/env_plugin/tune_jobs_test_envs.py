@@ -23,10 +23,10 @@ class Ticks(gym.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, *, end=None):
+    def __init__(self, *, end=None, start=5):
         self.end = end
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
-        self.action_space = gym.spaces.Discrete(3, start=5)
+        self.action_space = gym.spaces.Discrete(3, start=start)
         self.episode, self.ticks, self.stream = 0, 0, 0.0
 
     def _observation(self):
@@ -40,7 +40,7 @@ class Ticks(gym.Env):
         return self._observation(), {}
 
     def step(self, action):
-        assert action in {5, 6, 7}, action
+        assert self.action_space.contains(action), action
         self.ticks += 1
         ended = self.end is not None and self.ticks >= self.end + self.episode % 3
         return self._observation(), self.ticks + self.episode / 1000, ended, False, {"ticks": self.ticks}

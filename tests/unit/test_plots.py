@@ -1,0 +1,217 @@
+"""The figures hold the data, on any kind of sweep, and become safe, themeable SVG."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from synthetic_sweep import make_points, make_sweep
+
+from analysis.plot_style import (
+    CSS_DARK,
+    CSS_LIGHT,
+    INK,
+    PALETTE,
+    group_names,
+    group_styles,
+    numeric_names,
+    to_png,
+    to_svg,
+)
+from analysis.plots import learning_curves, score_by_lr, score_per_episode
+
+
+@pytest.fixture(scope="module")
+def synthetic():
+    return make_sweep(failed={3}, pending={5})
+
+
+def legend_of(figure):
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def lines_longer_than(axes, length):
+    return [line for line in axes.lines if len(line.get_xdata()) > length and line.get_linestyle() != "None"]
+
+
+def test_every_trial_with_results_has_its_curve(synthetic):
+    winner = synthetic.best.checkpoint.trial_id
+    axes = learning_curves(synthetic.trials, synthetic.results, threshold=195.0, winner=winner).axes[0]
+    curves = lines_longer_than(axes, 2)
+    assert len(curves) == 19
+    expected = {tuple(row.training_return for row in rows) for rows in synthetic.results.values() if rows}
+    assert {tuple(line.get_ydata()) for line in curves} == expected
+    thick = [line for line in curves if line.get_linewidth() == 3.0]
+    assert [tuple(line.get_ydata()) for line in thick] == [
+        tuple(row.training_return for row in synthetic.results[winner])
+    ]
+    assert axes.get_xlabel() == "env steps"
+    assert "training return" in axes.get_ylabel()
+
+
+def test_legend_names_groups_goal_winner_and_failure(synthetic):
+    figure = learning_curves(
+        synthetic.trials, synthetic.results, threshold=195.0, winner=synthetic.best.checkpoint.trial_id
+    )
+    labels = legend_of(figure)
+    assert {"32 · linear", "32 · relu", "64 · linear", "64 · relu", "failed", "goal 195"} <= set(labels)
+    assert "winner: greedy evaluation" in labels
+    assert len(labels) == len(set(labels))
+
+
+def test_long_curves_are_thinned_but_keep_their_ends():
+    long = make_sweep(points=[{"lr": 1e-6}], max_steps=1_000_000)
+    axes = learning_curves(long.trials, long.results, threshold=None).axes[0]
+    (line,) = lines_longer_than(axes, 2)
+    rows = long.results["t0000"]
+    assert len(line.get_xdata()) == 300
+    assert (line.get_xdata()[0], line.get_xdata()[-1]) == (rows[0].num_env_steps, rows[-1].num_env_steps)
+
+
+def test_the_range_over_the_seeds_of_the_winning_point_is_drawn():
+    several = make_sweep(points=make_points(1, np.random.default_rng(0)), seeds_per_point=3)
+    winner = several.best.checkpoint.trial_id
+    figure = learning_curves(several.trials, several.results, threshold=195.0, winner=winner)
+    assert "winner: range of 3 seeds" in legend_of(figure)
+
+
+def test_scores_stand_at_their_learning_rates(synthetic):
+    figure = score_by_lr(synthetic.trials, threshold=195.0, winner=synthetic.best.checkpoint.trial_id)
+    axes = figure.axes[0]
+    groups = [c for c in axes.collections if c.get_label() in {"32 · linear", "32 · relu", "64 · linear", "64 · relu"}]
+    drawn = {tuple(xy) for collection in groups for xy in np.asarray(collection.get_offsets())}
+    assert drawn == {
+        (trial.point["lr"], trial.best_evaluation_return) for trial in synthetic.trials if trial.status == "completed"
+    }
+    assert axes.get_xscale() == "log"
+    assert axes.get_xlabel() == "lr"
+    ring = next(c for c in axes.collections if c.get_label() == "winner")
+    assert np.asarray(ring.get_offsets()).tolist() == [[synthetic.best.point["lr"], synthetic.best.selection_score]]
+
+
+def test_trials_that_cannot_win_are_marked_at_the_edge(synthetic):
+    axes = score_by_lr(synthetic.trials).axes[0]
+    lost = next(c for c in axes.collections if c.get_label().startswith("no score"))
+    assert [x for x, _ in np.asarray(lost.get_offsets())] == [synthetic.trials[3].point["lr"]]
+
+
+@pytest.mark.parametrize(
+    ("values", "scale"), [([1e-4, 2e-4, 9e-4], "linear"), ([1e-4, 2e-3], "log"), ([0.0, 1.0], "linear")]
+)
+def test_the_axis_is_logarithmic_beyond_a_decade(values, scale):
+    sweep = make_sweep(points=[{"gamma": value} for value in values])
+    axes = score_by_lr(sweep.trials).axes[0]
+    assert (axes.get_xlabel(), axes.get_xscale()) == ("gamma", scale)
+
+
+def test_without_a_searched_number_the_groups_stand_side_by_side():
+    sweep = make_sweep(points=[{"activation": name} for name in ("relu", "relu", "tanh")])
+    axes = score_by_lr(sweep.trials).axes[0]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["relu", "tanh"]
+    assert axes.get_xlabel() == "activation"
+
+
+def test_lr_is_the_axis_where_there_are_several_numbers():
+    points = [{"gamma": 0.9 + i / 100, "lr": 10.0**-i, "use": bool(i % 2), "fixed": 1} for i in range(1, 4)]
+    trials = make_sweep(points=points).trials
+    assert numeric_names(trials) == ["lr", "gamma"]
+    assert group_names(trials, "lr") == ["gamma", "use"]
+
+
+def test_a_hyperparameter_of_many_values_makes_no_groups():
+    trials = make_sweep(points=[{"lr": 1e-3, "num_epochs": i} for i in range(1, 9)]).trials
+    assert group_names(trials, None) == []
+
+
+def test_groups_differ_in_colour_and_marker(synthetic):
+    styles = set(group_styles(synthetic.trials, ["hidden_sizes", "activation"]).values())
+    assert len({style.color for style in styles}) == 4
+    assert {(style.label.split(" · ")[0], style.marker) for style in styles} == {("32", "o"), ("64", "s")}
+    assert {(style.label.split(" · ")[1], style.line) for style in styles} == {("linear", "-"), ("relu", "--")}
+
+
+def test_score_per_episode_has_goal_trend_and_histogram_of_the_last_fifty():
+    scores = np.concatenate([np.arange(150.0), np.full(50, 199.0)])
+    figure = score_per_episode(scores, goal=195.0, title="trial t0001")
+    left, right = figure.axes
+    dots = next(line for line in left.lines if line.get_label() == "score")
+    assert dots.get_ydata().tolist() == scores.tolist()
+    assert dots.get_xdata()[0] == 1
+    trend = next(line for line in left.lines if line.get_label() == "linear trend")
+    slope = (trend.get_ydata()[1] - trend.get_ydata()[0]) / 199
+    assert slope == pytest.approx(np.polyfit(np.arange(1, 201), scores, 1)[0])
+    mean = next(line for line in left.lines if line.get_label() == "mean of last 100")
+    assert mean.get_ydata()[-1] == pytest.approx(scores[-100:].mean())
+    assert sum(patch.get_height() for patch in right.patches) == 50
+    assert max(patch.get_height() for patch in right.patches) == 50
+    assert right.get_title(loc="left") == "last 50 episodes"
+    assert left.get_title(loc="left") == "trial t0001"
+    assert "goal 195" in legend_of(figure)
+
+
+@pytest.mark.parametrize("returns", [[7.0], [0.0, 0.0], [-200.0, -180.0, -90.5]])
+@pytest.mark.parametrize("goal", [None, 0.0])
+def test_few_or_negative_scores_still_draw(returns, goal):
+    figure = score_per_episode(returns, goal=goal)
+    assert sum(patch.get_height() for patch in figure.axes[1].patches) == len(returns)
+    assert ("goal 0" in legend_of(figure)) == (goal is not None)
+    assert to_png(figure, dpi=40).startswith(b"\x89PNG")
+
+
+def test_no_episode_is_an_error():
+    with pytest.raises(ValueError, match="at least one episode"):
+        score_per_episode([], goal=1.0)
+
+
+@pytest.mark.parametrize("kind", ["none usable", "one trial", "no results"])
+def test_poor_sweeps_still_draw(kind):
+    sweep = {
+        "none usable": lambda: make_sweep(failed=range(20)),
+        "one trial": lambda: make_sweep(points=[{}]),
+        "no results": lambda: make_sweep(pending=range(20)),
+    }[kind]()
+    for figure in (learning_curves(sweep.trials, sweep.results, threshold=195.0), score_by_lr(sweep.trials)):
+        assert to_svg(figure, label="x", prefix="x").startswith("<svg")
+
+
+def test_svg_follows_the_theme_and_keeps_its_ids_apart():
+    figure = score_per_episode([1.0, 2.0, 3.0], goal=2.0)
+    svg = to_svg(figure, label='a "label"', prefix="one")
+    assert f"var(--ink, {INK})" in svg
+    assert f": {INK}" not in svg
+    assert all(f": {color}" not in svg for color in PALETTE)
+    assert set(re.findall(r"var\((--[\w-]+)", svg)) <= set(CSS_LIGHT) == set(CSS_DARK)
+    assert all(name.startswith("one-") for name in re.findall(r'\bid="([^"]+)"', svg))
+    targets = re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', svg)
+    assert targets
+    assert {first or second for first, second in targets} <= set(re.findall(r'\bid="([^"]+)"', svg))
+    assert 'aria-label="a &quot;label&quot;"' in svg
+    assert svg == to_svg(score_per_episode([1.0, 2.0, 3.0], goal=2.0), label='a "label"', prefix="one")
+
+
+@pytest.mark.parametrize("text", ["$x^$", "$\\frac{1}$", "<script>alert(1)</script>", "--><img src=x>", "& < >"])
+def test_hostile_labels_are_only_text(text):
+    sweep = make_sweep(points=[{"activation": text, "lr": 1e-3}, {"activation": "relu", "lr": 2e-3}])
+    figures = [
+        learning_curves(sweep.trials, sweep.results, threshold=None),
+        score_by_lr(sweep.trials),
+        score_per_episode([1.0, 2.0], goal=None, title=text),
+    ]
+    for figure in figures:
+        svg = to_svg(figure, label=text, prefix="x")
+        assert "<script" not in svg
+        assert "<img" not in svg
+        assert "<!--" not in svg
+
+
+def test_no_screen_and_no_pyplot_are_needed():
+    code = (
+        "import sys; sys.modules['matplotlib.pyplot'] = None\n"
+        "from analysis.plots import score_per_episode\n"
+        "from analysis.plot_style import to_png, to_svg\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        "figure = score_per_episode([1.0, 2.0], goal=1.0)\n"
+        "assert to_png(figure) and to_svg(figure, label='a', prefix='a')\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

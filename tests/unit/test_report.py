@@ -1,0 +1,299 @@
+"""The report: complete, self-contained, safe, and right on poor sweeps."""
+
+import base64
+import hashlib
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from synthetic_sweep import make_points, make_sweep
+
+from analysis.records import CheckpointRecord
+from analysis.report import build_report
+from analysis.report_data import goal_of, shown_path, winner_card
+from analysis.wording import NONE, duration, moment, number, seed_range
+
+HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7*7 }}"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+class Page(HTMLParser):
+    """Text, tags and table rows of a page."""
+
+    VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
+
+    def __init__(self, html):
+        super().__init__()
+        self.tags, self.text, self.rows, self.open = [], [], [], []
+        self.feed(html)
+        self.close()
+        assert self.open == [], f"never closed: {self.open}"
+        self.words = " ".join(" ".join(self.text).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in {"td", "th"}:
+            self.rows[-1].append("")
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in {"style", "script"}:
+            self.text.append(data)
+            if self.rows and ("td" in self.open or "th" in self.open):
+                self.rows[-1][-1] += data.strip()
+
+
+def report(tmp_path, synthetic, videos=None):
+    path = build_report(
+        tmp_path,
+        sweep=synthetic.sweep,
+        trials=synthetic.trials,
+        results=synthetic.results,
+        best=synthetic.best,
+        videos=videos or {},
+    )
+    html = path.read_text(encoding="utf-8")
+    return path, html, Page(html)
+
+
+@pytest.fixture(scope="module")
+def typical(tmp_path_factory):
+    synthetic = make_sweep(failed={3})
+    folder = tmp_path_factory.mktemp("typical")
+    (folder / "before.mp4").write_bytes(b"before-bytes")
+    (folder / "after.gif").write_bytes(b"after-bytes")
+    videos = {"before": folder / "before.mp4", "after": folder / "after.gif", "other": folder / "gone.mp4"}
+    return synthetic, *report(folder, synthetic, videos)
+
+
+def test_the_winner_stands_on_the_page(typical):
+    synthetic, _, html, page = typical
+    best = synthetic.best
+    assert f"Winner: {best.checkpoint.trial_id}" in page.words
+    assert f"{best.confirmation.mean_return:.1f} ± {best.confirmation.std_return:.1f}" in page.words
+    assert f"{best.selection_score:.1f} on 10 evaluation episodes" in page.words
+    assert f"{best.optimism_gap:+.1f} (selection less confirmation)" in page.words
+    assert f"{best.random.mean_return:.1f} ± {best.random.std_return:.1f}" in page.words
+    assert "100 greedy episodes" in page.words
+    assert f"hidden_sizes {best.point['hidden_sizes'][0]}" in page.words
+    assert f"lr {best.point['lr']:.4g}" in page.words
+    assert '<span class="badge good">solved</span>' in html
+
+
+def test_the_loading_command_names_the_policy_file(typical):
+    _, path, _, page = typical
+    policy = path.parent.parent / "best" / "policy.json"
+    assert f"tune-jobs evaluate {policy}" in page.words
+    assert f"load_policy({str(policy)!r})" in page.words
+
+
+def test_all_trials_stand_in_the_table_best_first(typical):
+    synthetic, _, _, page = typical
+    rows = [row for row in page.rows if re.fullmatch(r"t\d{4}", row[0])]
+    assert {row[0] for row in rows} == {trial.trial_id for trial in synthetic.trials}
+    assert rows[0][0] == synthetic.best.checkpoint.trial_id
+    assert rows[-1][:2] == ["t0003", "failed"]
+    scores = [float(row[5]) for row in rows[:-1]]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_errors_are_visible_and_linked(typical):
+    _, _, _, page = typical
+    assert "t0003 RuntimeError: env.step raised ZeroDivisionError: the cart left the track" in page.words
+    assert "Last lines of trials/t0003/log.txt" in page.words
+    assert ("a", {"href": "#error-t0003"}) in page.tags
+    assert any(tag == "details" and attrs.get("id") == "error-t0003" for tag, attrs in page.tags)
+
+
+def test_videos_are_embedded_and_missing_ones_left_out(typical):
+    _, _, _, page = typical
+    (video,) = [attrs for tag, attrs in page.tags if tag == "video"]
+    assert video["src"] == "data:video/mp4;base64," + base64.b64encode(b"before-bytes").decode()
+    assert {"autoplay", "loop", "muted", "controls"} <= set(video)
+    (image,) = [attrs for tag, attrs in page.tags if tag == "img"]
+    assert image["src"] == "data:image/gif;base64," + base64.b64encode(b"after-bytes").decode()
+
+
+def test_nothing_is_loaded_from_elsewhere(typical):
+    _, _, html, page = typical
+    for tag, attrs in page.tags:
+        for name in ("src", "href", "xlink:href", "data", "srcset"):
+            assert attrs.get(name, "#").startswith(("#", "data:")), (tag, name)
+    assert not re.search(r"url\((?!#)", html)
+    assert "@import" not in html
+
+
+def test_the_policy_of_the_page_allows_its_own_script_alone(typical):
+    _, _, html, _ = typical
+    (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in html
+    assert "default-src 'none'" in html
+
+
+def test_tables_and_figures_lie_beside(typical):
+    synthetic, path, html, _ = typical
+    figures = sorted(file.name for file in (path.parent / "figures").iterdir())
+    assert figures == ["learning_curves.png", "score_by_lr.png", "score_per_episode.png"]
+    assert all((path.parent / "figures" / name).read_bytes()[:4] == b"\x89PNG" for name in figures)
+    assert html.count("<svg ") == 2 * len(figures)
+    assert len(pd.read_csv(path.parent / "trials.csv")) == 20
+    assert len(pd.read_csv(path.parent / "iterations.csv")) == sum(map(len, synthetic.results.values()))
+
+
+def test_how_it_was_run_is_told(typical):
+    synthetic, _, html, page = typical
+    for text in ("2.60.0", "0123456789abcdef", "1 min 10 s", "10 (4711 to 4720)", "100 (900000 to 900099)"):
+        assert text in page.words
+    (spec,) = re.findall(r"<summary>Sweep file, resolved</summary><pre>(.*?)</pre>", html, re.DOTALL)
+    assert yaml.safe_load(spec) == synthetic.sweep.spec
+
+
+def test_a_sweep_without_a_winner_says_why(tmp_path):
+    synthetic = make_sweep(failed=range(20))
+    assert synthetic.best is None
+    _, _, page = report(tmp_path, synthetic)
+    assert "No winner No trial of 20 is usable: 20 failed. First error (t0000): RuntimeError" in page.words
+    assert "Winner:" not in page.words
+
+
+def test_an_unconfirmed_sweep_names_the_leader_and_the_command(tmp_path):
+    synthetic = make_sweep(pending=range(6, 20), with_best=False)
+    synthetic.sweep = synthetic.sweep.model_copy(update={"state": "interrupted"})
+    _, _, page = report(tmp_path, synthetic)
+    assert "not confirmed on fresh seeds yet" in page.words
+    assert f"tune-jobs best {tmp_path}" in page.words
+    assert f"tune-jobs resume {tmp_path}" in page.words
+
+
+@pytest.mark.parametrize("kind", ["one trial", "no trials", "nothing ran", "dqn", "no threshold"])
+def test_any_sweep_gives_a_page(tmp_path, kind):
+    synthetic = {
+        "one trial": lambda: make_sweep(points=[{}]),
+        "no trials": lambda: make_sweep(points=[]),
+        "nothing ran": lambda: make_sweep(pending=range(20)),
+        "dqn": lambda: make_sweep(points=[{"double_q": i, "lr": 1e-3} for i in (True, False)], algorithm="dqn"),
+        "no threshold": lambda: make_sweep(env_id="Own-v0", threshold=None),
+    }[kind]()
+    _, html, page = report(tmp_path, synthetic)
+    assert ("No winner" in page.words) == (synthetic.best is None)
+    assert "nan" not in page.words.lower().split()
+    assert "None" not in page.words
+    if kind == "no threshold":
+        assert '<span class="badge">no threshold</span>' in html
+
+
+def test_several_seeds_a_point_show_their_points_and_lost_seeds(tmp_path):
+    synthetic = make_sweep(points=make_points(1, np.random.default_rng(0)), seeds_per_point=3, failed={4})
+    _, _, page = report(tmp_path, synthetic)
+    assert "3 seeds: the interval is too narrow" in page.words
+    assert "2 of 3" in page.words
+    assert "seeds missing: ranked after complete points" in page.words
+
+
+def test_hostile_text_is_never_html(tmp_path):
+    synthetic = make_sweep(
+        points=[{"activation": HOSTILE, "lr": 1e-3}, {"activation": "$relu$", "lr": 2e-3}],
+        failed={1},
+        env_id=HOSTILE,
+        name=HOSTILE,
+        error=HOSTILE,
+    )
+    synthetic.sweep = synthetic.sweep.model_copy(
+        update={"versions": {HOSTILE: HOSTILE}, "address": HOSTILE, "git_commit": HOSTILE}
+    )
+    (tmp_path / "v.mp4").write_bytes(b"v")
+    _, html, page = report(tmp_path, synthetic, {HOSTILE: tmp_path / "v.mp4"})
+    assert [tag for tag, _ in page.tags].count("script") == 1
+    assert not any(tag == "img" for tag, _ in page.tags)
+    assert not any(name.startswith("on") for _, attrs in page.tags for name in attrs)
+    assert "<script>alert" not in html
+    assert "{{ 7*7 }}" in page.words
+
+
+def test_a_winner_the_selection_has_moved_from_is_called_out(tmp_path):
+    synthetic = make_sweep(points=[{"lr": 1e-3}, {"lr": 3e-3}])
+    assert not winner_card(synthetic.best, synthetic.trials, synthetic.sweep, tmp_path)["stale"]
+    old = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1, path="trials/t0000/checkpoints/1")
+    synthetic.best = synthetic.best.model_copy(update={"checkpoint": old})
+    _, _, page = report(tmp_path, synthetic)
+    assert "Another checkpoint leads by now" in page.words
+
+
+def test_returns_that_are_not_finite_cost_only_their_interval(tmp_path):
+    synthetic = make_sweep()
+    broken = synthetic.best.confirmation.model_copy(update={"returns": (float("nan"),) * 100})
+    best = synthetic.best.model_copy(update={"confirmation": broken})
+    card = winner_card(best, synthetic.trials, synthetic.sweep, tmp_path)
+    assert card["interval"] is None
+    assert card["gain"] is None
+
+
+@pytest.mark.parametrize(
+    ("env_id", "threshold", "stop", "goal"),
+    [
+        ("CartPole-v1", 123.0, {}, 123.0),
+        ("CartPole-v1", None, {"training_return": 7.0}, 475.0),
+        ("Own-v0", None, {"training_return": 0.0, "evaluation_return": None}, 0.0),
+        ("evil_module:Own-v0", None, {}, None),
+    ],
+)
+def test_the_goal_is_the_threshold_of_the_env_or_the_stop_rule(env_id, threshold, stop, goal):
+    synthetic = make_sweep(points=[{"lr": 1e-3}], env_id=env_id, threshold=195.0)
+    confirmation = synthetic.best.confirmation.model_copy(update={"threshold": threshold})
+    best = synthetic.best.model_copy(update={"confirmation": confirmation})
+    sweep = synthetic.sweep.model_copy(update={"spec": synthetic.sweep.spec | {"stop": stop}})
+    assert goal_of(sweep, best) == goal
+
+
+def test_paths_below_the_current_folder_are_relative(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert shown_path(tmp_path / "sweeps" / "a") == "sweeps/a"
+    assert shown_path(tmp_path.parent) == str(tmp_path.parent)
+
+
+def test_numbers_read_well():
+    assert [number(v) for v in (None, 0, 50176, 0.00123456, 1e-7, 200.0, True, "relu")] == [
+        NONE, "0", "50,176", "0.001235", "1e-07", "200", "True", "relu",
+    ]  # fmt: skip
+    assert [duration(v) for v in (0.0, 42.2, 70.4, 7500)] == ["0.0 s", "42 s", "1 min 10 s", "2 h 5 min"]
+    assert moment(0.0) == "1970-01-01 00:00 UTC"
+    assert moment(None) == NONE
+    assert [seed_range(s) for s in ((), (3,), (3, 4, 5), (3, 5))] == ["none", "3", "3 (3 to 5)", "2 (3, 5)"]
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_pressing_a_heading_sorts_the_table(typical, tmp_path):
+    synthetic, _, html, _ = typical
+    # The page's own policy would refuse the presses, so they are done in a copy without it.
+    presses = (
+        "<script>for (const button of document.querySelectorAll('th button'))"
+        " if (button.textContent === 'score') button.click();</script></body>"
+    )
+    copy = tmp_path / "copy.html"
+    copy.write_text(re.sub(r"<meta http-equiv[^>]*>", "", html).replace("</body>", presses), encoding="utf-8")
+    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
+    done = subprocess.run(
+        [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path}/profile", "--dump-dom", copy.as_uri()],
+        capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    rows = [row for row in Page(done.stdout).rows if re.fullmatch(r"t\d{4}", row[0])]
+    scores = [float(row[5]) for row in rows[:-1]]
+    assert scores == sorted(scores)
+    assert rows[-1][0] == "t0003"
+    assert len(rows) == len(synthetic.trials)

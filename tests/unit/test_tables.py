@@ -1,0 +1,144 @@
+"""DataFrames and CSV files of trials and iterations."""
+
+import math
+
+import pandas as pd
+import pytest
+from synthetic_sweep import make_sweep
+
+from analysis.records import IterationRecord
+from analysis.selection import score_trial
+from analysis.tables import env_steps_to, format_value, groups_frame, iterations_frame, trials_frame, write_csv
+from policies.errors import CannotRunError
+
+
+@pytest.fixture(scope="module")
+def synthetic():
+    return make_sweep(failed={3}, pending={5})
+
+
+def iteration(number, *, episodes, training):
+    return IterationRecord(
+        iteration=number, num_env_steps=1000 * number, num_episodes=episodes, time_s=1.0, training_return=training
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [([64, 64], "64x64"), ((32,), "32"), ("relu", "relu"), (0, 0), (False, False), (None, None), (1e-7, 1e-7)],
+)
+def test_a_value_becomes_a_cell(value, expected):
+    assert format_value(value) == expected
+    assert type(format_value(value)) is type(expected)
+
+
+def test_one_row_a_trial(synthetic):
+    frame = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
+    assert len(frame) == 20
+    assert list(frame.columns[:5]) == ["trial_id", "status", "hidden_sizes", "activation", "lr"]
+    assert frame["hidden_sizes"].tolist()[:4] == ["32", "32", "64", "64"]
+    assert frame["lr"].tolist() == [trial.point["lr"] for trial in synthetic.trials]
+    assert frame["seed"].tolist() == [trial.seed for trial in synthetic.trials]
+    row = frame.set_index("trial_id").loc["t0001"]
+    assert row["score"] == score_trial(synthetic.trials[1]).score
+    assert row["score_num_env_steps"] == score_trial(synthetic.trials[1]).checkpoint.num_env_steps
+
+
+def test_rows_are_in_order_of_index_whatever_the_order_given(synthetic):
+    frame = trials_frame(synthetic.trials[::-1])
+    assert frame["trial_id"].tolist() == [trial.trial_id for trial in synthetic.trials]
+
+
+def test_failed_and_pending_trials_are_rows_without_a_score(synthetic):
+    frame = trials_frame(synthetic.trials, synthetic.results).set_index("trial_id")
+    assert frame.loc["t0003", "status"] == "failed"
+    assert math.isnan(frame.loc["t0003", "score"])
+    assert frame.loc["t0003", "error"].startswith("RuntimeError: env.step raised")
+    assert "\n" not in frame.loc["t0003", "error"]
+    assert frame.loc["t0005", "status"] == "pending"
+    assert math.isnan(frame.loc["t0005", "training_return"])
+    assert frame.loc["t0005", "num_env_steps"] == 0
+
+
+def test_a_score_of_zero_is_not_missing():
+    trial = make_sweep(points=[{"lr": 1e-3}]).trials[0]
+    zero = trial.checkpoints[0].model_copy(update={"evaluation_return": 0.0})
+    frame = trials_frame([trial.model_copy(update={"checkpoints": (zero,)})])
+    assert frame["score"].tolist() == [0.0]
+
+
+def test_solved_needs_the_return_and_a_hundred_episodes():
+    rows = [
+        iteration(1, episodes=20, training=200.0),
+        iteration(2, episodes=100, training=None),
+        iteration(3, episodes=120, training=194.9),
+        iteration(4, episodes=140, training=195.0),
+        iteration(5, episodes=160, training=199.0),
+    ]
+    assert env_steps_to(195.0, rows) == 4000
+    assert env_steps_to(195.0, rows, num_episodes=20) == 1000
+    assert env_steps_to(200.0, rows[1:]) is None
+    assert env_steps_to(None, rows) is None
+    assert env_steps_to(0.0, [iteration(1, episodes=100, training=0.0)]) == 1000
+
+
+def test_no_trials_give_an_empty_table_with_its_columns():
+    frame = trials_frame([])
+    assert len(frame) == 0
+    assert "score" in frame.columns
+    assert len(iterations_frame({})) == 0
+
+
+def test_one_row_an_iteration(synthetic):
+    frame = iterations_frame(synthetic.results)
+    assert len(frame) == sum(len(rows) for rows in synthetic.results.values())
+    first = frame.iloc[0]
+    assert (first["trial_id"], first["iteration"], first["num_env_steps"]) == ("t0000", 1, 1024)
+    assert first["learner/entropy"] == 0.6
+    assert frame["evaluation_return"].isna().sum() > 0
+
+
+def test_groups_count_who_solved_and_how_fast(synthetic):
+    frame = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
+    groups = groups_frame(synthetic.trials, synthetic.results, ["hidden_sizes", "activation"], threshold=195.0)
+    assert groups["num_trials"].tolist() == [5, 5, 5, 5]
+    assert groups["num_failed"].sum() == 1
+    solved = frame["num_env_steps_to_solve"].dropna()
+    assert groups["num_solved"].sum() == len(solved) > 0
+    assert groups["min_num_env_steps_to_solve"].iloc[0] == solved.min()
+    assert groups["min_num_env_steps_to_solve"].isna().tolist() == [False, False, True, True]
+    unsolved = groups_frame(synthetic.trials, synthetic.results, ["activation"], threshold=None)
+    assert unsolved["num_solved"].tolist() == [0, 0]
+    assert unsolved["best_score"].is_monotonic_decreasing
+
+
+def test_csv_reads_back(synthetic, tmp_path):
+    frame = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
+    write_csv(tmp_path / "deep" / "trials.csv", frame)
+    back = pd.read_csv(tmp_path / "deep" / "trials.csv")
+    assert back["trial_id"].tolist() == frame["trial_id"].tolist()
+    assert back["lr"].tolist() == frame["lr"].tolist()
+    assert back["score"].isna().sum() == 2
+    # Whole numbers stay whole where some are missing.
+    text = pd.read_csv(tmp_path / "deep" / "trials.csv", dtype=str)["num_env_steps_to_solve"]
+    assert text.isna().any()
+    assert text.dropna().str.fullmatch(r"\d+").all()
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["trials.csv"]
+
+
+@pytest.mark.parametrize("start", ["=", "+", "-", "@"])
+def test_csv_text_is_no_spreadsheet_formula(tmp_path, start):
+    synthetic = make_sweep(points=[{"lr": 1e-3}], failed={0}, error=f"{start}HYPERLINK(1)")
+    write_csv(tmp_path / "t.csv", trials_frame(synthetic.trials))
+    assert pd.read_csv(tmp_path / "t.csv")["error"].tolist() == [f"'{start}HYPERLINK(1)"]
+
+
+def test_csv_leaves_numbers_alone(tmp_path):
+    write_csv(tmp_path / "t.csv", pd.DataFrame({"score": [-7.5, 3.0]}))
+    assert (tmp_path / "t.csv").read_text() == "score\n-7.5\n3.0\n"
+
+
+def test_a_csv_that_cannot_be_written_says_so(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CannotRunError, match="file"):
+        write_csv(tmp_path / "file" / "t.csv", pd.DataFrame({"a": [1]}))
