@@ -61,6 +61,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._obs: NDArray[Any] | None = None
         self._seed_override: int | None = None
         self._just_ended: NDArray[np.bool_] | None = None
+        self._synced_steps = 0
+        self._steps_since_sync = 0
         super().__init__(**kwargs)
 
     def pop_finished_episodes(self) -> list[tuple[float, int]]:
@@ -139,12 +141,17 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         assert self._just_ended is not None
         env = self.env.env
         num_runners = self.config.num_env_runners or 1
+        if self.num_env_steps_sampled_lifetime != self._synced_steps:
+            self._synced_steps, self._steps_since_sync = self.num_env_steps_sampled_lifetime, 0
+        # RLlib tells the count once an iteration, but DQN samples step by step: without counting on from there, its
+        # epsilon would only move between iterations.
+        steps_before = self._synced_steps // num_runners + self._steps_since_sync
         self.module.eval()
         rows: dict[str, list[NDArray[Any]]] = {"obs": [self._obs]}
         num_steps = 0
         with torch.no_grad():
             while num_steps < num_timesteps:
-                steps_so_far = (self.num_env_steps_sampled_lifetime // num_runners + num_steps) * num_runners
+                steps_so_far = (steps_before + num_steps) * num_runners
                 row = self._actions(self._obs, explore=explore, num_env_steps=steps_so_far)
                 to_env = self._for_env(row[Columns.ACTIONS])
                 self._obs, rewards, terminated, truncated, _ = env.step(to_env)
@@ -160,6 +167,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                 for key, value in row.items():
                     rows.setdefault(key, []).append(value)
                 rows["obs"].append(self._obs)
+        self._steps_since_sync += num_steps
         return {key: np.stack(values) for key, values in rows.items()}
 
     def _actions(self, obs: NDArray[Any], *, explore: bool, num_env_steps: int) -> dict[str, NDArray[Any]]:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any, TypeAlias
 
+import torch
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.algorithms.dqn import DQNConfig
+from ray.rllib.algorithms.dqn.torch.dqn_torch_learner import DQNTorchLearner
 from ray.rllib.algorithms.ppo import PPOConfig
 
 from policies.env_runner import ArrayEnvRunner
@@ -23,6 +25,20 @@ RLLIB_ACTIVATIONS = {
 }  # fmt: skip
 
 ModelConfig: TypeAlias = dict[str, Any]
+
+
+class AdamEpsilonDQNLearner(DQNTorchLearner):  # type: ignore[misc]
+    """RLlib's DQN learner, whose Adam takes `adam_epsilon`; on the new API stack RLlib ignores it (2.60)."""
+
+    def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
+        """Register Adam for a module, with the config's learning rate and epsilon."""
+        params = self.get_parameters(self.module[module_id])
+        self.register_optimizer(
+            module_id=module_id,
+            optimizer=torch.optim.Adam(params, eps=config.adam_epsilon),
+            params=params,
+            lr_or_lr_schedule=config.lr,
+        )
 
 
 def model_config(hyperparams: Hyperparams) -> ModelConfig:
@@ -119,4 +135,5 @@ def _dqn(hyperparams: DQNHyperparams) -> AlgorithmConfig:
         num_steps_sampled_before_learning_starts=hyperparams.learning_starts,
         epsilon=epsilon,
     )
+    config.learners(learner_class=AdamEpsilonDQNLearner)
     return config.reporting(min_sample_timesteps_per_iteration=hyperparams.env_steps_per_iteration)

@@ -10,6 +10,7 @@ import contextlib
 import os
 import secrets
 import socket
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -17,16 +18,21 @@ from pathlib import Path
 from typing import Any
 
 import ray
+from ray.exceptions import AuthenticationError, GetTimeoutError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from policies.errors import CannotRunError, TuneJobsError
+from policies.errors import CannotRunError
 from policies.files import write_atomic
+from tune_jobs.address import recorded_cluster
+from tune_jobs.live import quiet
 from tune_jobs.plan import Machine
 from tune_jobs.runner import prepare_environment
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
-_PROBE_TIMEOUT_S = 60.0
+# A node's first process imports torch and RLlib for it, from a disk that may be slow and cold.
+_PROBE_TIMEOUT_S = 180.0
+_QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
 
 
 @dataclass(frozen=True)
@@ -56,20 +62,10 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
     if ray.is_initialized():
         yield Connection(address, _is_client(), cluster_machine("the connected Ray cluster"))
         return
-    try:
-        _init(address, machine)
-    except TuneJobsError:
-        raise
-    except Exception as error:
-        where = "on this machine" if address is None else f"at {address}"
-        first_line = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        hint = (
-            "See the Ray logs in /tmp/ray/session_latest/logs."
-            if address is None
-            else "Check that the cluster runs (`ray status`), that the address is right, and that its Ray, Python and "
-            "token (RAY_AUTH_TOKEN) are those of this machine."
-        )
-        raise CannotRunError(f"Ray cannot be joined {where}: {first_line}", hint) from error
+    if address is None:
+        _start(machine)
+    else:
+        _join(address)
     try:
         source = "this machine" if address is None else f"the cluster at {address}"
         yield Connection(address, _is_client(), cluster_machine(source))
@@ -77,24 +73,54 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
         ray.shutdown()
 
 
-def _init(address: str | None, machine: Machine | None) -> None:
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-    if address is None:
-        # A local sweep sends nothing anywhere; who wants Ray's usage statistics sets the variable.
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        resources: dict[str, Any] = {}
-        if machine is not None:
-            resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
+def _start(machine: Machine | None) -> None:
+    # A local sweep sends nothing anywhere; who wants Ray's usage statistics sets the variable.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    resources: dict[str, Any] = {}
+    if machine is not None:
+        resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
+    try:
         # "local": a cluster of this sweep's own, even where one happens to run already.
         ray.init(
-            address="local",
-            include_dashboard=False,
-            object_store_memory=_OBJECT_STORE_BYTES,
-            **resources,
-            **quiet,
+            address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
         )
-    else:
-        ray.init(address=address, **quiet)
+    except Exception as error:
+        raise CannotRunError(
+            f"Ray cannot be started on this machine: {_first_line(error)}",
+            "See the Ray logs in /tmp/ray/session_latest/logs.",
+        ) from error
+
+
+def _join(address: str) -> None:
+    # Ray's native code prints a warning for each of its attempts.
+    with tempfile.NamedTemporaryFile(prefix="tune-jobs-join-") as file:
+        try:
+            with quiet(Path(file.name)):
+                ray.init(address=address, **_QUIET)
+        except Exception as error:
+            said = Path(file.name).read_text(encoding="utf-8", errors="replace")
+            if "InvalidAuthToken" in said or isinstance(error, AuthenticationError):
+                raise CannotRunError(
+                    f"The Ray cluster at {address} does not accept this machine's token.",
+                    "Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the cluster's token.",
+                ) from error
+            raise CannotRunError(
+                f"The Ray cluster at {address} cannot be joined: {_first_line(error)}",
+                "Its Ray and Python must be of this machine's versions, and its token (RAY_AUTH_TOKEN) the same. "
+                "host:port is for machines that are nodes of the cluster; others join by ray://HOST:10001.",
+            ) from error
+    joined = ray.get_runtime_context().gcs_address if address == "auto" else None
+    if joined is not None and "RAY_ADDRESS" not in os.environ and joined != recorded_cluster():
+        # Ray 2.60 prefers a lone cluster among this machine's processes: another sweep's own, which ends with it.
+        ray.shutdown()
+        raise CannotRunError(
+            f"`auto` found the Ray at {joined}, but `ray start` last joined {recorded_cluster()}.",
+            f"Say which with --address, for example --address {recorded_cluster()}.",
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def _is_client() -> bool:
@@ -135,9 +161,9 @@ def check_storage(folder: Path) -> None:
             strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
             remote = ray.remote(num_cpus=0, max_retries=0)(_answer).options(scheduling_strategy=strategy)
             name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"
-            tasks[name] = remote.remote(str(probe), node["NodeID"])
-        for name, task in tasks.items():
-            _check_answer(name, task, probe, token)
+            tasks[name] = (remote.remote(str(probe), node["NodeID"]), probe / node["NodeID"])
+        for name, (task, answer) in tasks.items():
+            _check_answer(name, task, answer, token)
     finally:
         for path in probe.iterdir():
             path.unlink(missing_ok=True)
@@ -151,25 +177,43 @@ def _answer(probe: str, node_id: str) -> tuple[str, str]:
     return question, version("tune-jobs")
 
 
-def _check_answer(name: str, task: Any, probe: Path, token: str) -> None:
-    folder = probe.parent
+def _check_answer(name: str, task: Any, answer: Path, token: str) -> None:
+    folder = answer.parent.parent
     storage_hint = "Choose storage that every node reaches (a network file system) with --storage."
     try:
         question, their_version = ray.get(task, timeout=_PROBE_TIMEOUT_S)
+    except GetTimeoutError as error:
+        raise CannotRunError(
+            f"Node {name} did not answer within {_PROBE_TIMEOUT_S:.0f} s.",
+            "Check the node with `ray status`, and that its file systems respond.",
+        ) from error
     except Exception as error:
         cause = getattr(error, "cause", None) or error
         if isinstance(cause, ImportError) or "ModuleNotFoundError" in str(error):
             raise CannotRunError(
-                f"Node {name} has no tune-jobs.", "Install the same version on every node, or use its image."
+                f"Node {name} has no tune-jobs that works: {_last_line(error)}",
+                "Install the same version on every node, or use its image.",
             ) from error
-        reason = (str(cause).strip().splitlines() or [type(cause).__name__])[-1]
+        if isinstance(cause, FileNotFoundError):
+            raise CannotRunError(f"Node {name} does not see the sweep folder {folder}.", storage_hint) from error
         raise CannotRunError(
-            f"Node {name} cannot use the sweep folder {folder}: {reason}", storage_hint
+            f"Node {name} cannot use the sweep folder {folder}: {_last_line(cause)}", storage_hint
         ) from error
-    if question != token or not any(path.name != "question" for path in probe.iterdir()):
+    if question != token or not _holds(answer, token):
         raise CannotRunError(f"Node {name} sees another folder under the name {folder}.", storage_hint)
     if their_version != version("tune-jobs"):
         raise CannotRunError(
             f"Node {name} has tune-jobs {their_version}, {socket.gethostname()} has {version('tune-jobs')}.",
             "Install the same version everywhere.",
         )
+
+
+def _last_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
+
+
+def _holds(path: Path, content: str) -> bool:
+    try:
+        return path.read_text(encoding="utf-8") == content
+    except OSError:
+        return False

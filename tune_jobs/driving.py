@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, TuneJobsError
+from tune_jobs.address import check_address
 from tune_jobs.monitor import SweepMonitor
 from tune_jobs.plan import Machine, SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec
@@ -124,7 +125,14 @@ def _git_commit() -> str | None:
 
 
 def connected(address: str | None, here: Machine | None) -> AbstractContextManager[Connection]:
-    """Join a cluster or start Ray here; see `cluster.connect`. Imports ray only when it is called."""
+    """Join a cluster or start Ray here; see `cluster.connect`. Imports ray only when it is called.
+
+    Raises:
+        SpecError: The address is none.
+        CannotRunError: Nothing listens there.
+    """
+    if address is not None:
+        check_address(address)
     from tune_jobs.cluster import connect
 
     return connect(address, here)

@@ -217,6 +217,10 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         error = cloudpickle.loads(Path(path).read_bytes()) if path and Path(path).is_file() else None
         return describe_failure(error, self._store.trial(_trial_id(trial)).log_tail())
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Tune pickles its callbacks into a file that is never read back here; listeners and open files can't be.
+        return {}
+
     def close(self) -> None:
         """No event will come any more."""
         self._scalars.close_all()

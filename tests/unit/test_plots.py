@@ -156,6 +156,8 @@ def test_few_or_negative_scores_still_draw(returns, goal):
     figure = score_per_episode(returns, goal=goal)
     assert sum(patch.get_height() for patch in figure.axes[1].patches) == len(returns)
     assert ("goal 0" in legend_of(figure)) == (goal is not None)
+    if goal is not None:
+        assert figure.axes[0].get_ylim()[1] > goal
     assert to_png(figure, dpi=40).startswith(b"\x89PNG")
 
 

@@ -243,10 +243,19 @@ def test_returns_that_are_not_finite_cost_only_their_interval(tmp_path):
     assert card["gain"] is None
 
 
+def test_episodes_that_are_not_finite_are_left_out_of_the_figure(tmp_path):
+    synthetic = make_sweep(points=[{"lr": 3e-3}])
+    row = synthetic.results["t0000"][0]
+    synthetic.results["t0000"][0] = row.model_copy(update={"episode_returns": (float("nan"), float("inf"), 9.0)})
+    path, _, _ = report(tmp_path, synthetic)
+    assert (path.parent / "figures" / "score_per_episode.png").is_file()
+
+
 @pytest.mark.parametrize(
     ("env_id", "threshold", "stop", "goal"),
     [
         ("CartPole-v1", 123.0, {}, 123.0),
+        ("CartPole-v1", 0.0, {}, 0.0),
         ("CartPole-v1", None, {"training_return": 7.0}, 475.0),
         ("Own-v0", None, {"training_return": 0.0, "evaluation_return": None}, 0.0),
         ("evil_module:Own-v0", None, {}, None),

@@ -1,0 +1,84 @@
+"""Checks a cluster's address before ray is imported, let alone asked: it would retry a dead one for minutes."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from policies.errors import CannotRunError, SpecError
+
+_CLIENT_SCHEME = "ray"
+_DEFAULT_CLIENT_PORT = 10001
+_CONNECT_TIMEOUT_S = 10.0
+_FORMS = "Give `auto`, HOST:PORT (`ray start` prints it) or ray://HOST:PORT, or leave --address out to run here."
+
+
+def check_address(address: str) -> None:
+    """Check that an address is one, and that something listens there.
+
+    Args:
+        address: `auto`, `host:port` or `ray://host:port`.
+
+    Raises:
+        SpecError: It has another form.
+        CannotRunError: Nothing listens there; with `auto`: no cluster is known on this machine.
+    """
+    where = ""
+    if address == "auto":
+        address, where = _find_cluster()
+    host, port = _host_and_port(address, where)
+    try:
+        socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S).close()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise CannotRunError(
+            f"No Ray cluster answers at {address}{where}: {reason}.",
+            "Check that it runs (`ray status` on its head), that the address is right, and that the port is open.",
+        ) from error
+
+
+def recorded_cluster() -> str | None:
+    """The address of the cluster that `ray start` last started or joined on this machine, if it left one."""
+    try:
+        return _record_path().read_text(encoding="utf-8").strip() or None
+    except OSError:
+        return None
+
+
+def _record_path() -> Path:
+    # Where Ray 2.60 keeps it (ray._common.utils.get_ray_address_file), without importing ray.
+    folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"  # noqa: S108 (Ray's own default)
+    return Path(folder, "ray", "ray_current_cluster")
+
+
+def _find_cluster() -> tuple[str, str]:
+    """What `auto` means: the address, and the words that say where it comes from."""
+    address = os.environ.get("RAY_ADDRESS")
+    if address:
+        return address, " (from RAY_ADDRESS)"
+    address = recorded_cluster()
+    if address is None:
+        # Ray would now join any Ray it finds among this machine's processes: another sweep's own, which ends with it.
+        raise CannotRunError(
+            "No Ray cluster is known on this machine: RAY_ADDRESS is not set, and `ray start` left no address in "
+            f"{_record_path()}.",
+            "Start one (`ray start --head`), name it with --address HOST:PORT or ray://HOST:PORT, or leave --address "
+            "out to run on this machine alone.",
+        )
+    return address, f" (from {_record_path()})"
+
+
+def _host_and_port(address: str, where: str) -> tuple[str, int]:
+    scheme, _, rest = address.rpartition("://")
+    try:
+        parts = urlsplit(f"//{rest}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if scheme == _CLIENT_SCHEME and port is None:
+        port = _DEFAULT_CLIENT_PORT
+    if scheme not in ("", _CLIENT_SCHEME) or not host or port is None:
+        raise SpecError(f"{address!r}{where} is not the address of a Ray cluster.", _FORMS)
+    return host, port
