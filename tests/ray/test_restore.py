@@ -1,0 +1,261 @@
+"""A checkpoint restores to the very weights that were saved, or raises; portable policies act as RLlib does."""
+
+import json
+import shutil
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from trials import make_task, run_trial
+
+from policies.errors import CheckpointError, NotFoundError
+from policies.hyperparams import ACTIVATIONS, make_hyperparams
+from policies.policy import NetworkPolicy, load_policy
+from policies.portable import Layer, PolicyNetwork, read_policy, save_policy
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+MODULE = "default_policy"
+
+
+@pytest.fixture(scope="module", params=["ppo", "dqn"])
+def trained(request, ray_session, tmp_path_factory):
+    """(checkpoint folder, its Algorithm as it was when it was saved)."""
+    from tune_jobs.engines.rllib import RLlibEngine
+
+    task = make_task(tmp_path_factory.mktemp("sweep"), request.param)
+    engine = RLlibEngine()
+    progress = run_trial(task, engine)
+    yield task.sweep_folder / progress.checkpoints[-1].path, engine.algorithm
+    engine.close()
+
+
+@pytest.fixture
+def checkpoint(trained, tmp_path):
+    """A copy of the checkpoint, to be damaged."""
+    folder = tmp_path / trained[0].name
+    shutil.copytree(trained[0], folder)
+    return folder
+
+
+def learner_state(algo):
+    """(weights, optimizer's moments) of the learner, as numpy arrays by name."""
+    learner = algo.learner_group._learner
+    weights = {name: value.numpy().copy() for name, value in learner.module[MODULE].state_dict().items()}
+    states = learner.get_optimizer(MODULE).state_dict()["state"]
+    return weights, {f"{index}.{key}": np.array(value) for index, s in states.items() for key, value in s.items()}
+
+
+def assert_equal_arrays(ours, theirs):
+    assert set(ours) == set(theirs)
+    for name, value in ours.items():
+        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+
+
+def test_a_checkpoint_restores_as_the_algorithm_that_was_saved_and_trains_on(trained):
+    from tune_jobs import sweeps
+
+    folder, saved = trained
+    algo = sweeps.restore(folder)
+    weights, moments = learner_state(algo)
+    saved_weights, saved_moments = learner_state(saved)
+    assert_equal_arrays(weights, saved_weights)
+    assert saved_moments
+    assert_equal_arrays(moments, saved_moments)
+    acting = {name: value.numpy() for name, value in algo.env_runner.module.state_dict().items()}
+    assert_equal_arrays(acting, {name: saved_weights[name] for name in acting})
+    assert algo.iteration == saved.iteration == 2
+    groups = [algorithm.learner_group._learner.get_optimizer(MODULE).param_groups[0] for algorithm in (algo, saved)]
+    assert [{key: group[key] for key in ("lr", "eps")} for group in groups[:1]] == [
+        {key: group[key] for key in ("lr", "eps")} for group in groups[1:]
+    ]
+    steps_before = saved.metrics.peek(("env_runners", "num_env_steps_sampled_lifetime"))
+    for _ in range(2):
+        # Two: after a restore DQN first fills its replay buffer again.
+        result = algo.train()
+    assert algo.iteration == 4
+    assert result["env_runners"]["num_env_steps_sampled_lifetime"] > steps_before
+    changed, _ = learner_state(algo)
+    assert any(not np.array_equal(changed[name], weights[name]) for name in weights)
+    algo.stop()
+
+
+def test_any_altered_or_missing_file_is_an_error_that_names_it(checkpoint):
+    from tune_jobs import sweeps
+
+    files = json.loads((checkpoint / "manifest.json").read_text())["files"]
+    on_disk = {path.relative_to(checkpoint).as_posix() for path in checkpoint.rglob("*") if path.is_file()}
+    assert set(files) == on_disk - {"manifest.json"}
+    assert any(name.startswith("rllib/") for name in files)
+    for name in files:
+        path = checkpoint / name
+        content = path.read_bytes()
+        path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]) if content else b"x")
+        with pytest.raises(CheckpointError, match=f"(?s){name}.*SHA-256"):
+            sweeps.restore(checkpoint)
+        path.write_bytes(content + b" ")
+        with pytest.raises(CheckpointError, match=name):
+            sweeps.restore(checkpoint)
+        path.unlink()
+        with pytest.raises(CheckpointError, match=f"lacks the file {name}"):
+            sweeps.restore(checkpoint)
+        path.write_bytes(content)
+    sweeps.restore(checkpoint).stop()
+
+
+def test_a_folder_that_is_no_checkpoint_is_an_error(checkpoint, tmp_path):
+    from tune_jobs import sweeps
+
+    with pytest.raises(NotFoundError, match="nowhere"):
+        sweeps.restore(tmp_path / "nowhere")
+    (checkpoint / "manifest.json").write_text("{")
+    with pytest.raises(CheckpointError, match=r"manifest\.json"):
+        sweeps.restore(checkpoint)
+    (checkpoint / "manifest.json").unlink()
+    with pytest.raises(NotFoundError):
+        sweeps.restore(checkpoint)
+
+
+def test_what_rllib_cannot_restore_is_an_error(checkpoint):
+    """Also where nobody looked at the hashes."""
+    from policies.restore import restore_algorithm
+
+    state = next((checkpoint / "rllib" / "learner_group").rglob("module_state.pkl"))
+    state.write_bytes(b"\x80\x04N.")  # the pickle of None
+    with pytest.raises(CheckpointError, match="rllib"):
+        restore_algorithm(checkpoint / "rllib", read_policy(checkpoint).network)
+
+
+def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint):
+    from policies.restore import restore_algorithm
+
+    (checkpoint / "rllib" / "class_and_ctor_args.pkl").unlink()
+    with pytest.raises(CheckpointError, match="RLlib cannot restore"):
+        restore_algorithm(checkpoint / "rllib")
+
+
+@pytest.mark.parametrize("part", ["weight", "bias"])
+@pytest.mark.parametrize("number", [0, 1])
+def test_weights_other_than_the_saved_ones_are_an_error(checkpoint, number, part):
+    """One number of one layer, in the last bit."""
+    from policies.restore import restore_algorithm
+
+    network = read_policy(checkpoint).network
+    restore_algorithm(checkpoint / "rllib", network).stop()
+    layers = list(network.layers)
+    arrays = {"weight": layers[number].weight.copy(), "bias": layers[number].bias.copy()}
+    arrays[part].flat[-1] = np.nextafter(arrays[part].flat[-1], np.float32(np.inf))
+    layers[number] = Layer(**arrays, activation=layers[number].activation)
+    with pytest.raises(CheckpointError, match=f"layer {number}"):
+        restore_algorithm(checkpoint / "rllib", PolicyNetwork(network.kind, tuple(layers)))
+
+
+def test_an_env_runner_with_other_weights_than_the_learner_is_an_error(trained):
+    from policies.restore import check_weights, restore_algorithm
+
+    folder, _ = trained
+    network = read_policy(folder).network
+    algo = restore_algorithm(folder / "rllib", network)
+    with torch.no_grad():
+        next(algo.env_runner.module.encoder.parameters()).add_(1.0)
+    with pytest.raises(CheckpointError, match="env runner"):
+        check_weights(algo, network)
+    algo.stop()
+
+
+# -- portable policies
+
+
+def rllib_actions(algo, obs):
+    """Greedy actions as RLlib computes and sends them to the environment."""
+    from ray.rllib.utils.spaces.space_utils import unsquash_action
+
+    module = algo.env_runner.module
+    with torch.no_grad():
+        out = module.forward_inference({"obs": torch.from_numpy(obs)})
+        if "actions" in out:
+            actions = out["actions"]
+        else:
+            dist = module.get_inference_action_dist_cls().from_logits(out["action_dist_inputs"])
+            actions = dist.to_deterministic().sample()
+    space = algo.env_runner.env.single_action_space
+    if isinstance(space, gym.spaces.Box):
+        assert algo.config.normalize_actions
+        return unsquash_action(actions.numpy(), space)
+    return actions.numpy() + space.start
+
+
+NETWORKS = {
+    "ppo-separate": ("ppo", "Acrobot-v1", {"vf_share_layers": False}),
+    "ppo-shared": ("ppo", "Acrobot-v1", {"vf_share_layers": True}),
+    "ppo-discrete-from-5": ("ppo", "TestTicks-v0", {}),
+    "ppo-continuous": ("ppo", "Pendulum-v1", {}),
+    "ppo-continuous-shared": ("ppo", "Pendulum-v1", {"vf_share_layers": True}),
+    "dqn-dueling": ("dqn", "Acrobot-v1", {"dueling": True}),
+    "dqn-plain": ("dqn", "Acrobot-v1", {"dueling": False}),
+}
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_greedy_actions_of_the_policy_file_are_rllibs(network, activation, tmp_path):
+    from policies.restore import portable_policy
+    from policies.rllib_config import build_algorithm_config
+
+    algorithm, env_id, values = NETWORKS[network]
+    hyperparams = make_hyperparams(algorithm, {"hidden_sizes": (24, 16), "activation": activation, **values})
+    torch.manual_seed(0)
+    algo = build_algorithm_config(hyperparams, env_id=env_id, seed=0).build_algo()
+    module = algo.learner_group._learner.module[MODULE]
+    with torch.no_grad():
+        for parameter in module.parameters():
+            # Larger than a fresh network's, so that activations saturate and actions reach their bounds.
+            parameter.mul_(3.0)
+    algo.env_runner.module.set_state(module.get_state(inference_only=True))
+    save_policy(portable_policy(algo, hyperparams, env_id=env_id, env_args={}), tmp_path)
+    policy = load_policy(tmp_path)
+    size = policy.observation_space.shape[0]
+    obs = np.random.default_rng(1).normal(scale=2.0, size=(1_000, size)).astype(np.float32)
+    expected = rllib_actions(algo, obs)
+    algo.stop()
+    actions = policy.act(obs)
+    assert len(np.unique(expected)) > 1
+    if isinstance(policy.action_space, gym.spaces.Box):
+        low, high = policy.action_space.low, policy.action_space.high
+        assert (expected.min(), expected.max()) == (low, high)
+        assert np.mean((expected > low) & (expected < high)) > 0.2
+        np.testing.assert_allclose(actions, expected, rtol=1e-4, atol=1e-5)
+    else:
+        np.testing.assert_array_equal(actions, expected)
+    one = policy.act(obs[0])
+    assert np.array_equal(one, actions[0])
+
+
+def test_trained_policies_act_as_their_checkpoints(trained):
+    folder, saved = trained
+    obs = np.random.default_rng(2).normal(size=(1_000, 4)).astype(np.float32)
+    np.testing.assert_array_equal(load_policy(folder).act(obs), rllib_actions(saved, obs))
+
+
+def test_a_network_other_than_the_hyperparameters_say_is_an_error(trained):
+    from policies.restore import portable_policy
+
+    _, saved = trained
+    algorithm = "dqn" if type(saved).__name__ == "DQN" else "ppo"
+    for values, what in (
+        ({"hidden_sizes": (8, 8)}, "no weights"),
+        ({"hidden_sizes": (9,)}, "hidden layers"),
+        *([({"hidden_sizes": (8,), "vf_share_layers": True}, "no weights")] if algorithm == "ppo" else []),
+    ):
+        hyperparams = make_hyperparams(algorithm, values)
+        with pytest.raises(CheckpointError, match=what):
+            portable_policy(saved, hyperparams, env_id="CartPole-v1", env_args={})
+
+
+def test_the_policy_of_a_checkpoint_tells_how_it_was_trained(trained):
+    folder, _ = trained
+    policy = NetworkPolicy(read_policy(folder))
+    training = policy.portable.training
+    assert (training["trial_id"], training["iteration"], policy.env_id) == ("t0000", 2, "CartPole-v1")
+    assert training["hyperparams"]["hidden_sizes"] == [8]

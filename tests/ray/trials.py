@@ -1,0 +1,46 @@
+"""Single trials without Ray Tune: what several test modules here run."""
+
+from pathlib import Path
+
+from policies.evaluate import Evaluator
+from tune_jobs.engines.protocol import TrialTask
+from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+
+TRIAL_SEED = 9 * 1024
+SMALL = {
+    "ppo": {"hidden_sizes": (8,), "train_batch_size": 128, "minibatch_size": 64, "num_epochs": 2, "num_envs": 4},
+    "dqn": {"hidden_sizes": (8,), "env_steps_per_iteration": 60, "learning_starts": 30, "train_batch_size": 16},
+}
+
+
+def make_task(folder: Path, algorithm="ppo", **changes):
+    """A trial of a few iterations; hyperparameters by name, other fields of `TrialTask` too."""
+    fields = {name: changes.pop(name) for name in list(changes) if name in TrialTask.__dataclass_fields__}
+    return TrialTask(
+        **{
+            "sweep_folder": Path(folder),
+            "trial_id": "t0000",
+            "seed": TRIAL_SEED,
+            "algorithm": algorithm,
+            "hyperparams": {**SMALL[algorithm], **changes},
+            "env_id": "CartPole-v1",
+            "env_args": {},
+            "stop": StopSpec(num_iterations=2),
+            "evaluation": EvaluationSpec(every_iterations=1, num_episodes=2),
+            "checkpoints": CheckpointSpec(every_iterations=1, keep=5),
+            "evaluation_seeds": (1, 2),
+            **fields,
+        }
+    )
+
+
+def run_trial(task, engine):
+    """Run a trial to its end; the engine keeps the Algorithm."""
+    from tune_jobs.trial import TrialLoop
+
+    with Evaluator(task.env_id, task.env_args, task.evaluation_seeds) as evaluator:
+        loop = TrialLoop(task, engine, evaluator)
+        loop.open()
+        while (progress := loop.advance(60.0)).status == "running":
+            pass
+    return progress
