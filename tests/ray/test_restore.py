@@ -44,7 +44,7 @@ def learner_state(algo):
     learner = algo.learner_group._learner
     weights = {name: value.numpy().copy() for name, value in learner.module[MODULE].state_dict().items()}
     states = learner.get_optimizer(MODULE).state_dict()["state"]
-    return weights, {f"{index}.{key}": np.array(value) for index, s in states.items() for key, value in s.items()}
+    return weights, {f"{index}.{key}": value.numpy().copy() for index, s in states.items() for key, value in s.items()}
 
 
 def assert_equal_arrays(ours, theirs):
@@ -186,6 +186,20 @@ def rllib_actions(algo, obs):
     return actions.numpy() + space.start
 
 
+def spread_actions(algo, obs):
+    """Set weights with which activations saturate, discrete actions differ, and continuous ones reach both bounds."""
+    module = algo.learner_group._learner.module[MODULE]
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.mul_(3.0)
+        head = (module.pi if hasattr(module, "pi") else module.af).net.mlp[0]
+        features = module.encoder({"obs": torch.from_numpy(obs)})["encoder_out"]
+        outputs = head(features["actor"] if isinstance(features, dict) else features)
+        head.weight.div_(outputs.std(dim=0)[:, None])
+        head.bias.sub_(outputs.mean(dim=0)).div_(outputs.std(dim=0))
+    algo.env_runner.module.set_state(module.get_state(inference_only=True))
+
+
 NETWORKS = {
     "ppo-separate": ("ppo", "Acrobot-v1", {"vf_share_layers": False}),
     "ppo-shared": ("ppo", "Acrobot-v1", {"vf_share_layers": True}),
@@ -207,16 +221,11 @@ def test_greedy_actions_of_the_policy_file_are_rllibs(network, activation, tmp_p
     hyperparams = make_hyperparams(algorithm, {"hidden_sizes": (24, 16), "activation": activation, **values})
     torch.manual_seed(0)
     algo = build_algorithm_config(hyperparams, env_id=env_id, seed=0).build_algo()
-    module = algo.learner_group._learner.module[MODULE]
-    with torch.no_grad():
-        for parameter in module.parameters():
-            # Larger than a fresh network's, so that activations saturate and actions reach their bounds.
-            parameter.mul_(3.0)
-    algo.env_runner.module.set_state(module.get_state(inference_only=True))
+    obs_space = algo.env_runner.env.single_observation_space
+    obs = np.random.default_rng(1).normal(scale=2.0, size=(1_000, *obs_space.shape)).astype(np.float32)
+    spread_actions(algo, obs)
     save_policy(portable_policy(algo, hyperparams, env_id=env_id, env_args={}), tmp_path)
     policy = load_policy(tmp_path)
-    size = policy.observation_space.shape[0]
-    obs = np.random.default_rng(1).normal(scale=2.0, size=(1_000, size)).astype(np.float32)
     expected = rllib_actions(algo, obs)
     algo.stop()
     actions = policy.act(obs)
