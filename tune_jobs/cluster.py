@@ -26,7 +26,7 @@ from policies.files import write_atomic
 from tune_jobs.address import recorded_cluster
 from tune_jobs.live import quiet
 from tune_jobs.plan import Machine
-from tune_jobs.runner import prepare_environment
+from tune_jobs.ray_environment import prepare_environment
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
@@ -134,8 +134,7 @@ def _alive_nodes() -> list[dict[str, Any]]:
 def cluster_machine(source: str) -> Machine:
     """The CPUs and GPUs of the joined cluster's nodes."""
     nodes = tuple(
-        (float(node["Resources"].get("CPU", 0)), float(node["Resources"].get("GPU", 0)))
-        for node in _alive_nodes()
+        (float(node["Resources"].get("CPU", 0)), float(node["Resources"].get("GPU", 0))) for node in _alive_nodes()
     )
     return Machine(
         num_cpus=sum(cpus for cpus, _ in nodes),

@@ -32,10 +32,7 @@ _MAX_RUNNING_ROWS = 12
 
 def describe_point(record: TrialRecord) -> str:
     """A trial's sampled values in a line."""
-    return (
-        ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items())
-        or "no searched values"
-    )
+    return ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items()) or "no searched values"
 
 
 def render(monitor: SweepMonitor) -> RenderableType:
@@ -54,9 +51,7 @@ def render(monitor: SweepMonitor) -> RenderableType:
     if counts.get("running"):
         parts.append(_running(monitor))
     if monitor.stopping:
-        parts.append(
-            Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow")
-        )
+        parts.append(Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow"))
     return Group(*parts)
 
 
@@ -126,9 +121,7 @@ def summary_line(monitor: SweepMonitor) -> str:
         f"{monitor.num_env_steps:,} env steps",
     ]
     if best is not None:
-        words.append(
-            f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})"
-        )
+        words.append(f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})")
     if estimate.time_left_s:
         words.append(f"about {format_duration(estimate.time_left_s)} left")
     return "; ".join(words)

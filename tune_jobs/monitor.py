@@ -92,11 +92,7 @@ class SweepMonitor:
         now = self._clock()
         first_time, first_steps = self._history[0]
         span = now - first_time
-        rate = (
-            (self._num_env_steps - first_steps) / span
-            if span > 0 and self._num_env_steps > first_steps
-            else None
-        )
+        rate = (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
         records = list(self.records.values())
         left = [record for record in records if record.status not in FINISHED]
         ended = [r for r in records if r.status == "completed" and r.trial_id not in self._finished_before]

@@ -6,7 +6,6 @@ Tune decides which trial runs where and when; what a trial is and how far it got
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ from ray.tune.experiment import Trial
 
 from analysis.records import CheckpointRecord, TrialRecord
 from policies.errors import TuneJobsError
+from tune_jobs.ray_environment import prepare_environment
 from tune_jobs.schedulers import build_scheduler
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
@@ -31,18 +31,6 @@ Listener = Callable[[TrialRecord], None]
 
 # How long running trials may take to save a checkpoint once they were asked to stop; then they are ended.
 STOP_GRACE_S = 20.0
-_TRIAL_CLEANUP_S = 5
-_ENVIRONMENT = {
-    # The driver has its own handler, which lets trials save a checkpoint first.
-    "TUNE_DISABLE_SIGINT_HANDLER": "1",
-    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-    "TUNE_FORCE_TRIAL_CLEANUP_S": str(_TRIAL_CLEANUP_S),
-    "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
-    # Tune's state is never read back: saving it every ten seconds would only cost.
-    "TUNE_GLOBAL_CHECKPOINT_S": "3600",
-    "RAY_AIR_NEW_OUTPUT": "0",
-    "RAY_CHDIR_TO_TRIAL_DIR": "0",
-}
 
 
 @dataclass(frozen=True)
@@ -54,11 +42,6 @@ class RunJob:
     cpus_per_trial: float
     gpus_per_trial: float
     max_concurrent: int
-
-
-def prepare_environment() -> None:
-    """Set what Ray Tune reads from the environment; before Ray starts, so that its workers inherit it."""
-    os.environ.update(_ENVIRONMENT)
 
 
 def run_trials(job: RunJob, listener: Listener) -> None:

@@ -242,6 +242,7 @@ class SweepStore:
         self.tune_folder = self.folder / "tune"
         self._stop_path = self.folder / ".stop"
         self._lock_path = self.folder / ".lock"
+        self._driver_lock_path = self.folder / ".driver-lock"
 
     @property
     def name(self) -> str:
@@ -341,24 +342,41 @@ class SweepStore:
         """Hold the sweep's lock; the system frees it when the process ends, however it ends.
 
         Raises:
-            CannotRunError: Another process holds it.
+            CannotRunError: Another process holds it, or runs the sweep on a cluster.
         """
-        file = self._open_lock()
-        with file:
+        watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
+        with self._held(self._lock_path, f"Sweep {self.name} is being run by another process.", watch):
+            with self.driver_lock():
+                pass
+            yield
+
+    @contextlib.contextmanager
+    def driver_lock(self) -> Iterator[None]:
+        """Hold the lock of the process on a cluster that drives the sweep for a client, which holds the sweep's lock.
+
+        Raises:
+            CannotRunError: Such a process still runs.
+        """
+        message = f"Sweep {self.name} is still being run on a cluster, for a process that is gone."
+        with self._held(self._driver_lock_path, message, "Try again in a minute: the cluster is ending it."):
+            yield
+
+    @contextlib.contextmanager
+    def _held(self, path: Path, message: str, hint: str) -> Iterator[None]:
+        with self._open_lock(path) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                if error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES):
-                    raise
+                if error.errno in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES):
+                    raise CannotRunError(message, hint) from error
                 raise CannotRunError(
-                    f"Sweep {self.name} is being run by another process.",
-                    f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`.",
+                    f"{path} cannot be locked: {error.strerror}.", "Choose storage whose file system has locks."
                 ) from error
             yield
 
-    def _open_lock(self) -> IO[Any]:
+    def _open_lock(self, path: Path) -> IO[Any]:
         try:
-            return self._lock_path.open("a")
+            return path.open("a")
         except OSError as error:
             raise CannotRunError(
                 f"The sweep folder {self.folder} cannot be written: {error.strerror}.",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-
-from tensorboardX import SummaryWriter
+from typing import TYPE_CHECKING
 
 from analysis.records import TrialRecord
+
+if TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
 
 
 class ScalarWriter:
@@ -24,6 +26,9 @@ class ScalarWriter:
         """Add the trial's current numbers; the evaluation return only where it is new."""
         writer = self._writers.get(record.trial_id)
         if writer is None:
+            # It imports torch, which nothing else here needs: not before the first result is on the screen.
+            from tensorboardX import SummaryWriter
+
             logdir = self._folder / "trials" / record.trial_id / "tensorboard"
             writer = self._writers[record.trial_id] = SummaryWriter(str(logdir), flush_secs=5)
         values = {

@@ -24,7 +24,6 @@ from ray import tune
 from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
-from tune_jobs.engines.rllib import RLlibEngine
 from tune_jobs.schedulers import METRIC, WORST_SCORE, grace_env_steps
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
@@ -95,6 +94,9 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the trial; it is built in the first step, so that every error comes from there."""
+        # Imported in the trial's process only: the driver imports this module too, and needs neither torch nor RLlib.
+        from tune_jobs.engines.rllib import RLlibEngine
+
         self._log = TrialLog()
         self._engine: TrainingEngine = RLlibEngine()
         self._evaluators: dict[str, Evaluator] = {}

@@ -1,0 +1,224 @@
+"""The RLlib engine: the same trial is the same again in a warm process, and a restored one goes on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from trials import TRIAL_SEED, make_task, run_trial
+
+from policies.errors import CannotRunError, CheckpointError
+from tune_jobs.spec import StopSpec
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+
+@pytest.fixture
+def engine():
+    from tune_jobs.engines.rllib import RLlibEngine
+
+    engine = RLlibEngine()
+    yield engine
+    engine.close()
+
+
+def weights_after(engine, task, num_iterations=2):
+    """The learner's weights of a fresh trial, and what its iterations gave."""
+    from policies.restore import learner_weights
+
+    engine.build(task, None)
+    stats = [engine.train_iteration() for _ in range(num_iterations)]
+    return learner_weights(engine.algorithm), stats
+
+
+def same(ours, theirs):
+    assert set(ours) == set(theirs)
+    return all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def save(engine, folder):
+    """A checkpoint as a trial saves it, but without a manifest."""
+    from policies.portable import save_policy
+
+    folder.mkdir(parents=True)
+    engine.save(folder)
+    save_policy(engine.policy(), folder)
+    return folder
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_a_trial_is_the_same_again_in_a_warm_process(engine, tmp_path, algorithm):
+    """However many other numbers the process has drawn, and whatever it trained in between."""
+    task = make_task(tmp_path, algorithm)
+    first, first_stats = weights_after(engine, task)
+    weights_after(engine, make_task(tmp_path, "ppo", seed=3 * TRIAL_SEED, env_id="Pendulum-v1"), 1)
+    np.random.rand(7)  # noqa: NPY002 (RLlib draws from the global generator)
+    again, again_stats = weights_after(engine, task)
+    assert same(first, again)
+    assert first_stats == again_stats
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_trials_of_other_seeds_are_other_trials(engine, tmp_path, algorithm):
+    first, first_stats = weights_after(engine, make_task(tmp_path, algorithm))
+    other, other_stats = weights_after(engine, make_task(tmp_path, algorithm, seed=TRIAL_SEED + 1024))
+    assert not any(np.array_equal(first[name], other[name]) for name in first)
+    assert first_stats[0].episodes != other_stats[0].episodes
+
+
+def test_iterations_tell_whole_episodes_and_all_env_steps(engine, tmp_path):
+    _, stats = weights_after(engine, make_task(tmp_path), 6)
+    steps = [item.num_env_steps for item in stats]
+    assert all(128 <= after - before < 128 + 4 for before, after in zip([0, *steps], steps, strict=False))
+    episodes = [episode for item in stats for episode in item.episodes]
+    # CartPole gives 1 a step, so the return of a whole episode is its length; those running are not counted.
+    assert all(episode_return == length for episode_return, length in episodes)
+    running = steps[-1] - sum(length for _, length in episodes)
+    assert 0 <= running < 4 * 500
+    # Of 768 steps of four beginners, nearly all belong to episodes that have ended; chunks would be as many, shorter.
+    assert running < 300
+    assert max(length for _, length in episodes) > 32
+    learner = stats[-1].learner
+    assert {"total_loss", "policy_loss", "vf_loss", "entropy", "lr", "gradient_norm"} <= set(learner)
+    assert learner["lr"] == pytest.approx(3e-4)
+    assert 0 < learner["entropy"] <= np.log(2) + 1e-6
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
+    from policies.restore import learner_weights
+    from tune_jobs.engines.rllib import RLlibEngine
+
+    task = make_task(tmp_path, algorithm)
+    weights, stats = weights_after(engine, task, 3)
+    folder = save(engine, tmp_path / "000003")
+    after = RLlibEngine()
+    after.build(task, folder)
+    assert same(learner_weights(after.algorithm), weights)
+    runner_weights = after.algorithm.env_runner.module.get_state()
+    assert same(runner_weights, {name: weights[name] for name in runner_weights})
+    assert after.algorithm.iteration == 3
+    before, now = stats[-1].num_env_steps, after.train_iteration().num_env_steps
+    # On from there; and env steps that only fill a replay buffer again are no env steps of the trial.
+    iteration = {"ppo": 128, "dqn": 60}[algorithm]
+    assert iteration <= now - before < 2 * iteration + 4
+    assert not same(learner_weights(after.algorithm), weights)
+    assert after.policy().training["iteration"] == 4
+    after.close()
+
+
+def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path):
+    """A trial that is retried from a checkpoint goes the same way again; and other ways from other checkpoints."""
+    from policies.restore import learner_weights
+
+    task = make_task(tmp_path)
+    weights_after(engine, task, 1)
+    folders = [save(engine, tmp_path / name / "000001") for name in ("a", "b")]
+    folders.append(save(engine, tmp_path / "000002"))
+    results = []
+    for folder in folders:
+        engine.build(task, folder)
+        stats = engine.train_iteration()
+        results.append((learner_weights(engine.algorithm), stats.episodes))
+    assert same(results[0][0], results[1][0])
+    assert results[0][1] == results[1][1]
+    assert results[0][1] != results[2][1]
+
+
+def test_a_restored_trial_does_not_see_its_first_episodes_again(engine, tmp_path):
+    task = make_task(tmp_path)
+    engine.build(task, None)
+    folder = save(engine, tmp_path / "000001")
+    fresh = engine.algorithm.env_runner.sample(num_timesteps=40)
+    engine.build(task, folder)
+    restored = engine.algorithm.env_runner.sample(num_timesteps=40)
+    first = [{tuple(chunk.get_observations(0)) for chunk in chunks} for chunks in (fresh, restored)]
+    assert len(first[0]) >= 4
+    assert first[0].isdisjoint(first[1])
+
+
+def test_dqn_fills_its_replay_buffer_again(engine, tmp_path):
+    """Ray does not save it; training on a handful of transitions would undo what was learned."""
+    task = make_task(tmp_path, "dqn", learning_starts=50)
+    weights_after(engine, task, 2)
+    sampled_before = engine.algorithm.local_replay_buffer.get_num_timesteps()
+    assert sampled_before == 120
+    folder = save(engine, tmp_path / "000002")
+    engine.build(task, folder)
+    buffer = engine.algorithm.local_replay_buffer
+    assert 50 <= buffer.get_num_timesteps() <= 60
+    batch = buffer.sample(num_items=16, n_step=1, gamma=0.9, batch_length_T=0, sample_episodes=True)
+    assert len(batch) == 16
+    stats = engine.train_iteration()
+    assert stats.num_env_steps == 180
+    assert "qf_loss" in stats.learner
+    assert buffer.get_num_timesteps() >= 110
+
+
+def test_a_damaged_checkpoint_is_never_a_fresh_start(engine, tmp_path):
+    task = make_task(tmp_path)
+    weights_after(engine, task, 1)
+    folder = save(engine, tmp_path / "000001")
+    (folder / "policy.safetensors").write_bytes(b"")
+    with pytest.raises(CheckpointError):
+        engine.build(task, folder)
+    with pytest.raises(CheckpointError):
+        engine.build(task, tmp_path / "000009")
+
+
+def test_nothing_is_left_of_a_closed_trial(engine, tmp_path):
+    with pytest.raises(RuntimeError, match="build"):
+        engine.algorithm  # noqa: B018
+    engine.close()
+    engine.build(make_task(tmp_path), None)
+    engine.close()
+    engine.close()
+    with pytest.raises(RuntimeError, match="build"):
+        engine.train_iteration()
+
+
+def test_the_policy_is_the_one_that_trains(engine, tmp_path):
+    from policies.restore import learner_weights
+
+    task = make_task(tmp_path)
+    weights_after(engine, task, 1)
+    policy = engine.policy()
+    weights = learner_weights(engine.algorithm)
+    np.testing.assert_array_equal(policy.network.layers[0].weight, weights["encoder.actor_encoder.net.mlp.0.weight"])
+    assert policy.training == {
+        "trial_id": "t0000",
+        "seed": TRIAL_SEED,
+        "hyperparams": task.hyperparams,
+        "iteration": 1,
+    }
+    engine.train_iteration()
+    assert not np.array_equal(engine.policy().network.layers[0].weight, policy.network.layers[0].weight)
+
+
+def test_a_trial_with_env_runners_of_its_own(engine, tmp_path):
+    """Their episodes are told too; and one that dies ends the trial, which RLlib would not."""
+    task = make_task(tmp_path, num_env_runners=1)
+    engine.build(task, None)
+    stats = engine.train_iteration()
+    assert 128 <= stats.num_env_steps < 136
+    assert stats.episodes
+    folder = save(engine, tmp_path / "000001")
+    engine.build(task, folder)
+    assert engine.train_iteration().num_env_steps > stats.num_env_steps
+    import ray
+
+    group = engine.algorithm.env_runner_group
+    for actor in group._worker_manager.actors().values():
+        ray.kill(actor)
+    with pytest.raises((CannotRunError, ray.exceptions.RayError)):
+        engine.train_iteration()
+
+
+def test_a_whole_trial_with_this_engine(engine, tmp_path):
+    """The loop and the engine together; what the loop does is tested without Ray."""
+    task = make_task(tmp_path, stop=StopSpec(num_env_steps=300))
+    progress = run_trial(task, engine)
+    assert (progress.status, progress.iteration) == ("completed", 3)
+    assert progress.num_env_steps >= 300
+    assert [record.iteration for record in progress.checkpoints] == [1, 2, 3]
+    assert all(Path(tmp_path / record.path / "rllib").is_dir() for record in progress.checkpoints)
+    assert progress.evaluation_return is not None
