@@ -21,7 +21,7 @@ import ray
 from ray.exceptions import AuthenticationError, GetTimeoutError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from policies.errors import CannotRunError
+from policies.errors import CannotRunError, TuneJobsError
 from policies.files import write_atomic
 from tune_jobs.address import recorded_cluster
 from tune_jobs.live import quiet
@@ -110,7 +110,7 @@ def _join(address: str) -> None:
                 "host:port is for machines that are nodes of the cluster; others join by ray://HOST:10001.",
             ) from error
     joined = ray.get_runtime_context().gcs_address if address == "auto" else None
-    if joined is not None and "RAY_ADDRESS" not in os.environ and joined != recorded_cluster():
+    if joined is not None and not os.environ.get("RAY_ADDRESS") and joined != recorded_cluster():
         # Ray 2.60 prefers a lone cluster among this machine's processes: another sweep's own, which ends with it.
         ray.shutdown()
         raise CannotRunError(
@@ -208,6 +208,8 @@ def _check_answer(name: str, task: Any, answer: Path, token: str) -> None:
 
 
 def _last_line(error: Exception) -> str:
+    if isinstance(error, TuneJobsError):
+        return error.message
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
 
 

@@ -188,7 +188,12 @@ def _run_trials(
         from tune_jobs.runner import RunJob, run_trials
 
         job = RunJob(store.folder, todo, plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent)
-        with contextlib.suppress(KeyboardInterrupt), connected(address, machine) as connection:
+        # Signals are handled anew once Ray is joined: it sets a handler of its own for SIGTERM, which ends the process.
+        with (
+            contextlib.suppress(KeyboardInterrupt),
+            connected(address, machine) as connection,
+            _stopping_on_signals(store, monitor),
+        ):
             if connection.is_client:
                 from tune_jobs.remote_driver import run_trials_remotely
 

@@ -69,6 +69,9 @@ class SweepMonitor:
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
         self.records[record.trial_id] = record
         now = self._clock()
+        if self._num_env_steps == self._history[0][1]:
+            # Nothing has been sampled here yet: starting Ray and the processes is no part of the rate.
+            self._history.clear()
         self._history.append((now, self._num_env_steps))
         while len(self._history) > 2 and self._history[1][0] < now - _RATE_WINDOW_S:
             self._history.popleft()

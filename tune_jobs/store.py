@@ -8,14 +8,12 @@ writes `sweep.json` and every `trial.json`; the process that trains a trial writ
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -27,8 +25,9 @@ from analysis.records import (
     SweepRecord,
     TrialRecord,
 )
-from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.files import sha256_file, write_atomic
+from tune_jobs.locks import held
 
 MANIFEST = "manifest.json"
 _RecordT = TypeVar("_RecordT", bound=BaseModel)
@@ -243,6 +242,7 @@ class SweepStore:
         self._stop_path = self.folder / ".stop"
         self._lock_path = self.folder / ".lock"
         self._driver_lock_path = self.folder / ".driver-lock"
+        self._made: list[Path] = []
 
     @property
     def name(self) -> str:
@@ -254,19 +254,34 @@ class SweepStore:
         return self.record_path.is_file()
 
     def create(self) -> None:
-        """Make the folder.
+        """Make the folder; of several processes that want the same name, one gets it.
 
         Raises:
+            SpecError: It is there already.
             CannotRunError: The storage folder cannot be written.
         """
+        root = self.folder.parent
+        self._made = [folder for folder in (root, *root.parents) if not folder.exists()]
         try:
-            (self.folder / "trials").mkdir(parents=True, exist_ok=True)
+            root.mkdir(parents=True, exist_ok=True)
+            try:
+                self.folder.mkdir()
+            except FileExistsError as error:
+                raise name_taken(self.folder) from error
+            (self.folder / "trials").mkdir()
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
             raise CannotRunError(
-                f"The storage folder {self.folder.parent} cannot be written: {reason}.",
+                f"The storage folder {root} cannot be written: {reason}.",
                 "Choose another with --storage, or set TUNE_JOBS_STORAGE.",
             ) from error
+
+    def discard(self) -> None:
+        """Undo `create`: remove the folder, and the folders above it that it made."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            for folder in self._made:
+                folder.rmdir()
 
     def read_record(self) -> SweepRecord:
         """sweep.json.
@@ -345,7 +360,7 @@ class SweepStore:
             CannotRunError: Another process holds it, or runs the sweep on a cluster.
         """
         watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
-        with self._held(self._lock_path, f"Sweep {self.name} is being run by another process.", watch):
+        with held(self._lock_path, f"Sweep {self.name} is being run by another process.", watch):
             with self.driver_lock():
                 pass
             yield
@@ -358,30 +373,16 @@ class SweepStore:
             CannotRunError: Such a process still runs.
         """
         message = f"Sweep {self.name} is still being run on a cluster, for a process that is gone."
-        with self._held(self._driver_lock_path, message, "Try again in a minute: the cluster is ending it."):
+        with held(self._driver_lock_path, message, "Try again in a minute: the cluster is ending it."):
             yield
 
-    @contextlib.contextmanager
-    def _held(self, path: Path, message: str, hint: str) -> Iterator[None]:
-        with self._open_lock(path) as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES):
-                    raise CannotRunError(message, hint) from error
-                raise CannotRunError(
-                    f"{path} cannot be locked: {error.strerror}.", "Choose storage whose file system has locks."
-                ) from error
-            yield
 
-    def _open_lock(self, path: Path) -> IO[Any]:
-        try:
-            return path.open("a")
-        except OSError as error:
-            raise CannotRunError(
-                f"The sweep folder {self.folder} cannot be written: {error.strerror}.",
-                "Check its permissions.",
-            ) from error
+def name_taken(folder: Path) -> SpecError:
+    """The error for a new sweep whose folder is there already."""
+    return SpecError(
+        f"A sweep {folder.name!r} is already in {folder.parent}.",
+        f"Choose another name with --name, or go on with it: `tune-jobs resume {folder.name}`.",
+    )
 
 
 def list_sweep_stores(storage: Path) -> list[SweepStore]:

@@ -7,7 +7,6 @@ one that another process runs. A sweep is named by its folder, or by its name in
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from tune_jobs.driving import SweepResult, check_same_trials, connected, pending
 from tune_jobs.plan import Machine, local_machine, make_plan
 from tune_jobs.spec import SweepSpec, check_sweep_name
 from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore, list_sweep_stores
+from tune_jobs.store import SweepStore, list_sweep_stores, name_taken
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,7 +91,7 @@ def launch(
             write_new(store, spec, plan, address)
         except BaseException:
             stack.pop_all().close()
-            shutil.rmtree(store.folder, ignore_errors=True)
+            store.discard()
             raise
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
@@ -393,10 +392,7 @@ def _new_store(spec: SweepSpec, source: Source, name: str | None, storage: str |
     if chosen is not None:
         store = SweepStore(root / check_sweep_name(chosen))
         if store.folder.exists():
-            raise SpecError(
-                f"A sweep {chosen!r} is already in {root}.",
-                f"Choose another name with --name, or go on with it: `tune-jobs resume {chosen}`.",
-            )
+            raise name_taken(store.folder)
         return store
     stem = Path(source).stem if isinstance(source, str | Path) else "sweep"
     # Only the folder's own creation decides who has a name; this finds one that is likely free.

@@ -290,7 +290,7 @@ def test_what_the_environment_raises_is_raised():
     from policies.rllib_config import build_algorithm_config
 
     config = build_algorithm_config(
-        PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args={"seed": SEED, "at": 5}, seed=SEED
+        PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args={"troubles": {str(SEED): {"how": "raise", "at": 5}}}, seed=SEED
     )
     runner = ArrayEnvRunner(config=config, worker_index=0)
     with pytest.raises(ZeroDivisionError, match="the cart left the track"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from trials import TRIAL_SEED, make_task, run_trial
 
-from policies.errors import CannotRunError, CheckpointError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from tune_jobs.spec import StopSpec
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
@@ -61,12 +61,13 @@ def test_a_trial_is_the_same_again_in_a_warm_process(engine, tmp_path, algorithm
 def test_trials_of_other_seeds_are_other_trials(engine, tmp_path, algorithm):
     first, first_stats = weights_after(engine, make_task(tmp_path, algorithm))
     other, other_stats = weights_after(engine, make_task(tmp_path, algorithm, seed=TRIAL_SEED + 1024))
-    assert not any(np.array_equal(first[name], other[name]) for name in first)
+    drawn = [name for name in first if not name.endswith("_const")]
+    assert not any(np.array_equal(first[name], other[name]) for name in drawn)
     assert first_stats[0].episodes != other_stats[0].episodes
 
 
 def test_iterations_tell_whole_episodes_and_all_env_steps(engine, tmp_path):
-    _, stats = weights_after(engine, make_task(tmp_path), 6)
+    _, stats = weights_after(engine, make_task(tmp_path, grad_clip=5.0), 6)
     steps = [item.num_env_steps for item in stats]
     assert all(128 <= after - before < 128 + 4 for before, after in zip([0, *steps], steps, strict=False))
     episodes = [episode for item in stats for episode in item.episodes]
@@ -98,19 +99,20 @@ def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
     assert same(runner_weights, {name: weights[name] for name in runner_weights})
     assert after.algorithm.iteration == 3
     before, now = stats[-1].num_env_steps, after.train_iteration().num_env_steps
-    # On from there; and env steps that only fill a replay buffer again are no env steps of the trial.
+    # On from there. What DQN sampled to fill its replay buffer again counts as part of the iteration.
     iteration = {"ppo": 128, "dqn": 60}[algorithm]
-    assert iteration <= now - before < 2 * iteration + 4
+    assert iteration <= now - before < iteration + 4
     assert not same(learner_weights(after.algorithm), weights)
     assert after.policy().training["iteration"] == 4
     after.close()
 
 
-def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path):
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path, algorithm):
     """A trial that is retried from a checkpoint goes the same way again; and other ways from other checkpoints."""
     from policies.restore import learner_weights
 
-    task = make_task(tmp_path)
+    task = make_task(tmp_path, algorithm)
     weights_after(engine, task, 1)
     folders = [save(engine, tmp_path / name / "000001") for name in ("a", "b")]
     folders.append(save(engine, tmp_path / "000002"))
@@ -149,9 +151,11 @@ def test_dqn_fills_its_replay_buffer_again(engine, tmp_path):
     batch = buffer.sample(num_items=16, n_step=1, gamma=0.9, batch_length_T=0, sample_episodes=True)
     assert len(batch) == 16
     stats = engine.train_iteration()
-    assert stats.num_env_steps == 180
+    # What was sampled for it counts: an env step is an env step. So this iteration had only a few left to do.
+    assert stats.num_env_steps == sampled_before + buffer.get_num_timesteps() == 180
     assert "qf_loss" in stats.learner
-    assert buffer.get_num_timesteps() >= 110
+    engine.train_iteration()
+    assert buffer.get_num_timesteps() == 120
 
 
 def test_a_damaged_checkpoint_is_never_a_fresh_start(engine, tmp_path):
@@ -161,7 +165,7 @@ def test_a_damaged_checkpoint_is_never_a_fresh_start(engine, tmp_path):
     (folder / "policy.safetensors").write_bytes(b"")
     with pytest.raises(CheckpointError):
         engine.build(task, folder)
-    with pytest.raises(CheckpointError):
+    with pytest.raises(NotFoundError):
         engine.build(task, tmp_path / "000009")
 
 

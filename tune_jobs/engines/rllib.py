@@ -78,6 +78,12 @@ class RLlibEngine:
         # The learner's weights are drawn from these; a warm process has drawn other numbers before.
         torch.manual_seed(task.seed)
         self._algorithm = config.build_algo()
+        self._seed_replay(task.seed)
+
+    def _seed_replay(self, seed: int) -> None:
+        """Let DQN draw its batches from the trial's seed; RLlib's buffers use a generator without one (2.60)."""
+        if isinstance(self._hyperparams, DQNHyperparams):
+            self.algorithm.local_replay_buffer.rng = np.random.default_rng(seed)
 
     def _continue_streams(self, checkpoint: Path) -> None:
         """After a restore: other random numbers than at the trial's start, and a replay buffer with something in it.
@@ -89,6 +95,7 @@ class RLlibEngine:
         words = np.random.SeedSequence([self._task.seed, iteration]).generate_state(2)
         torch.manual_seed(int(words[0]))
         np.random.seed(int(words[0]))  # noqa: NPY002 (RLlib's replay buffers and connectors draw from the global one)
+        self._seed_replay(int(words[0]))
         seed = int(words[1])
 
         def reseed(runner: ArrayEnvRunner) -> None:

@@ -47,29 +47,29 @@ class Ticks(gym.Env):
 
 
 class Trouble(gym.Env):
-    """One-step-memory env whose step raises or hangs in the trial whose seeds begin at `seed`.
+    """A question a step (is the first number positive?), ten steps an episode; in some trials its step goes wrong.
 
     Args:
-        seed: First seed of the trial; None: no trial, all is well.
-        how: `raise`, `hang`, or `exit` (the process dies).
-        at: Step of this environment's life, over all its episodes.
-        marker: File that is made when it happens; where it is there already, all is well.
+        troubles: First seed of a trial, as text -> what happens there: `how` (`raise`, `hang`, or `exit`: the process
+            dies), `at` (which step of this environment's life, over all its episodes) and `marker` (a file that is
+            made when it happens; where it is there already, all is well).
         pause_s: Seconds that every step takes, in any trial.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, *, seed=None, how="raise", at=1, marker=None, pause_s=0.0):
+    def __init__(self, *, troubles=None, pause_s=0.0):
         self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
         self.action_space = gym.spaces.Discrete(2)
-        self.trial_seed, self.how, self.at, self.marker, self.pause_s = seed, how, at, marker, pause_s
-        self.life, self.ticks, self.chosen = 0, 0, False
+        self.troubles, self.pause_s = troubles or {}, pause_s
+        self.trouble = None
+        self.life, self.ticks = 0, 0
         self.state = np.zeros(2, np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        if seed is not None and self.trial_seed is not None:
-            self.chosen = self.trial_seed <= seed < self.trial_seed + SEEDS_PER_TRIAL
+        if seed is not None:
+            self.trouble = self.troubles.get(str(seed - seed % SEEDS_PER_TRIAL))
         self.ticks = 0
         self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
         return self.state, {}
@@ -77,22 +77,22 @@ class Trouble(gym.Env):
     def step(self, action):
         self.life += 1
         self.ticks += 1
-        if self.chosen and self.life >= self.at:
-            self._go_wrong()
+        if self.trouble is not None and self.life >= self.trouble.get("at", 1):
+            self._go_wrong(**self.trouble)
         if self.pause_s:
             time.sleep(self.pause_s)
         reward = float(action == (self.state[0] > 0))
         self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
         return self.state, reward, self.ticks >= 10, False, {}
 
-    def _go_wrong(self):
-        if self.marker is not None:
-            if Path(self.marker).exists():
+    def _go_wrong(self, how, at=1, marker=None):
+        if marker is not None:
+            if Path(marker).exists():
                 return
-            Path(self.marker).touch()
-        if self.how == "raise":
+            Path(marker).touch()
+        if how == "raise":
             raise ZeroDivisionError("the cart left the track")
-        if self.how == "exit":
+        if how == "exit":
             os._exit(1)
         time.sleep(10_000)
 

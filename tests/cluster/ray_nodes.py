@@ -1,0 +1,168 @@
+"""Starts Ray clusters of several nodes on this machine, each node a child process that is ended by its own id."""
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+BIN = Path(sys.executable).parent
+START_TIMEOUT_S = 180
+STOP_TIMEOUT_S = 60
+# The least Ray takes; the weights of these trials are a few kilobytes.
+OBJECT_STORE_BYTES = 100_000_000
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return sock.getsockname()[1]
+
+
+def kill_group(process: subprocess.Popen) -> None:
+    """End a child, which leads a process group of its own, and its children, at once."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait(STOP_TIMEOUT_S)
+
+
+def processes_naming(text: str) -> list[int]:
+    """Ids of the running processes whose command line holds this text."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if folder.name.isdigit() and text.encode() in (folder / "cmdline").read_bytes():
+                found.append(int(folder.name))
+    return found
+
+
+@dataclass
+class Node:
+    name: str
+    process: subprocess.Popen
+    log: Path
+
+    def wait_until_started(self) -> None:
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while "Ray runtime started" not in self.log.read_text():
+            assert self.process.poll() is None, f"node {self.name} ended:\n{self.log.read_text()}"
+            assert time.monotonic() < deadline, f"node {self.name} did not start:\n{self.log.read_text()}"
+            time.sleep(0.1)
+
+    def stop(self) -> None:
+        """As `ray stop` would: the node takes its leave of the cluster."""
+        self.process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(STOP_TIMEOUT_S)
+        kill_group(self.process)
+
+    def crash(self) -> None:
+        """As if its power failed."""
+        kill_group(self.process)
+
+
+class Cluster:
+    """A head with one CPU, and as many other nodes as a test starts; with Ray's token authentication on.
+
+    Args:
+        folder: For logs; the token and Ray's own files lie in a folder with a short name, as sockets' names are.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.temporary = Path(tempfile.mkdtemp(prefix="tj", dir="/tmp"))
+        token = self.temporary / "token"
+        token.touch(mode=0o600)
+        token.write_text(secrets.token_hex(32))
+        self.port, self.client_port = free_port(), free_port()
+        self.address = f"127.0.0.1:{self.port}"
+        self.client_address = f"ray://127.0.0.1:{self.client_port}"
+        self.environment = {
+            **{name: value for name, value in os.environ.items() if not name.startswith("RAY_")},
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN_PATH": str(token),
+            # Where Ray keeps its files, and the address of the cluster that `auto` means.
+            "RAY_TMPDIR": str(self.temporary),
+            "RAY_USAGE_STATS_ENABLED": "0",
+            # A node that is gone is noticed in a few seconds instead of half a minute.
+            "RAY_health_check_initial_delay_ms": "2000",
+            "RAY_health_check_period_ms": "1000",
+            "RAY_health_check_timeout_ms": "8000",
+        }
+        self.nodes: dict[str, Node] = {}
+
+    def start_head(self) -> Node:
+        options = [
+            "--head", f"--port={self.port}", f"--ray-client-server-port={self.client_port}",
+            f"--dashboard-port={free_port()}", "--include-dashboard=false",
+        ]  # fmt: skip
+        return self._start("head", options, 1, (), {})
+
+    def start_worker(self, name: str, *, num_cpus: int = 1, prefix=(), environment=None) -> Node:
+        """Start a node; `prefix` is a command that runs the rest of its arguments."""
+        return self._start(name, [f"--address={self.address}"], num_cpus, prefix, environment or {})
+
+    def _start(self, name, options, num_cpus, prefix, environment) -> Node:
+        log = self.folder / f"{name}.log"
+        command = [
+            *prefix, str(BIN / "ray"), "start", *options, f"--num-cpus={num_cpus}", "--num-gpus=0",
+            f"--resources={json.dumps({name: 1})}", f"--object-store-memory={OBJECT_STORE_BYTES}",
+            f"--dashboard-agent-listen-port={free_port()}", "--disable-usage-stats", "--block",
+        ]  # fmt: skip
+        with log.open("wb") as file:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+                env={**self.environment, **environment}, start_new_session=True,
+            )  # fmt: skip
+        node = self.nodes[name] = Node(name, process, log)
+        node.wait_until_started()
+        return node
+
+    def node_ids(self) -> dict[str, str]:
+        """The id of each node that is alive, by name."""
+        script = (
+            "import json, sys, ray\n"
+            "ray.init(address=sys.argv[1], log_to_driver=False, logging_level='error')\n"
+            "print(json.dumps([[n['NodeID'], list(n['Resources'])] for n in ray.nodes() if n['Alive']]))\n"
+        )
+        done = self.run([sys.executable, "-c", script, self.address])
+        assert done.returncode == 0, done.stderr
+        found = json.loads(done.stdout.splitlines()[-1])
+        return {name: node_id for node_id, resources in found for name in self.nodes if name in resources}
+
+    def run(self, command, *, timeout_s: float = 400, **environment) -> subprocess.CompletedProcess:
+        process = self.begin(command, **environment)
+        try:
+            out, err = process.communicate(timeout=timeout_s)
+        finally:
+            kill_group(process)
+        return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+    def begin(self, command, **environment) -> subprocess.Popen:
+        """Start a command with the cluster's environment, in a folder that holds none of our code."""
+        return subprocess.Popen(
+            [str(part) for part in command], env={**self.environment, **environment}, cwd=self.folder,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            start_new_session=True,
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        """End every node, the head last, and whatever else still names the cluster's folder."""
+        for node in reversed(self.nodes.values()):
+            node.stop()
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        while (left := processes_naming(str(self.temporary))) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        shutil.rmtree(self.temporary, ignore_errors=True)
+        assert not left, f"processes outlived their node and had to be ended: {left}"
