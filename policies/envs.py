@@ -27,6 +27,7 @@ from gymnasium.envs.registration import (
     parse_env_id,
 )
 
+from policies.env_plugins import load_env_plugins
 from policies.errors import EnvError
 from policies.hyperparams import Algorithm
 
@@ -81,19 +82,29 @@ def normalize_env_id(env_id: str) -> str:
             "Install a package that registers the env with Gymnasium (entry point 'gymnasium.envs') and give "
             f"the registered id alone: {env_id.rpartition(':')[2]!r}.",
         )
+    problems: tuple[str, ...] = ()
+    found = _find_registered(env_id)
+    if found is None:
+        problems = load_env_plugins()
+        found = _find_registered(env_id)
+    if found is None:
+        reasons = "".join(f" {problem}" for problem in problems)
+        raise EnvError(
+            f"No environment {env_id!r} is registered with Gymnasium.{_did_you_mean(env_id)}{reasons}",
+            "Correct the id, or install the package that registers it.",
+        )
+    return found
+
+
+def _find_registered(env_id: str) -> str | None:
     if env_id in gym.registry:
         return env_id
     try:
         namespace, name, version = parse_env_id(env_id)
         newest = find_highest_version(namespace, name) if version is None else None
     except gym.error.Error:  # of no form that an id can have
-        newest = None
-    if newest is not None:
-        return get_env_id(namespace, name, newest)
-    raise EnvError(
-        f"No environment {env_id!r} is registered with Gymnasium.{_did_you_mean(env_id)}",
-        "Correct the id, or install the package that registers it.",
-    )
+        return None
+    return None if newest is None else get_env_id(namespace, name, newest)
 
 
 def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algorithm | None = None) -> EnvInfo:

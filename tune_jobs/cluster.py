@@ -32,6 +32,7 @@ from tune_jobs.ray_environment import prepare_environment
 _OBJECT_STORE_BYTES = 256 * 1024**2
 # A node's first process imports torch and RLlib for it, from a disk that may be slow and cold.
 _PROBE_TIMEOUT_S = 180.0
+_MAX_JOIN_ATTEMPTS = 4
 _QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
 
 
@@ -96,7 +97,7 @@ def _join(address: str) -> None:
     with tempfile.NamedTemporaryFile(prefix="tune-jobs-join-") as file:
         try:
             with quiet(Path(file.name)):
-                ray.init(address=address, **_QUIET)
+                _init_patiently(address)
         except Exception as error:
             said = Path(file.name).read_text(encoding="utf-8", errors="replace")
             if "InvalidAuthToken" in said or isinstance(error, AuthenticationError):
@@ -117,6 +118,18 @@ def _join(address: str) -> None:
             f"`auto` found the Ray at {joined}, but `ray start` last joined {recorded_cluster()}.",
             f"Say which with --address, for example --address {recorded_cluster()}.",
         )
+
+
+def _init_patiently(address: str) -> None:
+    for attempt in range(1, _MAX_JOIN_ATTEMPTS + 1):
+        try:
+            ray.init(address=address, **_QUIET)
+            return
+        except ConnectionError as error:
+            # Ray 2.60's client proxy forks a server for each client, and one in twenty dies at once in gRPC's fork
+            # handlers (ray issue 63202), unless the head was started with GRPC_ENABLE_FORK_SUPPORT=0.
+            if "Starting Ray client server failed" not in str(error) or attempt == _MAX_JOIN_ATTEMPTS:
+                raise
 
 
 def _first_line(error: Exception) -> str:

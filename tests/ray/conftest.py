@@ -23,7 +23,7 @@ def env_plugin(tmp_path_factory):
     sys.path[:0] = paths
     import tune_jobs_test_envs
 
-    # Gymnasium has looked for entry points already, when this process imported it.
+    # For RLlib's own runners, which ask Gymnasium itself.
     tune_jobs_test_envs.register()
     yield
     if before is None:

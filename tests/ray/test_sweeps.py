@@ -195,8 +195,8 @@ def test_resuming_a_finished_sweep_changes_no_trial(cartpole):
 
 
 def test_extending_adds_the_new_trials_and_touches_no_other(tmp_path):
-    first = launch(tmp_path, make_spec(num_samples=1, space={"lr": {"loguniform": [1e-3, 1e-2]},
-                                                            "num_epochs": {"grid": [1, 2]}}))  # fmt: skip
+    space = {"lr": {"loguniform": [1e-3, 1e-2]}, "gamma": {"grid": [0.9, 0.99]}}
+    first = launch(tmp_path, make_spec(num_samples=1, space=space))
     assert [trial.trial_id for trial in first.trials] == ["t0000", "t0001"]
     before = snapshot(first.folder / "trials")
     extended = sweeps.extend("mine", 1, storage=tmp_path, progress="none", finish=False)
@@ -240,7 +240,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     assert (result.exit_code, result.sweep.state) == (3, "completed")
     failed = result.trials[1]
     assert failed.error.startswith("ZeroDivisionError: the cart left the track")
-    assert "Traceback" in failed.error
+    # And where, from the end of its log.
     assert "tune_jobs_test_envs.py" in failed.error
     assert failed.ended_at is not None
     assert failed.checkpoints == ()
@@ -343,7 +343,6 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
     for trial in resumed.trials:
         assert_results_without_gaps(store, trial)
         assert store.trial(trial.trial_id).results_path.read_text().startswith(lines.get(trial.trial_id, ""))
-    assert [trial.started_at for trial in resumed.trials[:2]] == [trial.started_at for trial in result.trials[:2]]
     assert resumed.sweep.run_time_s > result.sweep.run_time_s
 
 
@@ -364,7 +363,10 @@ def test_a_killed_sweep_goes_on_from_its_latest_checkpoints(tmp_path):
     eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     status = sweeps.status("mine", storage=tmp_path)
     assert (status.sweep.state, status.alive) == ("interrupted", False)
-    assert "running" in status.counts
+    # It is told as it is, whatever its files still say.
+    assert "running" not in status.counts
+    assert status.counts["paused"] >= 2
+    assert {trial.status for trial in store.read_trials()} == {"running", "pending"}
     # A line that was being written, and a checkpoint that was.
     with store.trial("t0000").results_path.open("a") as file:
         file.write('{"iteration": 99')

@@ -1,0 +1,39 @@
+"""Environments of other installed packages.
+
+A package with environments declares a function that registers them as an entry point of the group `gymnasium.envs`, under
+the name of their namespace, or `__root__` for none. Gymnasium called these functions until 1.0 and calls none since; they
+are called here, when an id is not registered yet, in the process that plans a sweep and in those that run its trials
+alike. An installed package is trusted to run its code; what a sweep file names is not.
+"""
+
+from __future__ import annotations
+
+import functools
+from importlib import metadata
+
+from gymnasium.envs import registration
+
+GROUP = "gymnasium.envs"
+_NO_NAMESPACE = "__root__"
+
+
+@functools.cache
+def load_env_plugins() -> tuple[str, ...]:
+    """Let installed packages register their environments; only the first call does anything.
+
+    Returns:
+        For each package that could not, a sentence that says why.
+    """
+    problems = []
+    for entry_point in metadata.entry_points(group=GROUP):
+        before = registration.current_namespace
+        registration.current_namespace = None if entry_point.name == _NO_NAMESPACE else entry_point.name
+        try:
+            entry_point.load()()
+        except Exception as error:
+            # Its own environments are missing then, and no others.
+            package = entry_point.dist.name if entry_point.dist is not None else entry_point.value
+            problems.append(f"The package {package} could not register its own: {type(error).__name__}: {error}.")
+        finally:
+            registration.current_namespace = before
+    return tuple(problems)

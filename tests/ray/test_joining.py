@@ -1,0 +1,67 @@
+"""What `tune_jobs.cluster` and `tune_jobs.address` take for granted about Ray, and work around."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.ray
+
+FORK_FAILURE = "Initialization failure from server:\nRuntimeError: Starting Ray client server failed. See the log."
+
+
+def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path, monkeypatch):
+    import ray._common.utils
+
+    from tune_jobs.address import recorded_cluster
+
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    path = Path(ray._common.utils.get_ray_address_file(None))
+    path.parent.mkdir(parents=True)
+    path.write_text("192.0.2.7:6379")
+    assert recorded_cluster() == "192.0.2.7:6379"
+
+
+@pytest.mark.parametrize(("error", "attempts"), [(FORK_FAILURE, 3), ("ray client connection timeout", 1)])
+def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(monkeypatch, error, attempts):
+    from tune_jobs import cluster
+
+    asked = []
+
+    def init(address, **_):
+        asked.append(address)
+        if len(asked) < 3:
+            raise ConnectionAbortedError(error)
+
+    monkeypatch.setattr(cluster.ray, "init", init)
+    if attempts == 1:
+        with pytest.raises(ConnectionAbortedError):
+            cluster._init_patiently("ray://host:10001")
+    else:
+        cluster._init_patiently("ray://host:10001")
+    assert asked == ["ray://host:10001"] * attempts
+
+
+def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch):
+    from policies.errors import CannotRunError
+    from tune_jobs import cluster
+
+    def init(address, **_):
+        raise ConnectionAbortedError(FORK_FAILURE)
+
+    monkeypatch.setattr(cluster.ray, "init", init)
+    with pytest.raises(CannotRunError, match="cannot be joined: Initialization failure from server"):
+        cluster._join("ray://host:10001")
+
+
+def test_a_refused_token_is_named(monkeypatch):
+    from policies.errors import CannotRunError
+    from tune_jobs import cluster
+
+    def init(address, **_):
+        os.write(2, b"W gcs_client.cc:210: Failed to get cluster ID: InvalidAuthToken: token is missing or incorrect\n")
+        raise ConnectionError("Failed to connect")
+
+    monkeypatch.setattr(cluster.ray, "init", init)
+    with pytest.raises(CannotRunError, match="does not accept this machine's token"):
+        cluster._join("host:6379")

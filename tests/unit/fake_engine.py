@@ -1,0 +1,108 @@
+"""A training engine that does as a script says, and an evaluator to go with it: seconds of trials in no time."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+from policy_factory import make_portable
+
+from policies.errors import CheckpointError
+from policies.evaluate import Episodes
+from policies.portable import Layer, PolicyNetwork, read_policy
+from tune_jobs.engines.protocol import IterationStats, TrialTask
+from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+
+
+class FakeEngine:
+    """Iteration i gives `episodes(i)`; its policy's bias is i, or NaN from `nan_from` on.
+
+    Args:
+        episodes: Iteration -> returns of the whole episodes that end in it.
+        steps: Env steps an iteration.
+        nan_from: First iteration whose weights are not finite.
+        raise_at: Iteration that raises.
+    """
+
+    def __init__(self, episodes=lambda iteration: (20.0,), *, steps=100, nan_from=None, raise_at=None):
+        self.episodes, self.steps, self.nan_from, self.raise_at = episodes, steps, nan_from, raise_at
+        self.iteration = 0
+        self.builds = []
+
+    def build(self, task, checkpoint):
+        self.builds.append(None if checkpoint is None else checkpoint.name)
+        self.iteration = 0
+        if checkpoint is not None:
+            self.iteration = json.loads((checkpoint / "engine.json").read_text())["iteration"]
+            if read_policy(checkpoint).training["iteration"] != self.iteration:
+                raise CheckpointError("Engine and policy of the checkpoint differ.")
+
+    def train_iteration(self):
+        self.iteration += 1
+        if self.iteration == self.raise_at:
+            raise ZeroDivisionError("the cart left the track")
+        returns = self.episodes(self.iteration)
+        return IterationStats(
+            num_env_steps=self.iteration * self.steps,
+            episodes=tuple((value, 7) for value in returns),
+            learner={"total_loss": 1.0 / self.iteration},
+        )
+
+    def policy(self):
+        portable = make_portable("CartPole-v1", hidden=(2,))
+        nan = self.nan_from is not None and self.iteration >= self.nan_from
+        *layers, last = portable.network.layers
+        last = Layer(last.weight, np.full(2, np.nan if nan else self.iteration, np.float32), last.activation)
+        return dataclasses.replace(
+            portable,
+            network=PolicyNetwork(portable.network.kind, (*layers, last)),
+            training={"iteration": self.iteration},
+        )
+
+    def save(self, folder):
+        (folder / "rllib").mkdir()
+        (folder / "engine.json").write_text(json.dumps({"iteration": self.iteration}))
+
+    def close(self):
+        pass
+
+
+class FakeEvaluator:
+    """Gives the policy of iteration i the mean return `scores(i)`, from two episodes of different returns."""
+
+    def __init__(self, scores=float):
+        self.scores = scores
+        self.evaluated = []
+
+    def run(self, policy):
+        policy.check_finite()  # as the real one
+        iteration = round(float(policy.portable.network.layers[-1].bias[0]))
+        self.evaluated.append(iteration)
+        score = self.scores(iteration)
+        return Episodes((1, 2), (score - 1.0, score + 1.0), (5, 5))
+
+
+class FakeClock:
+    """Seconds that pass only by command, or so many at each look."""
+
+    def __init__(self, step=0.0):
+        self.now, self.step = 1_000.0, step
+
+    def __call__(self):
+        self.now += self.step
+        return self.now
+
+
+def make_task(folder: Path, **changes):
+    """A trial that nothing stops for 100 iterations; evaluated at each, with a checkpoint at every tenth."""
+    sections = {"stop": StopSpec, "evaluation": EvaluationSpec, "checkpoints": CheckpointSpec}
+    values = {
+        "stop": {"num_iterations": 100},
+        "evaluation": {"every_iterations": 1},
+        "checkpoints": {"every_iterations": 10, "keep": 2},
+    } | changes
+    values = {name: sections[name](**value) if name in sections else value for name, value in values.items()}
+    return TrialTask(
+        sweep_folder=folder, trial_id="t0000", seed=1024, algorithm="ppo", hyperparams={}, env_id="CartPole-v1",
+        env_args={}, evaluation_seeds=(1, 2), **values,
+    )  # fmt: skip

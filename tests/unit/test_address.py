@@ -1,0 +1,89 @@
+import socket
+
+import pytest
+from click.testing import CliRunner
+
+from policies.errors import CannotRunError, SpecError
+from tune_jobs.address import check_address, recorded_cluster
+from tune_jobs.cli import cli
+
+
+@pytest.fixture
+def ray_folder(tmp_path, monkeypatch):
+    """A machine of which Ray knows nothing."""
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    (tmp_path / "ray").mkdir()
+    return tmp_path / "ray"
+
+
+@pytest.fixture
+def listener():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()[1]
+
+
+@pytest.fixture
+def dead_port():
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        # Bound and not listening: refused, and nobody else can take it meanwhile.
+        yield sock.getsockname()[1]
+
+
+def test_an_address_where_something_listens_passes(ray_folder, listener, monkeypatch):
+    check_address(f"127.0.0.1:{listener}")
+    check_address(f"ray://127.0.0.1:{listener}")
+    (ray_folder / "ray_current_cluster").write_text(f"127.0.0.1:{listener}\n")
+    assert recorded_cluster() == f"127.0.0.1:{listener}"
+    check_address("auto")
+    (ray_folder / "ray_current_cluster").unlink()
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{listener}")
+    check_address("auto")
+
+
+@pytest.mark.parametrize("form", ["127.0.0.1:{}", "ray://127.0.0.1:{}"])
+def test_a_dead_address_is_refused(dead_port, form):
+    address = form.format(dead_port)
+    with pytest.raises(CannotRunError, match="No Ray cluster answers at") as caught:
+        check_address(address)
+    assert address in caught.value.message
+    assert "Connection refused" in caught.value.message
+
+
+def test_an_unknown_host_is_refused():
+    with pytest.raises(CannotRunError, match=r"No Ray cluster answers at no-such-host\.invalid:6379"):
+        check_address("no-such-host.invalid:6379")
+
+
+def test_auto_names_where_a_dead_address_comes_from(ray_folder, dead_port, monkeypatch):
+    record = ray_folder / "ray_current_cluster"
+    record.write_text(f"127.0.0.1:{dead_port}")
+    with pytest.raises(CannotRunError, match=str(record)):
+        check_address("auto")
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{dead_port}")
+    with pytest.raises(CannotRunError, match="from RAY_ADDRESS"):
+        check_address("auto")
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["", "localhost", "host:", ":6379", "host:port", "host:99999", "http://host:8265", "ray://", "ray://[::1"],
+)
+def test_what_is_no_address_is_a_wrong_argument(ray_folder, address):
+    with pytest.raises(SpecError, match="is not the address of a Ray cluster"):
+        check_address(address)
+
+
+def test_launching_without_a_cluster_starts_and_writes_nothing(ray_folder, tmp_path, dead_port):
+    storage = tmp_path / "sweeps"
+    for address, message in [
+        ("auto", "No Ray cluster is known on this machine"),
+        (f"127.0.0.1:{dead_port}", "No Ray cluster answers"),
+        (f"ray://127.0.0.1:{dead_port}", "No Ray cluster answers"),
+    ]:
+        done = CliRunner().invoke(cli, ["launch", "cartpole-ppo", "--storage", str(storage), "--address", address])
+        assert done.exit_code == 5
+        assert message in done.stderr
+        assert "Traceback" not in done.stderr
+        assert not storage.exists()

@@ -1,0 +1,45 @@
+"""What may be imported where, seen in the modules of a fresh process; import-linter checks the same in the source."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = "import json, sys\n{code}\nprint(json.dumps(sorted(name for name in sys.modules if '.' not in name)))"
+
+
+def modules_after(code):
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(code=code)], capture_output=True, text=True, check=True
+    )
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        # Help, validation and dry runs are instant.
+        ("import tune_jobs.cli", {"ray", "torch", "pandas", "matplotlib"}),
+        ("from tune_jobs.spec_file import load_spec; load_spec('cartpole-ppo')", {"ray", "torch", "pandas", "matplotlib"}),
+        ("import tune_jobs.sweeps", {"ray", "torch", "pandas", "matplotlib"}),
+        # A policy file acts, is evaluated and filmed without Ray and without torch.
+        ("import policies.policy, policies.evaluate, policies.video, policies.portable", {"ray", "torch"}),
+        ("import tune_jobs.finish", {"ray", "torch"}),
+        # The seam between trials and engines.
+        ("import tune_jobs.trial, tune_jobs.engines.protocol, tune_jobs.store, tune_jobs.monitor", {"ray", "torch"}),
+        ("import analysis.records, analysis.selection, analysis.report", {"ray", "torch", "tune_jobs"}),
+        ("import policies.envs, policies.hyperparams, policies.errors, policies.files", {"analysis", "tune_jobs"}),
+    ],
+)
+def test_importing_imports_no_more_than_it_may(code, absent):
+    assert modules_after(code) & absent == set()
+
+
+def test_the_contracts_of_the_source_hold(pytestconfig):
+    pytest.importorskip("importlinter")
+    done = subprocess.run(
+        [sys.executable, "-c", "from importlinter.cli import lint_imports; raise SystemExit(lint_imports())"],
+        capture_output=True, text=True, check=False, cwd=pytestconfig.rootpath,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout

@@ -1,0 +1,166 @@
+"""The numbers behind the live table, with a clock that stands still until it is told."""
+
+import pytest
+from fake_engine import FakeClock
+
+from analysis.records import CheckpointRecord, TrialRecord
+from tune_jobs.monitor import SweepMonitor
+
+
+def make_trial(index, status="pending", *, steps=0, score=None, time_s=0.0, point_index=None):
+    """A trial whose best checkpoint has this score."""
+    trial_id = f"t{index:04d}"
+    checkpoints = ()
+    if score is not None:
+        checkpoints = (
+            CheckpointRecord(
+                trial_id=trial_id, iteration=1, num_env_steps=steps, path="trials/x", evaluation_return=score
+            ),
+        )
+    return TrialRecord(
+        trial_id=trial_id,
+        index=index,
+        point_index=index if point_index is None else point_index,
+        seed=index,
+        point={"lr": 0.001 * (index + 1)},
+        status=status,
+        num_env_steps=steps,
+        time_s=time_s,
+        best_evaluation_return=score,
+        checkpoints=checkpoints,
+    )
+
+
+def make_monitor(*records, clock=None, cap=1_000, max_concurrent=2):
+    return SweepMonitor(
+        "mine", records, max_env_steps_per_trial=cap, max_concurrent=max_concurrent, clock=clock or FakeClock()
+    )
+
+
+def test_trials_are_counted_by_status():
+    monitor = make_monitor(*(make_trial(index) for index in range(4)))
+    assert monitor.counts() == {"pending": 4}
+    monitor.update(make_trial(0, "running"))
+    monitor.update(make_trial(1, "failed"))
+    monitor.update(make_trial(0, "completed"))
+    assert monitor.counts() == {"completed": 1, "failed": 1, "pending": 2}
+
+
+def test_env_steps_are_of_all_trials_whatever_their_order():
+    monitor = make_monitor(make_trial(0, "completed", steps=1_000), make_trial(1))
+    assert monitor.num_env_steps == 1_000
+    monitor.update(make_trial(1, "running", steps=300))
+    monitor.update(make_trial(1, "running", steps=500))
+    assert monitor.num_env_steps == 1_500
+    # A retry goes on from an earlier checkpoint.
+    monitor.update(make_trial(1, "running", steps=200))
+    assert monitor.num_env_steps == 1_200
+
+
+def test_the_best_so_far_is_chosen_by_the_rule_that_will_choose_the_winner():
+    monitor = make_monitor(make_trial(0), make_trial(1), make_trial(2))
+    assert monitor.best() is None
+    monitor.update(make_trial(0, "running", steps=100, score=-5.0))
+    assert (monitor.best().trial.trial_id, monitor.best().score) == ("t0000", -5.0)
+    monitor.update(make_trial(1, "running", steps=100, score=0.0))
+    assert monitor.best().trial.trial_id == "t0001"
+    # It gets better while it runs.
+    monitor.update(make_trial(0, "running", steps=200, score=-0.5))
+    assert [point.score for point in monitor.best().ranking] == [0.0, -0.5]
+    # A failed trial never wins.
+    monitor.update(make_trial(1, "failed", steps=100, score=0.0))
+    assert monitor.best().trial.trial_id == "t0000"
+    monitor.update(make_trial(0, "failed", steps=200, score=-0.5))
+    assert monitor.best() is None
+
+
+def test_the_rate_is_of_the_last_seconds():
+    clock = FakeClock()
+    monitor = make_monitor(make_trial(0), clock=clock, cap=1_000_000)
+    assert monitor.estimate().env_steps_per_s is None
+    for second in range(1, 11):
+        clock.now += 1.0
+        monitor.update(make_trial(0, "running", steps=200 * second))
+    assert monitor.estimate().env_steps_per_s == pytest.approx(200)
+    # Then it gets faster, and half a minute later that is all that counts.
+    for second in range(1, 31):
+        clock.now += 1.0
+        monitor.update(make_trial(0, "running", steps=2_000 + 1_000 * second))
+    assert monitor.estimate().env_steps_per_s == pytest.approx(1_000)
+    # Nothing more comes: the rate falls.
+    clock.now += 60.0
+    assert monitor.estimate().env_steps_per_s < 400
+
+
+def test_the_start_of_ray_is_no_part_of_the_rate():
+    clock = FakeClock()
+    monitor = make_monitor(make_trial(0), clock=clock, cap=1_000_000)
+    for _ in range(6):
+        clock.now += 2.0
+        monitor.update(make_trial(0, "running"))
+    clock.now += 1.0
+    monitor.update(make_trial(0, "running", steps=500))
+    assert monitor.estimate().env_steps_per_s == pytest.approx(500)
+
+
+def test_steps_of_an_earlier_run_are_no_part_of_the_rate():
+    clock = FakeClock()
+    monitor = make_monitor(make_trial(0, "paused", steps=50_000), clock=clock, cap=1_000_000)
+    clock.now += 1.0
+    monitor.update(make_trial(0, "running", steps=50_300))
+    assert monitor.estimate().env_steps_per_s == pytest.approx(300)
+    assert monitor.num_env_steps == 50_300
+
+
+def test_time_left_is_what_ended_trials_took():
+    """Two at once; those that ended took 10 s each. 4 s of one are done, four have not begun."""
+    clock = FakeClock()
+    monitor = make_monitor(*(make_trial(index) for index in range(7)), clock=clock)
+    clock.now += 10.0
+    monitor.update(make_trial(0, "completed", steps=1_000, time_s=8.0))
+    monitor.update(make_trial(1, "completed", steps=400, time_s=12.0))
+    monitor.update(make_trial(2, "running", steps=10, time_s=4.0))
+    assert monitor.estimate().time_left_s == pytest.approx((6.0 + 4 * 10.0) / 2)
+    # One that runs longer than the others took is about to end, and is no time won.
+    monitor.update(make_trial(2, "running", steps=10, time_s=30.0))
+    assert monitor.estimate().time_left_s == pytest.approx(4 * 10.0 / 2)
+
+
+def test_the_last_trials_run_side_by_side_only_as_far_as_there_are_any():
+    monitor = make_monitor(*(make_trial(index) for index in range(2)), max_concurrent=8)
+    monitor.update(make_trial(0, "completed", steps=1_000, time_s=10.0))
+    monitor.update(make_trial(1, "running", steps=10, time_s=4.0))
+    assert monitor.estimate().time_left_s == pytest.approx(6.0)
+
+
+def test_before_a_trial_has_ended_time_left_is_what_the_caps_allow():
+    clock = FakeClock()
+    monitor = make_monitor(*(make_trial(index) for index in range(3)), clock=clock)
+    assert monitor.estimate().time_left_s is None
+    clock.now += 1.0
+    monitor.update(make_trial(0, "running", steps=100))
+    clock.now += 1.0
+    monitor.update(make_trial(0, "running", steps=200))
+    rate = monitor.estimate().env_steps_per_s
+    assert rate == pytest.approx(100)
+    assert monitor.estimate().time_left_s == pytest.approx((800 + 1_000 + 1_000) / rate)
+
+
+def test_trials_that_failed_or_ended_before_tell_nothing_of_the_time():
+    """A trial that was ended early, or in an earlier run on another machine, is not how long a trial takes."""
+    monitor = make_monitor(make_trial(0, "completed", steps=1_000, time_s=500.0), make_trial(1), make_trial(2))
+    monitor.update(make_trial(1, "failed", steps=10, time_s=1.0))
+    assert monitor.estimate().time_left_s is None
+
+
+def test_a_sweep_that_is_done_has_no_time_left():
+    monitor = make_monitor(make_trial(0))
+    monitor.update(make_trial(0, "stopped", steps=10, time_s=1.0))
+    assert monitor.estimate().time_left_s == 0.0
+
+
+def test_elapsed_time_is_the_clocks():
+    clock = FakeClock()
+    monitor = make_monitor(make_trial(0), clock=clock)
+    clock.now += 12.5
+    assert monitor.elapsed_s == 12.5

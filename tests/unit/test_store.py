@@ -1,0 +1,362 @@
+"""The sweep folder: files are whole or not there, damage is found, and one process at a time drives a sweep."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from analysis.records import (
+    FORMAT_VERSION,
+    BestRecord,
+    CheckpointRecord,
+    EvaluationRecord,
+    IterationRecord,
+    SweepRecord,
+    TrialRecord,
+)
+from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
+from tune_jobs.store import SweepStore, TrialStore, list_sweep_stores, read_manifest, verify_checkpoint
+
+
+def make_sweep(**changes):
+    values = {"name": "mine", "state": "running", "spec": {"a": 1}, "evaluation_seeds": (1, 2), "num_trials": 2,
+              "confirmation_seeds": (3,), "created_at": 5.0}  # fmt: skip
+    return SweepRecord(**values | changes)
+
+
+def make_trial(index=0, **changes):
+    values = {"trial_id": f"t{index:04d}", "index": index, "point_index": index, "seed": index, "point": {"lr": 0.1}}
+    return TrialRecord(**values | changes)
+
+
+def make_iteration(number, **changes):
+    return IterationRecord(iteration=number, num_env_steps=100 * number, num_episodes=number, time_s=number, **changes)
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = SweepStore(tmp_path / "storage" / "mine")
+    store.create()
+    return store
+
+
+@pytest.fixture
+def trial(store):
+    return store.trial("t0000")
+
+
+def write_checkpoint(trial, iteration=3, files=None, **scores):
+    record = CheckpointRecord(
+        trial_id=trial.trial_id,
+        iteration=iteration,
+        num_env_steps=100 * iteration,
+        path=trial.checkpoint_path(iteration),
+        **scores,
+    )
+
+    def write(folder):
+        for name, content in (files or {"policy.json": "{}", "rllib/state.pkl": "abc"}).items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(content)
+
+    trial.write_checkpoint(record, write)
+    return record, trial.sweep_folder / record.path
+
+
+# -- records
+
+
+def test_records_come_back_as_they_were(store, trial):
+    sweep = make_sweep(run_time_s=0.0, git_commit="abc")
+    store.write_record(sweep)
+    assert store.read_record() == sweep
+    record = make_trial(
+        status="failed", error="no\nroom", evaluation_return=0.0, checkpoints=(
+            CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=2, path="p", evaluation_return=-1.0),
+        ),
+    )  # fmt: skip
+    trial.write_record(record)
+    assert trial.read_record() == record
+    evaluation = EvaluationRecord(policy="p", env_id="E-v0", seeds=(1,), returns=(0.0,), lengths=(3,))
+    best = BestRecord(
+        checkpoint=record.checkpoints[0], point={}, seed=0, selection_score=-1.0, confirmation=evaluation,
+        random=evaluation,
+    )  # fmt: skip
+    store.write_best(best)
+    assert store.read_best() == best
+
+
+def test_a_score_that_is_no_number_is_written_as_none(trial):
+    trial.write_record(make_trial(evaluation_return=float("nan"), training_return=float("inf")))
+    assert json.loads(trial.record_path.read_text())["evaluation_return"] is None
+    assert trial.read_record().training_return is None
+
+
+def test_trials_are_read_by_index(store):
+    for index in (10, 2, 0):
+        store.trial(f"t{index:04d}").write_record(make_trial(index))
+    # A folder that a killed process had just made is no trial yet.
+    store.trial("t0003").folder.mkdir()
+    assert [record.index for record in store.read_trials()] == [0, 2, 10]
+    assert SweepStore(store.folder.parent / "other").read_trials() == []
+
+
+def test_what_is_not_there_is_not_found(store, trial, tmp_path):
+    for read in (store.read_record, trial.read_record, store.read_best):
+        with pytest.raises(NotFoundError):
+            read()
+    assert not store.exists()
+    assert trial.read_iterations() == []
+    assert trial.checkpoints() == []
+    assert trial.log_tail() == ""
+    assert list_sweep_stores(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ('{"name": "mi', "cannot be read"),
+        ("[]", "not a valid"),
+        ('{"name": "mine"}', "not a valid"),
+        (b"\xff\xfe\x00", "cannot be read"),
+        (json.dumps({"format_version": FORMAT_VERSION + 1}), "Upgrade"),
+    ],
+)
+def test_a_damaged_record_is_an_error_that_names_the_file(store, content, what):
+    store.record_path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(CheckpointError, match=what) as raised:
+        store.read_record()
+    assert str(store.record_path) in raised.value.message
+    assert raised.value.exit_code == 4
+
+
+def test_what_a_newer_version_added_is_ignored(store):
+    """Within a format version, fields may be added."""
+    data = json.loads(make_sweep().model_dump_json()) | {"mood": "good"}
+    store.record_path.write_text(json.dumps(data))
+    assert store.read_record() == make_sweep()
+
+
+def test_sweeps_are_listed_by_name(tmp_path):
+    for name in ("b", "a"):
+        store = SweepStore(tmp_path / name)
+        store.create()
+        store.write_record(make_sweep(name=name))
+    SweepStore(tmp_path / "half").create()
+    (tmp_path / "file").write_text("")
+    assert [store.name for store in list_sweep_stores(tmp_path)] == ["a", "b"]
+
+
+# -- results
+
+
+def test_results_are_appended_and_replaced(trial):
+    trial.keep_iterations([])
+    trial.append_iterations([make_iteration(1), make_iteration(2, evaluation_return=0.0, learner={"lr": 1e-4})])
+    trial.append_iterations([])
+    trial.append_iterations([make_iteration(3, episode_returns=(1.5, -2.0), episode_lengths=(4, 5))])
+    records = trial.read_iterations()
+    assert [record.iteration for record in records] == [1, 2, 3]
+    assert (records[1].evaluation_return, records[1].learner) == (0.0, {"lr": 1e-4})
+    assert records[2].episode_returns == (1.5, -2.0)
+    trial.keep_iterations(records[:2])
+    assert trial.read_iterations() == records[:2]
+    trial.append_iterations([make_iteration(3)])
+    assert [record.iteration for record in trial.read_iterations()] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("torn", ['{"iteration": 2', '{"iteration": 2, "num_env_steps": 5}', ""])
+def test_a_last_line_without_its_end_is_not_read(trial, torn):
+    """Whole JSON or not: its newline was not written, so nothing says that it is complete."""
+    trial.keep_iterations([make_iteration(1)])
+    with trial.results_path.open("a") as file:
+        file.write(torn)
+    assert [record.iteration for record in trial.read_iterations()] == [1]
+
+
+def test_a_damaged_line_within_is_an_error_with_its_number(trial):
+    trial.keep_iterations([make_iteration(1)])
+    with trial.results_path.open("a") as file:
+        file.write('{"iteration": "x"}\n')
+    trial.append_iterations([make_iteration(3)])
+    with pytest.raises(CheckpointError, match="line 2"):
+        trial.read_iterations()
+
+
+# -- checkpoints
+
+
+def test_a_checkpoint_has_a_manifest_of_every_file(trial):
+    record, folder = write_checkpoint(trial, 3, evaluation_return=0.0)
+    assert folder == trial.checkpoints_folder / "000003"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(manifest["files"]) == {"policy.json", "rllib/state.pkl"}
+    assert manifest["files"]["rllib/state.pkl"] == {
+        "bytes": 3,
+        "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad",
+    }
+    assert read_manifest(folder) == verify_checkpoint(folder) == record
+    assert record.evaluation_return == 0.0
+    assert trial.checkpoints() == [record]
+
+
+def test_checkpoints_are_listed_oldest_first(trial):
+    for iteration in (900, 1_000_001, 20):
+        write_checkpoint(trial, iteration)
+    assert [record.iteration for record in trial.checkpoints()] == [20, 900, 1_000_001]
+
+
+def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial):
+    def fails(folder):
+        (folder / "half").write_text("x")
+        raise OSError(28, "No space left on device")
+
+    record, _ = write_checkpoint(trial, 3)
+    with pytest.raises(OSError, match="No space"):
+        trial.write_checkpoint(record.model_copy(update={"iteration": 4, "path": trial.checkpoint_path(4)}), fails)
+    assert [path.name for path in trial.checkpoints_folder.iterdir()] == ["000003"]
+    # Nor where it would replace one.
+    with pytest.raises(OSError, match="No space"):
+        trial.write_checkpoint(record, fails)
+    verify_checkpoint(trial.checkpoints_folder / "000003")
+
+
+def test_while_a_checkpoint_is_written_readers_do_not_see_it(trial):
+    seen = []
+    record = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1, path=trial.checkpoint_path(1))
+    trial.write_checkpoint(record, lambda folder: seen.append((trial.checkpoints(), folder.is_dir())))
+    assert seen == [([], True)]
+    assert trial.checkpoints() == [record]
+
+
+def test_a_checkpoint_written_anew_replaces_the_old_one(trial):
+    write_checkpoint(trial, 3, {"old": "1"}, evaluation_return=1.0)
+    record, folder = write_checkpoint(trial, 3, {"new": "2"}, evaluation_return=2.0)
+    assert trial.checkpoints() == [record]
+    assert {path.name for path in folder.iterdir()} == {"new", "manifest.json"}
+    assert len(list(trial.checkpoints_folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("damage", "what"),
+    [
+        (lambda path: path.write_text("abd"), "SHA-256"),
+        (lambda path: path.write_text("abcd"), "SHA-256"),
+        (lambda path: path.write_text(""), "SHA-256"),
+        (lambda path: path.unlink(), "lacks the file"),
+    ],
+)
+def test_a_changed_file_is_found(trial, damage, what):
+    _, folder = write_checkpoint(trial)
+    damage(folder / "rllib" / "state.pkl")
+    with pytest.raises(CheckpointError, match=what) as raised:
+        verify_checkpoint(folder)
+    assert "rllib/state.pkl" in raised.value.message
+    assert str(folder) in raised.value.message
+
+
+def test_a_checkpoint_without_a_manifest_is_none(trial):
+    _, folder = write_checkpoint(trial)
+    (folder / "manifest.json").unlink()
+    with pytest.raises(CheckpointError, match=r"no manifest\.json"):
+        verify_checkpoint(folder)
+    with pytest.raises(NotFoundError, match="No checkpoint folder"):
+        verify_checkpoint(folder.with_name("000009"))
+
+
+def test_deleted_checkpoints_and_leftovers_are_gone(trial):
+    first, _ = write_checkpoint(trial, 1)
+    second, _ = write_checkpoint(trial, 2)
+    trial.delete_checkpoint(first)
+    assert trial.checkpoints() == [second]
+    (trial.checkpoints_folder / ".000003.77").mkdir()
+    (trial.checkpoints_folder / ".000001.deleted").mkdir()
+    trial.remove_leftovers()
+    assert [path.name for path in trial.checkpoints_folder.iterdir()] == ["000002"]
+    TrialStore(trial.sweep_folder, "t0009").remove_leftovers()
+
+
+# -- logs
+
+
+def test_the_end_of_a_log_is_its_last_lines(trial):
+    trial.folder.mkdir(parents=True)
+    trial.log_path.write_bytes(b"".join(b"line %d\n" % number for number in range(100_000)))
+    assert trial.log_tail(2) == "line 99998\nline 99999"
+    trial.log_path.write_bytes(b"caf\xe9 \xff\n")
+    assert "caf" in trial.log_tail()
+
+
+# -- the folder and its lock
+
+
+def test_of_two_that_want_a_name_one_gets_it(store):
+    with pytest.raises(SpecError, match="already"):
+        SweepStore(store.folder).create()
+
+
+def test_a_storage_folder_that_cannot_be_written_is_an_error_and_nothing_is_left(tmp_path):
+    (tmp_path / "file").write_text("")
+    store = SweepStore(tmp_path / "file" / "mine")
+    with pytest.raises(CannotRunError, match="cannot be written") as raised:
+        store.create()
+    assert "--storage" in raised.value.hint
+    assert raised.value.exit_code == 5
+
+
+def test_a_discarded_sweep_leaves_only_what_was_there_before(tmp_path):
+    (tmp_path / "old").mkdir()
+    store = SweepStore(tmp_path / "old" / "new" / "newer" / "mine")
+    store.create()
+    store.write_record(make_sweep())
+    store.discard()
+    assert [path.name for path in tmp_path.rglob("*")] == ["old"]
+
+
+def test_a_relative_folder_is_made_absolute(tmp_path, monkeypatch):
+    """Trap: Ray answers "URI has empty scheme" to a relative one."""
+    monkeypatch.chdir(tmp_path)
+    from pathlib import Path
+
+    assert SweepStore(Path("sweeps/mine")).folder == tmp_path / "sweeps" / "mine"
+
+
+def test_a_stop_is_asked_for_and_forgotten(store):
+    assert not store.stop_requested()
+    store.clear_stop_request()
+    store.request_stop()
+    store.request_stop()
+    assert store.stop_requested()
+    store.clear_stop_request()
+    assert not store.stop_requested()
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from tune_jobs.store import SweepStore
+with SweepStore(Path(sys.argv[1])).lock():
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_one_process_at_a_time_drives_a_sweep_and_a_killed_one_no_longer_does(store):
+    assert not store.is_driven()
+    arguments = [sys.executable, "-c", HOLDER, str(store.folder)]
+    with subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "held\n"
+        assert store.is_driven()
+        with pytest.raises(CannotRunError, match="another process") as raised, store.lock():
+            pass
+        assert "tune-jobs status mine" in raised.value.hint
+        os.kill(process.pid, 9)
+        process.wait()
+    assert not store.is_driven()
+    with store.lock():
+        assert store.is_driven()
+    # Looking does not take it.
+    with store.lock():
+        pass
