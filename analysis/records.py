@@ -105,9 +105,7 @@ class EvaluationRecord(_Record):
     env_id: str
     env_args: dict[str, Any] = Field(default_factory=dict)
     seeds: tuple[int, ...]
-    returns: tuple[float, ...] = Field(
-        description="Undiscounted return of each episode, in the order of seeds."
-    )
+    returns: tuple[float, ...] = Field(description="Undiscounted return of each episode, in the order of seeds.")
     lengths: tuple[int, ...] = Field(description="Env steps of each episode.")
     threshold: float | None = Field(None, description="The env's reward threshold; None if it has none.")
 

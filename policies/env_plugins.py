@@ -1,9 +1,9 @@
 """Environments of other installed packages.
 
-A package with environments declares a function that registers them as an entry point of the group `gymnasium.envs`, under
-the name of their namespace, or `__root__` for none. Gymnasium called these functions until 1.0 and calls none since; they
-are called here, when an id is not registered yet, in the process that plans a sweep and in those that run its trials
-alike. An installed package is trusted to run its code; what a sweep file names is not.
+A package with environments declares a function that registers them as an entry point of the group `gymnasium.envs`,
+under the name of their namespace, or `__root__` for none. Gymnasium called these functions until 1.0 and calls none
+since; they are called here, when an id is not registered yet, in the process that plans a sweep and in those that run
+its trials alike. An installed package is trusted to run its code; what a sweep file names is not.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ def load_env_plugins() -> tuple[str, ...]:
         registration.current_namespace = None if entry_point.name == _NO_NAMESPACE else entry_point.name
         try:
             entry_point.load()()
-        except Exception as error:
-            # Its own environments are missing then, and no others.
+        except Exception as error:  # noqa: BLE001 (its own environments are missing then, and no others)
             package = entry_point.dist.name if entry_point.dist is not None else entry_point.value
             problems.append(f"The package {package} could not register its own: {type(error).__name__}: {error}.")
         finally:

@@ -186,9 +186,7 @@ def make_vector_env(
     try:
         if _takes_vector_entry_point(spec, kwargs):
             return gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
-        return gym.make_vec(
-            spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True, **kwargs
-        )
+        return gym.make_vec(spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True, **kwargs)
     except Exception as error:  # an env's constructor may raise anything
         raise _cannot_make(spec.id, env_args, error) from error
 
@@ -222,8 +220,7 @@ def _check_args(spec: EnvSpec, env_args: dict[str, Any]) -> None:
     for name, value in env_args.items():
         if name in _RESERVED_ARGS:
             raise EnvError(
-                f"The env argument {name!r} (value {value!r}) cannot be set: it is chosen where the env is "
-                "used.",
+                f"The env argument {name!r} (value {value!r}) cannot be set: it is chosen where the env is used.",
                 f"Remove {name!r} from the env's arguments.",
             )
         if name not in known and not takes_any:
@@ -270,9 +267,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: Excepti
         # gymnasium[box2d] asks for a source build; this wheel holds the same module.
         return EnvError(message, "Install it, on every machine that runs trials: pip install Box2D==2.3.10")
     if isinstance(error, (ImportError, gym.error.DependencyNotInstalled)):
-        return EnvError(
-            message, "Install the package that the message names, on every machine that runs trials."
-        )
+        return EnvError(message, "Install the package that the message names, on every machine that runs trials.")
     return EnvError(message, "Check the env's arguments against its documentation.")
 
 
@@ -289,8 +284,7 @@ def _check_reset(env: gym.Env[Any, Any], info: EnvInfo) -> None:
         ) from error
     if shape != info.observation_space.shape:
         raise EnvError(
-            f"{info.env_id} returns observations of shape {shape} but declares "
-            f"{info.observation_space.shape}.",
+            f"{info.env_id} returns observations of shape {shape} but declares {info.observation_space.shape}.",
             "Mend the env: its observations must be of the shape of its observation_space.",
         )
 
@@ -311,8 +305,7 @@ def _check_observation_space(info: EnvInfo) -> None:
         )
     if not np.issubdtype(space.dtype, np.floating):
         raise EnvError(
-            f"{info.env_id} has observations of dtype {space.dtype}; only floating-point observations are "
-            "supported.",
+            f"{info.env_id} has observations of dtype {space.dtype}; only floating-point observations are supported.",
             "Register a variant of the env that returns float32 observations, scaled to about [-1, 1].",
         )
 
@@ -329,8 +322,7 @@ def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
         )
     if algorithm == "dqn":
         raise EnvError(
-            f"DQN cannot train on {info.env_id}: its actions are continuous ({space}), and DQN needs "
-            "Discrete ones.",
+            f"DQN cannot train on {info.env_id}: its actions are continuous ({space}), and DQN needs Discrete ones.",
             "Use 'algorithm: ppo', or an env with Discrete actions.",
         )
     if len(space.shape) != 1 or space.shape[0] == 0 or not np.issubdtype(space.dtype, np.floating):

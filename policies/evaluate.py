@@ -158,9 +158,7 @@ def evaluate_policy(
         return evaluator.run(policy)
 
 
-def play_episode(
-    policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int
-) -> tuple[float, int]:
+def play_episode(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int) -> tuple[float, int]:
     """One greedy episode in one environment: its return and its env steps.
 
     Args and errors are those of `episode_steps`.
@@ -216,8 +214,7 @@ def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
         if not same:
             env_id = env.spec.id if env.spec is not None else "this env"
             raise EnvError(
-                f"The policy is for {policy.env_id}, whose {what} are {ours}; those of {env_id} are "
-                f"{theirs}.",
+                f"The policy is for {policy.env_id}, whose {what} are {ours}; those of {env_id} are {theirs}.",
                 f"Use it with {policy.env_id}.",
             )
 
@@ -246,9 +243,7 @@ def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
         limit = None if env.spec is None else env.spec.max_episode_steps
         return MAX_EPISODE_STEPS if limit is None else limit
     if max_episode_steps < 1:
-        raise EnvError(
-            f"The cap on episode steps is {max_episode_steps}.", "Use a cap of 1 or more, or none."
-        )
+        raise EnvError(f"The cap on episode steps is {max_episode_steps}.", "Use a cap of 1 or more, or none.")
     return max_episode_steps
 
 

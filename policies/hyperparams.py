@@ -35,9 +35,7 @@ class _Hyperparams(BaseModel):
     grad_clip: PositiveFloat | None = Field(
         None, description="Clip the gradient's global L2 norm at this; null: no clipping."
     )
-    num_envs: PositiveInt = Field(
-        8, le=512, description="Sub-environments that one env runner steps at once."
-    )
+    num_envs: PositiveInt = Field(8, le=512, description="Sub-environments that one env runner steps at once.")
 
 
 class PPOHyperparams(_Hyperparams):
@@ -57,9 +55,7 @@ class PPOHyperparams(_Hyperparams):
     kl_coeff: NonNegativeFloat = Field(0.2, description="First weight of the KL penalty, if used.")
     kl_target: PositiveFloat = Field(0.01, description="KL divergence the penalty aims at, if used.")
     train_batch_size: PositiveInt = Field(1024, description="Env steps an iteration, over all env runners.")
-    minibatch_size: PositiveInt = Field(
-        256, description="Env steps a gradient step; at most train_batch_size."
-    )
+    minibatch_size: PositiveInt = Field(256, description="Env steps a gradient step; at most train_batch_size.")
     num_epochs: PositiveInt = Field(6, description="Passes over each train batch.")
 
     @model_validator(mode="after")
@@ -77,9 +73,7 @@ class DQNHyperparams(_Hyperparams):
 
     activation: Activation = Field("relu", description="Activation after each hidden layer.")
     lr: PositiveFloat = Field(5e-4, description="Adam's learning rate, > 0.")
-    num_envs: PositiveInt = Field(
-        1, le=512, description="Sub-environments that one env runner steps at once."
-    )
+    num_envs: PositiveInt = Field(1, le=512, description="Sub-environments that one env runner steps at once.")
     train_batch_size: PositiveInt = Field(32, description="Transitions an update.")
     env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps an iteration, at least.")
     training_intensity: PositiveFloat | None = Field(
@@ -97,9 +91,7 @@ class DQNHyperparams(_Hyperparams):
     prioritized_replay: bool = Field(False, description="Prioritized instead of uniform replay.")
     epsilon_initial: Fraction = Field(1.0, description="Share of random actions at the start.")
     epsilon_final: Fraction = Field(0.05, description="Share of random actions at the end.")
-    epsilon_decay_steps: PositiveInt = Field(
-        10_000, description="Env steps from the first share to the last."
-    )
+    epsilon_decay_steps: PositiveInt = Field(10_000, description="Env steps from the first share to the last.")
 
     @model_validator(mode="after")
     def _buffer_holds_a_batch(self) -> Self:
@@ -112,7 +104,7 @@ class DQNHyperparams(_Hyperparams):
 
 
 Hyperparams = PPOHyperparams | DQNHyperparams
-HYPERPARAMS_BY_ALGORITHM: dict[str, type[PPOHyperparams] | type[DQNHyperparams]] = {
+HYPERPARAMS_BY_ALGORITHM: dict[str, type[PPOHyperparams | DQNHyperparams]] = {
     "ppo": PPOHyperparams,
     "dqn": DQNHyperparams,
 }

@@ -20,9 +20,7 @@ from policies.errors import CannotRunError
 from policies.files import atomic_path, write_atomic
 
 GIF_MAX_BYTES = 3_000_000
-_GIF_MAX_FPS = (
-    25.0  # GIF delays are whole hundredths of a second, and many viewers slow down those below 3 of them
-)
+_GIF_MAX_FPS = 25.0  # GIF delays are whole hundredths of a second, and many viewers slow down those below 3 of them
 _GIF_MAX_FRAMES = 500
 _GIF_COLORS = 128
 # (share of the size, one frame in so many): tried in turn until the GIF is small enough.
@@ -73,7 +71,7 @@ class Mp4Writer:
         if self._process is None:
             self._process = self._start(picture.size)
         data = picture.convert("RGB").tobytes()
-        assert self._process.stdin is not None  # noqa: S101  (it was started with a pipe)
+        assert self._process.stdin is not None
         try:
             for _ in range(times):
                 self._process.stdin.write(data)
@@ -119,10 +117,8 @@ class Mp4Writer:
 
     def _finish(self) -> None:
         if self._process is None:
-            raise CannotRunError(
-                f"There is no picture to write to {self._path}.", "Record at least one episode."
-            )
-        assert self._process.stdin is not None  # noqa: S101
+            raise CannotRunError(f"There is no picture to write to {self._path}.", "Record at least one episode.")
+        assert self._process.stdin is not None
         try:
             self._process.stdin.close()
         except OSError as error:
@@ -185,9 +181,7 @@ class GifWriter:
             CannotRunError: There is no picture, or the file cannot be written.
         """
         if not self._frames:
-            raise CannotRunError(
-                f"There is no picture to write to {self._path}.", "Record at least one episode."
-            )
+            raise CannotRunError(f"There is no picture to write to {self._path}.", "Record at least one episode.")
         data = b""
         for scale, step in _GIF_ATTEMPTS:
             data = self._encode(scale, step)

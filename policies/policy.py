@@ -96,9 +96,7 @@ class Policy(ABC):
         if not single:
             return actions
         return (
-            int(actions[0])
-            if isinstance(self.action_space, gym.spaces.Discrete)
-            else cast("NDArray[Any]", actions[0])
+            int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", actions[0])
         )
 
     @abstractmethod
@@ -140,8 +138,7 @@ class NetworkPolicy(Policy):
             count = sum(int(array.size - np.isfinite(array).sum()) for array in (layer.weight, layer.bias))
             if count:
                 raise NonFiniteWeightsError(
-                    f"The policy {self.description!r} has {count} weights that are NaN or infinite in layer "
-                    f"{index}.",
+                    f"The policy {self.description!r} has {count} weights that are NaN or infinite in layer {index}.",
                     "Lower the learning rate, or set grad_clip.",
                 )
 
@@ -188,24 +185,18 @@ class RandomPolicy(Policy):
     ) -> None:
         # A copy: a space has one generator, and the env's own must not be touched.
         own_space = _copy_space(action_space)
-        super().__init__(
-            observation_space, own_space, env_id=env_id, env_args=env_args, description="random policy"
-        )
+        super().__init__(observation_space, own_space, env_id=env_id, env_args=env_args, description="random policy")
         self.reset(seed)
 
     @classmethod
-    def for_env(
-        cls, env_id: str, env_args: Mapping[str, Any] | None = None, *, seed: int = 0
-    ) -> RandomPolicy:
+    def for_env(cls, env_id: str, env_args: Mapping[str, Any] | None = None, *, seed: int = 0) -> RandomPolicy:
         """A random policy for an environment.
 
         Raises:
             EnvError: The environment cannot be made, or its spaces are not supported.
         """
         info = check_env(env_id, env_args)
-        return cls(
-            info.observation_space, info.action_space, env_id=info.env_id, env_args=info.env_args, seed=seed
-        )
+        return cls(info.observation_space, info.action_space, env_id=info.env_id, env_args=info.env_args, seed=seed)
 
     def reset(self, seed: int) -> None:
         """Start again from a seed: the same seed gives the same actions."""
@@ -251,9 +242,7 @@ def _copy_space(space: gym.Space[Any]) -> gym.Space[Any]:
         return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
     if isinstance(space, gym.spaces.Discrete):
         return gym.spaces.Discrete(int(space.n), start=int(space.start))
-    raise TuneJobsError(
-        f"Actions of kind {type(space).__name__} are not supported.", "Use Box or Discrete actions."
-    )
+    raise TuneJobsError(f"Actions of kind {type(space).__name__} are not supported.", "Use Box or Discrete actions.")
 
 
 def _action_function(
@@ -266,9 +255,7 @@ def _action_function(
     low, high, dtype = action_space.low, action_space.high, action_space.dtype
     size = math.prod(action_space.shape)
     transform = portable.action_transform
-    if transform == "unsquash" and not (
-        np.all(action_space.bounded_below) and np.all(action_space.bounded_above)
-    ):
+    if transform == "unsquash" and not (np.all(action_space.bounded_below) and np.all(action_space.bounded_above)):
         transform = "none"
 
     def to_actions(outputs: NDArray[np.float32]) -> NDArray[Any]:

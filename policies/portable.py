@@ -106,9 +106,7 @@ def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | g
             return gym.spaces.Discrete(int(description["n"]), start=int(description.get("start", 0)))
         if description["type"] == "box":
             dtype = np.dtype(description["dtype"])
-            low, high = (
-                np.array(_numbers_from_json(description[key]), dtype=dtype) for key in ("low", "high")
-            )
+            low, high = (np.array(_numbers_from_json(description[key]), dtype=dtype) for key in ("low", "high"))
             shape = tuple(int(size) for size in description["shape"])
             return gym.spaces.Box(low.reshape(shape), high.reshape(shape), shape, dtype.type)
     except (KeyError, TypeError, ValueError, AssertionError) as error:
@@ -161,9 +159,7 @@ def save_policy(policy: PortablePolicy, folder: Path, stem: str = "policy") -> P
         "training": policy.training,
     }
     write_atomic(folder / f"{stem}.safetensors", weights)
-    write_atomic(
-        folder / f"{stem}.json", json.dumps(_jsonable(description), indent=2, allow_nan=False) + "\n"
-    )
+    write_atomic(folder / f"{stem}.json", json.dumps(_jsonable(description), indent=2, allow_nan=False) + "\n")
     return folder / f"{stem}.json"
 
 
@@ -192,8 +188,7 @@ def read_policy(path: Path) -> PortablePolicy:
     version = description["format_version"]
     if version != FORMAT_VERSION:
         raise CheckpointError(
-            f"The policy file {json_path} has format version {version!r}; this tune-jobs reads "
-            f"{FORMAT_VERSION}.",
+            f"The policy file {json_path} has format version {version!r}; this tune-jobs reads {FORMAT_VERSION}.",
             "Update tune-jobs, or write the policy file again from its checkpoint.",
         )
     digest = hashlib.sha256(weights).hexdigest()
@@ -213,9 +208,7 @@ def _locate(path: Path) -> tuple[Path, Path]:
         path = path / "policy.json"
     elif path.suffix not in {".json", ".safetensors"}:
         if not path.exists():
-            raise NotFoundError(
-                f"There is no policy file {path}.", "Give a policy.json, or the folder that holds one."
-            )
+            raise NotFoundError(f"There is no policy file {path}.", "Give a policy.json, or the folder that holds one.")
         raise CheckpointError(
             f"{path} is not a policy file: its name ends in neither .json nor .safetensors.",
             "Give a policy.json, or the folder that holds one.",
@@ -283,17 +276,11 @@ def _check(policy: PortablePolicy, place: str) -> None:
         problem = f"a network of kind {kind!r} gives no actions of type {policy.action_space['type']!r}"
     else:
         num_actions = (
-            2 * math.prod(action_space.shape)
-            if isinstance(action_space, gym.spaces.Box)
-            else int(action_space.n)
+            2 * math.prod(action_space.shape) if isinstance(action_space, gym.spaces.Box) else int(action_space.n)
         )
-        problem = _layers_problem(
-            policy.network.layers, math.prod(observation_space.shape or ()), num_actions
-        )
+        problem = _layers_problem(policy.network.layers, math.prod(observation_space.shape or ()), num_actions)
     if problem:
-        raise CheckpointError(
-            f"Wrong {place}: {problem}.", "Write the policy file again from its checkpoint."
-        )
+        raise CheckpointError(f"Wrong {place}: {problem}.", "Write the policy file again from its checkpoint.")
 
 
 def _layers_problem(layers: tuple[Layer, ...], num_inputs: int, num_outputs: int) -> str:
@@ -310,9 +297,7 @@ def _layers_problem(layers: tuple[Layer, ...], num_inputs: int, num_outputs: int
         size = weight.shape[0]
     if not layers:
         return "the network has no layers"
-    return (
-        "" if size == num_outputs else f"the network has {size} outputs, but its actions need {num_outputs}"
-    )
+    return "" if size == num_outputs else f"the network has {size} outputs, but its actions need {num_outputs}"
 
 
 def _numbers_to_json(value: Any) -> Any:

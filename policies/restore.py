@@ -32,9 +32,7 @@ Weights = Mapping[str, NDArray[Any]]
 _RESTORE_HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
 
 
-def network_from_weights(
-    weights: Weights, hyperparams: Hyperparams, action_space: gym.Space[Any]
-) -> PolicyNetwork:
+def network_from_weights(weights: Weights, hyperparams: Hyperparams, action_space: gym.Space[Any]) -> PolicyNetwork:
     """The greedy part of an RLlib module's weights as a chain of layers.
 
     Args:
@@ -133,9 +131,7 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     try:
         algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
     except Exception as error:
-        raise CheckpointError(
-            f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT
-        ) from error
+        raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
     if expected is not None:
         try:
             check_weights(algorithm, expected)
@@ -156,9 +152,7 @@ def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
     if runner is not None and runner.module is not None:
         sources["env runner"] = runner.module.get_state()
     for source, weights in sources.items():
-        held = {
-            array.tobytes() for array in (np.asarray(value, dtype=np.float32) for value in weights.values())
-        }
+        held = {array.tobytes() for array in (np.asarray(value, dtype=np.float32) for value in weights.values())}
         for number, layer in enumerate(expected.layers):
             if layer.weight.tobytes() not in held or layer.bias.tobytes() not in held:
                 raise CheckpointError(

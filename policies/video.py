@@ -145,9 +145,7 @@ def record_side_by_side(
                 film.add(panels, last=all(panel.over for panel in panels))
             ends.append(panels)
     results = [
-        Episodes(
-            filmed, tuple(panels[side].total for panels in ends), tuple(panels[side].steps for panels in ends)
-        )
+        Episodes(filmed, tuple(panels[side].total for panels in ends), tuple(panels[side].steps for panels in ends))
         for side in (0, 1)
     ]
     return results[0], results[1]
@@ -248,8 +246,7 @@ def _make_drawable_env(env_id: str, env_args: Mapping[str, Any] | None) -> gym.E
         plain.close()  # type: ignore[no-untyped-call]
         if "rgb_array" not in modes:
             raise EnvError(
-                f"{env_id} cannot be filmed: it has no render mode 'rgb_array' (it has: "
-                f"{', '.join(modes) or 'none'}).",
+                f"{env_id} cannot be filmed: it has no render mode 'rgb_array' (it has: {', '.join(modes) or 'none'}).",
                 "Evaluate it without a video, or add the render mode to the env.",
             )
         return make_env(env_id, env_args, render_mode="rgb_array")
@@ -294,9 +291,7 @@ def _captioned(panel: _Panel, scale: float) -> Image.Image:
     for label, number, colour in (("return", total, _TEXT), ("step", str(panel.steps), _DIM)):
         draw.text((right, middle), f"{label} {number}", font=font, fill=colour, anchor="rm")
         right -= max(draw.textlength(f"{label} {digits}", font) for digits in ("000", number)) + pad
-    draw.text(
-        (pad, middle), _shorten(panel.title, draw, font, right - pad), font=font, fill=_TEXT, anchor="lm"
-    )
+    draw.text((pad, middle), _shorten(panel.title, draw, font, right - pad), font=font, fill=_TEXT, anchor="lm")
     return picture
 
 

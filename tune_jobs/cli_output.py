@@ -151,6 +151,8 @@ def _plan_table(trials: Sequence[TrialPlan]) -> Table:
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
     """Print what a launch, resume or extend came to, and where everything lies."""
     at = "" if storage is None else f" --storage {shlex.quote(storage)}"
+    if result.sweep.address is not None:
+        at += f" --address {shlex.quote(result.sweep.address)}"
     how_to_resume = f"tune-jobs resume {shlex.quote(result.sweep.name)}{at}"
     if as_json:
         print_json({**to_json(result), "exit_code": result.exit_code})

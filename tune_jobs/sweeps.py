@@ -15,11 +15,19 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.records import BestRecord, EvaluationRecord, SweepRecord, TrialRecord
 from policies.errors import SpecError
-from tune_jobs.driving import SweepResult, check_same_trials, connected, pending_record, run_sweep, write_new
+from tune_jobs.driving import (
+    SweepResult,
+    check_same_trials,
+    choose_store,
+    connected,
+    pending_record,
+    run_sweep,
+    write_new,
+)
 from tune_jobs.plan import Machine, local_machine, make_plan
-from tune_jobs.spec import SweepSpec, check_sweep_name
+from tune_jobs.spec import SweepSpec
 from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore, list_sweep_stores, name_taken
+from tune_jobs.store import SweepStore, list_sweep_stores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,8 +80,11 @@ def launch(
         SpecError: The sweep is wrong, or its name is taken. Nothing was written.
         CannotRunError: It cannot run here. Nothing was written.
     """
+    from tune_jobs.finish import storage_folder
+
     spec = _load(source, overrides)
-    store = _new_store(spec, source, name, storage)
+    stem = Path(source).stem if isinstance(source, str | Path) else "sweep"
+    store = choose_store(name if name is not None else spec.name, stem, storage_folder(storage))
     # Here and not only on the cluster's machine, so that a bad env or point is known before Ray starts.
     machine = local_machine() if address is None else None
     plan = make_plan(spec, machine) if machine is not None else None
@@ -382,21 +393,3 @@ def _load(source: Source, overrides: Sequence[str]) -> SweepSpec:
     if isinstance(source, SweepSpec):
         source = source.model_dump(mode="json")
     return load_spec(source, overrides)
-
-
-def _new_store(spec: SweepSpec, source: Source, name: str | None, storage: str | Path | None) -> SweepStore:
-    from tune_jobs.finish import storage_folder
-
-    root = storage_folder(storage)
-    chosen = name if name is not None else spec.name
-    if chosen is not None:
-        store = SweepStore(root / check_sweep_name(chosen))
-        if store.folder.exists():
-            raise name_taken(store.folder)
-        return store
-    stem = Path(source).stem if isinstance(source, str | Path) else "sweep"
-    # Only the folder's own creation decides who has a name; this finds one that is likely free.
-    number = 1
-    while (root / (candidate := stem if number == 1 else f"{stem}-{number}")).exists():
-        number += 1
-    return SweepStore(root / check_sweep_name(candidate))

@@ -6,6 +6,7 @@ Run it on a machine that does nothing else.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import platform
 import statistics
@@ -40,7 +41,7 @@ def trial_gaps(folder: Path) -> list[float]:
     gaps = []
     for spans in by_process.values():
         spans.sort()
-        gaps += [later[0] - earlier[1] for earlier, later in zip(spans, spans[1:], strict=False)]
+        gaps += [later[0] - earlier[1] for earlier, later in itertools.pairwise(spans)]
     return gaps
 
 

@@ -1,7 +1,7 @@
 """Training reaches the returns it should, over several training seeds.
 
-Each policy is the trial's best checkpoint by the sweep's own rule, evaluated on 100 episodes whose seeds no training and
-no selection has used. The median over training seeds is asserted: a single unlucky seed of PPO or DQN is normal.
+Each policy is the trial's best checkpoint by the sweep's own rule, evaluated on 100 episodes whose seeds no training
+and no selection has used. The median over training seeds is asserted: a single unlucky seed of PPO or DQN is normal.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def median_return(spec: dict[str, Any], storage: Path) -> float:
 
 
 def test_ppo_solves_cartpole(ray_session: None, tmp_path: Path) -> None:
-    # 195 over 100 episodes is CartPole-v0's own threshold. 50,000 env steps are what the tutorial's sweep gives a trial.
+    # 195 over 100 episodes is CartPole-v0's own threshold; 50,000 env steps are what the tutorial's sweep gives one.
     spec = {
         "env": "CartPole-v0",
         "algorithm": "ppo",
@@ -42,7 +42,7 @@ def test_ppo_solves_cartpole(ray_session: None, tmp_path: Path) -> None:
 
 
 def test_ppo_learns_pendulum(ray_session: None, tmp_path: Path) -> None:
-    # Continuous actions. Random play returns about -1,200; swinging up and holding it from most starts, -400 or better.
+    # Continuous actions. Random play returns about -1,200; swinging up and holding it from most starts, -400 or more.
     spec = {
         "env": "Pendulum-v1",
         "algorithm": "ppo",

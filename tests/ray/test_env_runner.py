@@ -88,11 +88,11 @@ def assert_equal_episodes(ours, theirs):
     } | {key: (ours.extra_model_outputs[key], theirs.extra_model_outputs[key]) for key in ours.extra_model_outputs}
     for name, (mine, other) in pairs.items():
         assert mine.lookback == other.lookback, name
-        mine, other = np.asarray(mine.data), np.asarray(other.data)
-        assert mine.shape == other.shape, name
+        rows, other_rows = np.asarray(mine.data), np.asarray(other.data)
+        assert rows.shape == other_rows.shape, name
         # RLlib turns discrete actions into int32 on the way; the learner takes any whole numbers.
-        assert mine.dtype == other.dtype or (mine.dtype, other.dtype) == (np.int64, np.int32), name
-        np.testing.assert_array_equal(mine, other, err_msg=name)
+        assert rows.dtype == other_rows.dtype or (rows.dtype, other_rows.dtype) == (np.int64, np.int32), name
+        np.testing.assert_array_equal(rows, other_rows, err_msg=name)
     assert len(ours.infos.data) == len(theirs.infos.data)
 
 
@@ -289,9 +289,8 @@ def test_what_the_environment_raises_is_raised():
     from policies.env_runner import ArrayEnvRunner
     from policies.rllib_config import build_algorithm_config
 
-    config = build_algorithm_config(
-        PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args={"troubles": {str(SEED): {"how": "raise", "at": 5}}}, seed=SEED
-    )
+    env_args = {"troubles": {str(SEED): {"how": "raise", "at": 5}}}
+    config = build_algorithm_config(PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args=env_args, seed=SEED)
     runner = ArrayEnvRunner(config=config, worker_index=0)
     with pytest.raises(ZeroDivisionError, match="the cart left the track"):
         runner.sample(num_timesteps=40, explore=True)

@@ -181,9 +181,7 @@ def ppo_loss(algo, hyperparams):
     }
     with torch.no_grad():
         out = module.forward_train(batch)
-        theirs = learner.compute_loss_for_module(
-            module_id=MODULE, config=loss_config(algo), batch=batch, fwd_out=out
-        )
+        theirs = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=batch, fwd_out=out)
         now = torch.distributions.Categorical(logits=out["action_dist_inputs"])
         then = torch.distributions.Categorical(logits=batch["action_dist_inputs"])
         ratio = torch.exp(now.log_prob(batch["actions"]) - batch["action_logp"])
@@ -569,9 +567,7 @@ def test_resources_are_what_the_plan_counts(num_env_runners):
     from policies.rllib_config import build_algorithm_config
 
     for hyperparams in (PPOHyperparams(), DQNHyperparams()):
-        config = build_algorithm_config(
-            hyperparams, env_id="CartPole-v1", seed=0, num_env_runners=num_env_runners
-        )
+        config = build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=0, num_env_runners=num_env_runners)
         assert (config.num_env_runners, config.num_learners, config.num_cpus_for_main_process) == (
             num_env_runners,
             0,

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from trials import TRIAL_SEED, make_task, run_trial
 
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
@@ -129,10 +130,14 @@ def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path, algorithm):
 def test_a_restored_trial_does_not_see_its_first_episodes_again(engine, tmp_path):
     task = make_task(tmp_path)
     engine.build(task, None)
+    drawn = [torch.rand(3)]
     folder = save(engine, tmp_path / "000001")
     fresh = engine.algorithm.env_runner.sample(num_timesteps=40)
     engine.build(task, folder)
+    drawn.append(torch.rand(3))
     restored = engine.algorithm.env_runner.sample(num_timesteps=40)
+    # Nor does it explore by the same numbers.
+    assert not torch.equal(*drawn)
     first = [{tuple(chunk.get_observations(0)) for chunk in chunks} for chunks in (fresh, restored)]
     assert len(first[0]) >= 4
     assert first[0].isdisjoint(first[1])

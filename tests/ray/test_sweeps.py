@@ -1,11 +1,10 @@
-"""Whole sweeps through the Python API, tiny ones: what they leave, and what happens when something goes wrong."""
+"""Whole sweeps through the Python API, tiny ones: what they leave, and what happens when something goes wrong.
+
+Sweeps whose process is killed are in test_interruption.py.
+"""
 
 import itertools
-import json
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -344,47 +343,6 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
         assert_results_without_gaps(store, trial)
         assert store.trial(trial.trial_id).results_path.read_text().startswith(lines.get(trial.trial_id, ""))
     assert resumed.sweep.run_time_s > result.sweep.run_time_s
-
-
-def test_a_killed_sweep_goes_on_from_its_latest_checkpoints(tmp_path):
-    """kill -9 of the process that drives it; its Ray and its trials die with it."""
-    spec = tmp_path / "mine.yaml"
-    spec.write_text(json.dumps(slow_spec()))
-    code = "import sys; from tune_jobs import sweeps; sweeps.launch(sys.argv[1], storage=sys.argv[2], progress='none')"
-    process = subprocess.Popen([sys.executable, "-c", code, str(spec), str(tmp_path)], start_new_session=True)
-    store = SweepStore(tmp_path / "mine")
-    try:
-        eventually(lambda: has_checkpoints(tmp_path, num_trials=2) or process.poll() is not None)
-        assert process.poll() is None
-        pids = {trial.pid for trial in store.read_trials()} - {None}
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
-    status = sweeps.status("mine", storage=tmp_path)
-    assert (status.sweep.state, status.alive) == ("interrupted", False)
-    # It is told as it is, whatever its files still say.
-    assert "running" not in status.counts
-    assert status.counts["paused"] >= 2
-    assert {trial.status for trial in store.read_trials()} == {"running", "pending"}
-    # A line that was being written, and a checkpoint that was.
-    with store.trial("t0000").results_path.open("a") as file:
-        file.write('{"iteration": 99')
-    (store.trial("t0000").checkpoints_folder / ".000099.1").mkdir()
-    latest = {name: store.trial(name).checkpoints()[-1].iteration for name in ("t0000", "t0001")}
-    known = {name: store.trial(name).read_iterations() for name in latest}
-
-    goal = max(len(records) for records in known.values()) + 2
-    shorten(store, goal)
-    resumed = sweeps.resume("mine", storage=tmp_path, progress="none", finish=False)
-    assert [(trial.status, trial.num_iterations) for trial in resumed.trials] == [("completed", goal)] * 3
-    for trial in resumed.trials:
-        assert_results_without_gaps(store, trial)
-        assert trial.num_failures == 0
-    for name, iteration in latest.items():
-        assert iteration > 0
-        assert store.trial(name).read_iterations()[:iteration] == known[name][:iteration]
-    assert not list(store.trial("t0000").checkpoints_folder.glob(".*"))
 
 
 def test_a_changed_sweep_is_not_gone_on_with(tmp_path):

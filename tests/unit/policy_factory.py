@@ -25,9 +25,7 @@ def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algor
         weight = rng.normal(size=(num_out, num_in)) / np.sqrt(num_in)
         bias = 0.1 * rng.normal(size=num_out)
         last = index == len(sizes) - 2
-        layers.append(
-            Layer(weight.astype(np.float32), bias.astype(np.float32), "linear" if last else activation)
-        )
+        layers.append(Layer(weight.astype(np.float32), bias.astype(np.float32), "linear" if last else activation))
     kind = "gaussian" if not discrete else "q_values" if algorithm == "dqn" else "categorical"
     return PortablePolicy(
         network=PolicyNetwork(kind, tuple(layers)),
@@ -119,9 +117,7 @@ class Pushes(gym.Env):
 
     def __init__(self):
         self.observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
-        self.action_space = gym.spaces.Box(
-            np.array([-1.0, -np.inf], np.float32), np.array([1.0, np.inf], np.float32)
-        )
+        self.action_space = gym.spaces.Box(np.array([-1.0, -np.inf], np.float32), np.array([1.0, np.inf], np.float32))
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

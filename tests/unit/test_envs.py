@@ -18,9 +18,7 @@ register_test_envs()
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize(
-    ("env_id", "steps", "threshold"), [("CartPole-v0", 200, 195.0), ("CartPole-v1", 500, 475.0)]
-)
+@pytest.mark.parametrize(("env_id", "steps", "threshold"), [("CartPole-v0", 200, 195.0), ("CartPole-v1", 500, 475.0)])
 def test_both_cartpoles_are_known_without_a_word(env_id, steps, threshold, capfd):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -102,9 +100,7 @@ def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp
 
 
 def test_an_unknown_argument_names_the_nearest_and_all():
-    with pytest.raises(
-        EnvError, match=r"no argument 'sutton_barto' .*Did you mean 'sutton_barto_reward'"
-    ) as caught:
+    with pytest.raises(EnvError, match=r"no argument 'sutton_barto' .*Did you mean 'sutton_barto_reward'") as caught:
         check_env("CartPole-v1", {"sutton_barto": True}, None)
     assert "max_episode_steps" in caught.value.hint
 

@@ -84,10 +84,7 @@ def test_an_episode_depends_on_its_seed_alone(env_id, monkeypatch):
     assert whole == by_hand(policy, env_id, seeds, 60)
     back = evaluate_policy(policy, env_id=env_id, seeds=seeds[::-1], max_episode_steps=60)
     assert (back.returns[::-1], back.lengths[::-1]) == (whole.returns, whole.lengths)
-    alone = [
-        evaluate_policy(policy, env_id=env_id, seeds=[seed], max_episode_steps=60).returns[0]
-        for seed in seeds
-    ]
+    alone = [evaluate_policy(policy, env_id=env_id, seeds=[seed], max_episode_steps=60).returns[0] for seed in seeds]
     assert tuple(alone) == whole.returns
 
 
@@ -124,10 +121,7 @@ def test_a_random_policy_repeats_itself(env_id):
     first = evaluate_policy(policy, env_id=env_id, seeds=range(6))
     policy.act(np.zeros(policy.observation_space.shape))
     assert evaluate_policy(policy, env_id=env_id, seeds=range(6)) == first
-    assert (
-        evaluate_policy(RandomPolicy.for_env(env_id), env_id=env_id, seeds=range(3)).returns
-        == first.returns[:3]
-    )
+    assert evaluate_policy(RandomPolicy.for_env(env_id), env_id=env_id, seeds=range(3)).returns == first.returns[:3]
     assert len(set(first.returns)) > 1
 
 

@@ -6,13 +6,12 @@ import sys
 
 import pytest
 
+HEAVY = {"ray", "torch", "pandas", "matplotlib"}
 PROGRAM = "import json, sys\n{code}\nprint(json.dumps(sorted(name for name in sys.modules if '.' not in name)))"
 
 
 def modules_after(code):
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM.format(code=code)], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", PROGRAM.format(code=code)], capture_output=True, text=True, check=True)
     return set(json.loads(done.stdout.splitlines()[-1]))
 
 
@@ -20,9 +19,9 @@ def modules_after(code):
     ("code", "absent"),
     [
         # Help, validation and dry runs are instant.
-        ("import tune_jobs.cli", {"ray", "torch", "pandas", "matplotlib"}),
-        ("from tune_jobs.spec_file import load_spec; load_spec('cartpole-ppo')", {"ray", "torch", "pandas", "matplotlib"}),
-        ("import tune_jobs.sweeps", {"ray", "torch", "pandas", "matplotlib"}),
+        ("import tune_jobs.cli", HEAVY),
+        ("from tune_jobs.spec_file import load_spec; load_spec('cartpole-ppo')", HEAVY),
+        ("import tune_jobs.sweeps", HEAVY),
         # A policy file acts, is evaluated and filmed without Ray and without torch.
         ("import policies.policy, policies.evaluate, policies.video, policies.portable", {"ray", "torch"}),
         ("import tune_jobs.finish", {"ray", "torch"}),

@@ -104,7 +104,8 @@ def test_a_point_without_values_is_named():
 def test_a_line_for_logs_tells_the_same(running):
     line = live.summary_line(running[0])
     assert "\n" not in line
-    for word in ("mine: 1 min 15 s", "2 running", "1 failed", "62,355 env steps", "best 195.2 (t0000: lr 0.001)", "left"):
+    words = ("mine: 1 min 15 s", "2 running", "1 failed", "62,355 env steps", "best 195.2 (t0000: lr 0.001)", "left")
+    for word in words:
         assert word in line
     line = live.summary_line(make_monitor(make_trial(0)))
     assert "best" not in line
@@ -141,8 +142,12 @@ def test_nothing_else_is_on_the_terminal(tmp_path, progress, lines):
 
 
 def test_streams_come_back_after_an_error(tmp_path, capfd):
-    with pytest.raises(ZeroDivisionError), live.shown(make_monitor(make_trial(0)), "none", tmp_path / "driver.log"):
-        os.write(1, b"hidden")
-        raise ZeroDivisionError
+    def fail():
+        with live.shown(make_monitor(make_trial(0)), "none", tmp_path / "driver.log"):
+            os.write(1, b"hidden")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     os.write(1, b"seen")
     assert capfd.readouterr().out == "seen"

@@ -79,9 +79,7 @@ def test_a_trial_ends_after_so_many_seconds(tmp_path):
 
 def test_the_hard_caps_hold_where_nothing_else_is_set(tmp_path):
     """No rule given: the defaults end it all the same."""
-    progress = Trial(
-        tmp_path, engine=FakeEngine(steps=50_000), stop={}, evaluation={"every_iterations": 1_000}
-    ).run()
+    progress = Trial(tmp_path, engine=FakeEngine(steps=50_000), stop={}, evaluation={"every_iterations": 1_000}).run()
     assert progress.stop_reason == "num_env_steps 200000 >= 200000"
 
 
@@ -191,7 +189,8 @@ def test_the_evaluation_is_the_mean_of_greedy_episodes_of_the_very_policy(tmp_pa
 
 def test_a_score_that_is_no_number_is_none_and_never_the_best(tmp_path):
     scores = {1: -5.0, 2: math.nan, 3: math.inf, 4: -7.0}
-    trial = Trial(tmp_path, scores=scores.get, stop={"num_iterations": 4}, checkpoints={"every_iterations": 1, "keep": 9})
+    checkpoints = {"every_iterations": 1, "keep": 9}
+    trial = Trial(tmp_path, scores=scores.get, stop={"num_iterations": 4}, checkpoints=checkpoints)
     progress = trial.run()
     assert [record.evaluation_return for record in progress.checkpoints] == [-5.0, None, None, -7.0]
     assert (progress.best_iteration, progress.best_evaluation_return) == (1, -5.0)

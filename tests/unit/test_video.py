@@ -60,9 +60,7 @@ def test_the_filmed_episode_is_the_evaluated_one_and_plays_in_real_time(tmp_path
 
 def test_the_frames_show_the_env_under_a_caption(tmp_path):
     record_video(balancing_policy(), env_id="CartPole-v0", seeds=0, mp4=tmp_path / "a.mp4", max_steps=3)
-    record_video(
-        balancing_policy(), env_id="CartPole-v0", seeds=0, mp4=tmp_path / "b.mp4", max_steps=3, caption=""
-    )
+    record_video(balancing_policy(), env_id="CartPole-v0", seeds=0, mp4=tmp_path / "b.mp4", max_steps=3, caption="")
     (_, frames), (_, untitled) = read_mp4(tmp_path / "a.mp4"), read_mp4(tmp_path / "b.mp4")
     env = gym.make("CartPole-v0", render_mode="rgb_array")
     env.reset(seed=0)
@@ -116,12 +114,8 @@ def test_tiny_frames_are_enlarged(tmp_path):
 
 
 def test_an_env_without_pictures_is_refused(tmp_path):
-    with pytest.raises(
-        EnvError, match="TestNotDrawable-v0 cannot be filmed: it has no render mode 'rgb_array'"
-    ):
-        record_video(
-            make_policy("TestNotDrawable-v0"), env_id="TestNotDrawable-v0", seeds=0, mp4=tmp_path / "a.mp4"
-        )
+    with pytest.raises(EnvError, match="TestNotDrawable-v0 cannot be filmed: it has no render mode 'rgb_array'"):
+        record_video(make_policy("TestNotDrawable-v0"), env_id="TestNotDrawable-v0", seeds=0, mp4=tmp_path / "a.mp4")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -177,9 +171,7 @@ def test_an_encoder_that_fails_is_one_clear_error(tmp_path, monkeypatch):
     broken.write_text("#!/bin/sh\nread -r line\necho 'no such codec' >&2\nexit 1\n")
     broken.chmod(0o755)
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(broken))
-    picture = Image.fromarray(
-        np.full((400, 600, 3), 10, np.uint8)
-    )  # a newline, so that the script's read ends
+    picture = Image.fromarray(np.full((400, 600, 3), 10, np.uint8))  # a newline, so that the script's read ends
     with pytest.raises(CannotRunError, match="no such codec"), Mp4Writer(tmp_path / "a.mp4", 30) as writer:
         writer.add(picture, 50)
     assert list(tmp_path.iterdir()) == [broken]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-PLUGIN = Path(__file__).parent / "env_plugin"
+PLUGIN = Path(__file__).parent / "ray" / "env_plugin"
 
 
 @pytest.fixture(scope="session")

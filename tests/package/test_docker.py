@@ -1,0 +1,87 @@
+"""The Dockerfile's commands and the compose file's services, run as they stand; there is no engine to do so."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from image import Image, Root, read_compose, why_not
+
+pytestmark = [pytest.mark.package, pytest.mark.cluster]
+ROOT = Path(__file__).parents[2]
+TOKEN = "0123456789abcdef" * 4
+
+
+@pytest.fixture(scope="module")
+def image():
+    if reason := why_not():
+        pytest.skip(reason)
+    with Root() as root:
+        image = Image(root)
+        image.build(ROOT / "docker" / "Dockerfile", ROOT)
+        root.cut_off()
+        yield image
+
+
+def canonical(name: str) -> str:
+    """A package's name as the index compares it."""
+    return re.sub("[-_.]+", "-", name).lower()
+
+
+def test_the_image_holds_the_pinned_versions_and_nothing_runs_as_root(image):
+    assert image.run(["id", "-un"], environment={}).stdout == "tune\n"
+    assert "Usage: tune-jobs" in image.run(image.command, environment={}).stdout
+    done = image.run(["pip", "list", "--format=json"], environment={})
+    installed = {
+        canonical(package["name"]): package["version"].partition("+")[0]
+        for package in json.loads(done.stdout.splitlines()[0])
+    }
+    pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().split())
+    pins = {canonical(name): version for name, version in pins.items()}
+    ours = {"pip", "tune-jobs"}
+    assert {name: version for name, version in installed.items() if pins.get(name) != version}.keys() == ours
+    assert {"ray", "torch", "gymnasium"} <= installed.keys()
+    assert image.run(["touch", "/opt/tune-jobs/file"], environment={}).returncode != 0
+    assert image.run(["touch", "/sweeps/file"], environment={}).returncode == 0
+    assert image.run(["rm", "/sweeps/file"], environment={}).returncode == 0
+
+
+def test_the_composed_services_run_a_sweep_on_two_workers(image, tmp_path):
+    compose = read_compose(ROOT / "docker" / "compose.yaml", {"RAY_AUTH_TOKEN": TOKEN, "WORKER_CPUS": "1"})
+    services = compose["services"]
+    head_log = tmp_path / "head.log"
+    head = image.begin(services["head"]["command"], environment=services["head"]["environment"], log=head_log)
+    image.wait_until_healthy(services["head"], head, head_log)
+    for number in range(2):
+        log = tmp_path / f"worker-{number}.log"
+        worker = image.begin(services["worker"]["command"], environment=services["worker"]["environment"], log=log)
+        image.wait_until_healthy(services["worker"], worker, log)
+    launcher = services["launcher"]
+    settings = ["num_samples=1", "stop.num_env_steps=30000", "evaluation.num_episodes=2"]
+    arguments = ["launch", "mine.yaml", "--address", "auto", "--json"]
+    for setting in settings:
+        arguments += ["--set", setting]
+    files = image.root.path(launcher["working_dir"])
+    files.mkdir()
+    shutil.copy(ROOT / "tune_jobs" / "presets" / "cartpole-ppo.yaml", files / "mine.yaml")
+    # Begun early: Ray tries for 20 s before it gives up.
+    stranger = image.begin(
+        [*launcher["entrypoint"], *arguments, "--address", "head:6379"],
+        environment={**launcher["environment"], "RAY_AUTH_TOKEN": TOKEN[::-1]},
+        workdir=launcher["working_dir"],
+    )
+    done = image.run(
+        launcher["entrypoint"] + arguments, environment=launcher["environment"], workdir=launcher["working_dir"]
+    )
+    assert done.returncode == 0, done.stdout[-4000:] + head_log.read_text()[-2000:]
+    folder = image.root.path("/sweeps/mine")
+    trials = [json.loads(path.read_text()) for path in sorted(folder.glob("trials/*/trial.json"))]
+    assert [trial["status"] for trial in trials] == ["completed"] * 4
+    # The head takes no trials; the two workers share them.
+    assert len({trial["node"] for trial in trials}) == 2
+    for name in ("best/policy.safetensors", "best/after.mp4", "report/index.html"):
+        assert (folder / name).stat().st_size > 0
+    out, _ = stranger.communicate(timeout=300)
+    assert stranger.returncode == 5
+    assert b"does not accept this machine's token" in out

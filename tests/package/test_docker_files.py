@@ -1,0 +1,96 @@
+"""What the Docker files promise, read from them."""
+
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+from image import read_compose, read_dockerfile
+
+ROOT = Path(__file__).parents[2]
+DOCKER = ROOT / "docker"
+INSTRUCTIONS = read_dockerfile(DOCKER / "Dockerfile")
+
+
+@pytest.fixture(scope="module")
+def compose():
+    return read_compose(DOCKER / "compose.yaml", {"RAY_AUTH_TOKEN": "secret"})
+
+
+def rest_of(word):
+    return [instruction.rest for instruction in INSTRUCTIONS if instruction.word == word]
+
+
+def copied():
+    return [source for rest in rest_of("COPY") for source in rest.split()[:-1]]
+
+
+def test_the_image_runs_as_another_user_than_root():
+    assert rest_of("USER") == ["tune"]
+    words = [instruction.word for instruction in INSTRUCTIONS]
+    assert "RUN" not in words[words.index("USER") :]
+
+
+def test_the_base_and_every_package_are_pinned():
+    (base,) = rest_of("FROM")
+    assert base.startswith("python:3.11-slim-")
+    installs = [command for rest in rest_of("RUN") for command in rest.split("&&") if "pip install" in command]
+    assert len(installs) == 2
+    assert all("--constraint constraints.txt" in command or "--no-deps" in command for command in installs)
+
+
+def test_the_whole_package_is_copied_and_nothing_else_is_sent():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = [name.rstrip("*") for name in project["tool"]["setuptools"]["packages"]["find"]["include"]]
+    assert set(packages) <= set(copied())
+    assert project["project"]["readme"] in copied()
+    assert set(project["project"]["license-files"]) <= set(copied())
+    rules = [line for line in (ROOT / ".dockerignore").read_text().splitlines() if line[:1] != "#"]
+    assert rules[0] == "*"
+    assert sorted(rule[1:] for rule in rules if rule.startswith("!")) == sorted(copied())
+    assert all((ROOT / source).exists() for source in copied())
+
+
+def test_the_secret_is_never_committed():
+    ignored = (ROOT / ".gitignore").read_text().split()
+    assert any(fnmatch("docker/.env", rule) for rule in ignored)
+
+
+def test_without_a_token_nothing_starts():
+    with pytest.raises(KeyError, match=r"RAY_AUTH_TOKEN: Write one to docker/\.env first"):
+        read_compose(DOCKER / "compose.yaml", {})
+
+
+def test_every_service_shows_the_token_and_shares_the_storage(compose):
+    (storage,) = [part for rest in rest_of("ENV") for part in rest.split() if part.startswith("TUNE_JOBS_STORAGE=")]
+    for service in compose["services"].values():
+        assert service["environment"]["RAY_AUTH_MODE"] == "token"
+        assert service["environment"]["RAY_AUTH_TOKEN"] == "secret"
+        assert f"sweeps:{storage.partition('=')[2]}" in service["volumes"]
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+    assert list(compose["volumes"]) == ["sweeps"]
+
+
+def test_no_port_is_published(compose):
+    assert not any("ports" in service or "network_mode" in service for service in compose["services"].values())
+
+
+def test_workers_scale(compose):
+    worker = compose["services"]["worker"]
+    assert "container_name" not in worker
+    assert "hostname" not in worker
+    assert f"--num-cpus={worker['cpus']}" in worker["command"]
+
+
+def test_the_services_agree_on_the_heads_ports(compose):
+    head, worker, launcher = (compose["services"][name] for name in ("head", "worker", "launcher"))
+    assert "--port=6379" in head["command"]
+    assert "--address=head:6379" in worker["command"]
+    assert "--ray-client-server-port=10001" in head["command"]
+    assert launcher["environment"]["RAY_ADDRESS"] == "ray://head:10001"
+    assert launcher["profiles"] == ["launch"]
+    for service in (head, worker):
+        assert "head:6379" in " ".join(service["healthcheck"]["test"])
+    for service in (worker, launcher):
+        assert service["depends_on"] == {"head": {"condition": "service_healthy"}}
