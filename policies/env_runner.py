@@ -71,8 +71,13 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         return finished
 
     def reseed(self, seed: int) -> None:
-        """Reset the environments from another seed before the next fragment: a restored trial sees new episodes."""
+        """Go on with other random numbers: new episodes from the next fragment on, and new exploration.
+
+        The main process seeds its own exploration; env runners of their own do here.
+        """
         self._seed_override = seed
+        if self.worker_index:
+            torch.manual_seed(seed + self.worker_index)
         self._needs_initial_reset = True
 
     def make_env(self) -> None:

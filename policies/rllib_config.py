@@ -46,7 +46,7 @@ def model_config(hyperparams: Hyperparams) -> ModelConfig:
     config: ModelConfig = {
         "fcnet_hiddens": list(hyperparams.hidden_sizes),
         "fcnet_activation": RLLIB_ACTIVATIONS[hyperparams.activation],
-        # Without this, RLlib puts one more hidden layer of 256 before DQN's outputs.
+        # The heads are one linear layer each: the portable policy counts on it.
         "head_fcnet_hiddens": [],
     }
     if isinstance(hyperparams, PPOHyperparams):
@@ -73,7 +73,10 @@ def build_algorithm_config(
         num_env_runners: Processes that sample beside the main one; 0: the main process samples.
         num_gpus: GPUs of the learner; 0: the CPU.
     """
-    config = _ppo(hyperparams) if isinstance(hyperparams, PPOHyperparams) else _dqn(hyperparams)
+    if isinstance(hyperparams, PPOHyperparams):
+        config = _ppo(hyperparams)
+    else:
+        config = _dqn(hyperparams, num_env_runners)
     return (
         config.environment(env_id, env_config=env_args or {}, disable_env_checking=True)
         .env_runners(
@@ -113,7 +116,11 @@ def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
     )
 
 
-def _dqn(hyperparams: DQNHyperparams) -> AlgorithmConfig:
+def _dqn(hyperparams: DQNHyperparams, num_env_runners: int) -> AlgorithmConfig:
+    intensity = hyperparams.training_intensity
+    if intensity is not None and num_env_runners > 0:
+        # RLlib's `calculate_rr_weights` counts the main process as one more that samples, and would train more (2.60).
+        intensity *= num_env_runners / (num_env_runners + 1)
     buffer: dict[str, Any] = {"type": "EpisodeReplayBuffer", "capacity": hyperparams.replay_capacity}
     if hyperparams.prioritized_replay:
         buffer = {**buffer, "type": "PrioritizedEpisodeReplayBuffer", "alpha": 0.6, "beta": 0.4}
@@ -124,7 +131,7 @@ def _dqn(hyperparams: DQNHyperparams) -> AlgorithmConfig:
         grad_clip=hyperparams.grad_clip,
         grad_clip_by="global_norm",
         train_batch_size_per_learner=hyperparams.train_batch_size,
-        training_intensity=hyperparams.training_intensity,
+        training_intensity=intensity,
         double_q=hyperparams.double_q,
         dueling=hyperparams.dueling,
         n_step=hyperparams.n_step,

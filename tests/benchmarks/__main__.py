@@ -8,7 +8,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import os
 import platform
+import re
 import statistics
 import sys
 import tempfile
@@ -25,6 +27,13 @@ from tests.benchmarks.measure import Run, run
 ROOT = Path(__file__).parents[2]
 CLI = str(Path(sys.executable).with_name("tune-jobs"))
 FIRST_RESULT = r"\([1-9][\d,]* env steps in all"
+
+
+def machine_name() -> str:
+    """Cores and processor of this machine."""
+    cpuinfo = Path("/proc/cpuinfo")
+    names = re.findall(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
+    return f"{len(os.sched_getaffinity(0))} cores of {names[0] if names else platform.machine()}"
 
 
 def median(values: list[float]) -> float:
@@ -114,7 +123,7 @@ def main() -> None:
             ("the same work, Ray Tune + RLlib", f"{stock:.1f} s, {stock / ours:.2f} x ours", ""),
             ("the same work, Stable-Baselines3, 2 processes", f"{sb3:.1f} s, {sb3 / ours:.2f} x ours", ""),
         ]
-    table = Table(title=f"{platform.processor() or platform.machine()}, medians of {options.repeats}")
+    table = Table(title=f"{machine_name()}, medians of {options.repeats}")
     for column in ("figure", "measured", "at most / at least"):
         table.add_column(column)
     for row in rows:

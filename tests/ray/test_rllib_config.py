@@ -48,9 +48,10 @@ def build():
 
     built = []
 
-    def make(algorithm, env_id="CartPole-v1", **values):
+    def make(algorithm, env_id="CartPole-v1", num_env_runners=0, **values):
         hyperparams = make_hyperparams(algorithm, {**SMALL[algorithm], **values})
-        built.append(build_algorithm_config(hyperparams, env_id=env_id, seed=1024).build_algo())
+        config = build_algorithm_config(hyperparams, env_id=env_id, seed=1024, num_env_runners=num_env_runners)
+        built.append(config.build_algo())
         return built[-1]
 
     yield make
@@ -432,6 +433,15 @@ def check_training_intensity(build, _):
         sizes = count_updates(algo)
         steps = env_steps(algo.train())
         assert abs(len(sizes) - expected * steps / 48) <= 1 + 0.1 * expected, (intensity, num_envs, len(sizes), steps)
+
+
+def test_training_intensity_is_the_same_with_env_runners(build):
+    # RLlib counts one sampling process too many, and would make twice the updates.
+    values = {"training_intensity": 16.0, "env_steps_per_iteration": 96, "num_envs": 4}
+    algo = build("dqn", num_env_runners=1, **values)
+    sizes = count_updates(algo)
+    steps = env_steps(algo.train())
+    assert 14 <= sum(sizes) / steps <= 16
 
 
 @reaches("dqn", field="adam_epsilon")
