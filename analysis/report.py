@@ -132,7 +132,7 @@ def _content(source: _Sweep) -> dict[str, Any]:
         "headline": report_data.headline(sweep, trials, results, goal),
         "winner": None if best is None else report_data.winner_card(best, trials, sweep, source.folder),
         "why_no_best": None if best is not None else report_data.why_no_best(trials, source.folder),
-        "sweep_path": report_data.shown_path(source.folder),
+        "sweep_path": wording.shown_path(source.folder),
         "trial_table": report_tables.trial_table(trials, results, goal=goal, best=best),
         "group_table": report_tables.group_table(trials, results, groups, goal=goal),
         "point_table": report_tables.point_table(trials),

@@ -15,7 +15,7 @@ from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialReco
 from analysis.selection import NoUsableTrialError, error_summary, select_best
 from analysis.statistics import mean_with_ci, paired_difference
 from analysis.tables import format_value, trials_frame
-from analysis.wording import NONE, duration, moment, number, seed_range
+from analysis.wording import NONE, duration, moment, number, seed_range, shown_path
 
 _MAX_ERROR_CHARS = 4_000
 
@@ -132,12 +132,6 @@ def facts(sweep: SweepRecord) -> list[tuple[str, str]]:
         ("git commit", sweep.git_commit or NONE),
     ]
     return rows + sorted(sweep.versions.items())
-
-
-def shown_path(path: Path) -> str:
-    """A path as a user would type it: relative where it lies below the current folder."""
-    absolute = path.absolute()
-    return str(absolute.relative_to(Path.cwd())) if absolute.is_relative_to(Path.cwd()) else str(absolute)
 
 
 def _is_stale(best: BestRecord, trials: Sequence[TrialRecord]) -> bool:

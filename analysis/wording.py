@@ -1,10 +1,11 @@
-"""Numbers, times and seeds as text for a reader."""
+"""Numbers, times, seeds and paths as text for a reader."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 from analysis.statistics import Estimate
@@ -57,3 +58,9 @@ def interval_text(estimate: Estimate) -> str:
 def is_number(value: Any) -> bool:
     """Whether a value is a real number, NumPy's included; True and False are not."""
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def shown_path(path: Path) -> str:
+    """A path as a user would type it: relative where it lies below the current folder."""
+    absolute = path.absolute()
+    return str(absolute.relative_to(Path.cwd())) if absolute.is_relative_to(Path.cwd()) else str(absolute)

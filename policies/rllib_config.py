@@ -73,10 +73,7 @@ def build_algorithm_config(
         num_env_runners: Processes that sample beside the main one; 0: the main process samples.
         num_gpus: GPUs of the learner; 0: the CPU.
     """
-    if isinstance(hyperparams, PPOHyperparams):
-        config = _ppo(hyperparams)
-    else:
-        config = _dqn(hyperparams, num_env_runners)
+    config = _ppo(hyperparams) if isinstance(hyperparams, PPOHyperparams) else _dqn(hyperparams, num_env_runners)
     return (
         config.environment(env_id, env_config=env_args or {}, disable_env_checking=True)
         .env_runners(

@@ -163,8 +163,10 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
             _print_best(console, result.best)
         elif result.why_no_best is not None:
             console.print(f"no best policy: {result.why_no_best}", style="yellow")
+        from analysis.wording import shown_path
+
         paths = {"sweep": result.folder, **result.artifacts}
-        _print_facts(console, {name.replace("_", " "): str(path) for name, path in paths.items()})
+        _print_facts(console, {name.replace("_", " "): shown_path(path) for name, path in paths.items()})
         for note in result.notes:
             console.print(f"note: {note}", style="yellow")
     if result.interrupted:
@@ -292,10 +294,12 @@ def _verdict(record: EvaluationRecord) -> dict[str, str]:
 
 def show_paths(paths: Mapping[str, Path], *, as_json: bool) -> None:
     """Print where files were written."""
+    from analysis.wording import shown_path
+
     if as_json:
         print_json(paths)
     else:
-        _print_facts(_console(), {name: str(path) for name, path in paths.items()})
+        _print_facts(_console(), {name: shown_path(path) for name, path in paths.items()})
 
 
 def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
