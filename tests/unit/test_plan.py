@@ -24,7 +24,7 @@ def test_the_tutorials_sweep():
     assert (len(made.trials), made.num_points) == (20, 20)
     assert (made.cpus_per_trial, made.gpus_per_trial, made.max_concurrent) == (1, 0, 2)
     assert [trial.trial_id for trial in made.trials[:2]] == ["t0000", "t0001"]
-    assert len(made.evaluation_seeds) == 10
+    assert len(made.evaluation_seeds) == 20
     assert len(made.confirmation_seeds) == 100
     assert made.env.env_id == "CartPole-v0"
     assert made.notes == ()
@@ -160,7 +160,7 @@ def test_far_too_many_trials_are_refused_before_they_are_drawn():
 
 def test_env_steps_are_bounded_by_the_cap_and_one_iteration_a_trial():
     # 1,024 steps an iteration, 8 at a time, of which the last 8 may be one too many.
-    assert plan("num_samples=1").max_env_steps == 4 * (49_999 + 1_032)
+    assert plan("num_samples=1").max_env_steps == 4 * (99_999 + 1_032)
     assert plan("num_samples=1", "stop.num_iterations=2").max_env_steps == 4 * 2 * 1_032
     dqn = {"env": "CartPole-v1", "algorithm": "dqn", "stop": {"num_env_steps": 5_000}}
     assert plan(source=dqn).max_env_steps == 4_999 + 1_001

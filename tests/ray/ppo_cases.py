@@ -1,0 +1,185 @@
+"""The cases of PPO's hyperparameters; see `rllib_cases`."""
+
+import numpy as np
+import pytest
+import torch
+from rllib_cases import (
+    MODULE,
+    SMALL,
+    count_updates,
+    env_steps,
+    learner_of,
+    linears,
+    loss_config,
+    module_of,
+    reaches,
+)
+from torch import nn
+
+from policies.hyperparams import PPOHyperparams
+
+
+def ppo_loss(algo, hyperparams):
+    """(RLlib's loss, the loss by its definition) of one batch whose ratios and values are beyond every clip."""
+    learner, module = learner_of(algo), module_of(algo)
+    rng = torch.Generator().manual_seed(0)
+    batch = {
+        "obs": torch.randn(64, 4, generator=rng),
+        "actions": torch.randint(2, (64,), generator=rng),
+        "action_logp": -0.2 - torch.rand(64, generator=rng),
+        "action_dist_inputs": torch.randn(64, 2, generator=rng),
+        "advantages": torch.randn(64, generator=rng),
+        "value_targets": 6 * torch.randn(64, generator=rng),
+    }
+    with torch.no_grad():
+        out = module.forward_train(batch)
+        theirs = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=batch, fwd_out=out)
+        now = torch.distributions.Categorical(logits=out["action_dist_inputs"])
+        then = torch.distributions.Categorical(logits=batch["action_dist_inputs"])
+        ratio = torch.exp(now.log_prob(batch["actions"]) - batch["action_logp"])
+        clipped = torch.clamp(ratio, 1 - hyperparams.clip_param, 1 + hyperparams.clip_param)
+        loss = -torch.min(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
+        value_loss = (module.compute_values(batch) - batch["value_targets"]) ** 2
+        if hyperparams.vf_clip_param is not None:
+            value_loss = value_loss.clamp(0, hyperparams.vf_clip_param)
+        loss += hyperparams.vf_loss_coeff * value_loss.mean() - hyperparams.entropy_coeff * now.entropy().mean()
+        if hyperparams.use_kl_loss:
+            loss += hyperparams.kl_coeff * torch.distributions.kl_divergence(then, now).mean()
+    return float(theirs), float(loss)
+
+
+def check_loss(build, **values):
+    """The loss is the one these values define, and not the one without them."""
+    fixed = {key: value for key, value in values.items() if key == "use_kl_loss"} if len(values) > 1 else {}
+    losses = []
+    for changed in (fixed, values):
+        hyperparams = PPOHyperparams(**{**SMALL["ppo"], **changed})
+        theirs, ours = ppo_loss(build("ppo", **changed), hyperparams)
+        assert theirs == pytest.approx(ours, rel=1e-4)
+        losses.append(theirs)
+    assert abs(losses[1] - losses[0]) > 1e-3
+
+
+@reaches("ppo", field="clip_param")
+def check_clip_param(build, _):
+    check_loss(build, clip_param=0.03)
+
+
+@reaches("ppo", field="vf_clip_param")
+def check_vf_clip_param(build, _):
+    check_loss(build, vf_clip_param=2.5)
+
+
+@reaches("ppo", field="vf_loss_coeff")
+def check_vf_loss_coeff(build, _):
+    check_loss(build, vf_loss_coeff=0.2)
+
+
+@reaches("ppo", field="entropy_coeff")
+def check_entropy_coeff(build, _):
+    check_loss(build, entropy_coeff=0.3)
+
+
+@reaches("ppo", field="use_kl_loss")
+def check_use_kl_loss(build, _):
+    check_loss(build, use_kl_loss=True)
+
+
+@reaches("ppo", field="kl_coeff")
+def check_kl_coeff(build, _):
+    check_loss(build, use_kl_loss=True, kl_coeff=0.9)
+
+
+@reaches("ppo", field="kl_target")
+def check_kl_target(build, _):
+    for target, factor in ((0.01, 1.5), (0.03, 1.0), (0.2, 0.5)):
+        algo = build("ppo", use_kl_loss=True, kl_coeff=0.4, kl_target=target)
+        learner = learner_of(algo)
+        learner._update_module_kl_coeff(module_id=MODULE, config=loss_config(algo), kl_loss=0.05)
+        assert float(learner.curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.4 * factor)
+
+
+@reaches("ppo", field="vf_share_layers")
+def check_vf_share_layers(build, _):
+    names = {share: set(module_of(build("ppo", vf_share_layers=share)).state_dict()) for share in (False, True)}
+    assert {name.split(".")[1] for name in names[False] if name.startswith("encoder")} == {
+        "actor_encoder",
+        "critic_encoder",
+    }
+    assert {name.split(".")[1] for name in names[True] if name.startswith("encoder")} == {"encoder"}
+
+
+def advantages(algo, rewards, values_are_zero=True):
+    """Advantages and value targets of one terminated episode, from the learner's own pipeline."""
+    from ray.rllib.core.learner.training_data import TrainingData
+    from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+
+    for layer in linears(module_of(algo).vf):
+        nn.init.zeros_(layer.weight)
+        nn.init.ones_(layer.bias)  # the value function says 1 everywhere
+    length = len(rewards)
+    episode = SingleAgentEpisode(
+        observations=list(np.zeros((length + 1, 4), np.float32)),
+        actions=[0] * length,
+        rewards=list(rewards),
+        terminated=True,
+        extra_model_outputs={"action_logp": [0.0] * length, "action_dist_inputs": [np.zeros(2, np.float32)] * length},
+        observation_space=algo.env_runner.env.single_observation_space,
+        action_space=algo.env_runner.env.single_action_space,
+        len_lookback_buffer=0,
+    ).to_numpy()
+    batch = learner_of(algo)._make_batch_if_necessary(TrainingData(episodes=[episode]))[MODULE]
+    return np.asarray(batch["value_targets"])[:length]
+
+
+def expected_targets(rewards, gamma, gae_lambda):
+    advantage, targets = 0.0, []
+    for step in reversed(range(len(rewards))):
+        following = 0.0 if step == len(rewards) - 1 else 1.0
+        advantage = rewards[step] + gamma * following - 1.0 + gamma * gae_lambda * advantage
+        targets.insert(0, advantage + 1.0)
+    return targets
+
+
+@reaches("ppo", field="gamma")
+def check_ppo_gamma(build, _):
+    for gamma in (0.0, 0.6):
+        found = advantages(build("ppo", gamma=gamma), [1.0, 5.0, 2.0])
+        np.testing.assert_allclose(found, expected_targets([1.0, 5.0, 2.0], gamma, 0.95), rtol=1e-5)
+
+
+@reaches("ppo", field="gae_lambda")
+def check_gae_lambda(build, _):
+    for gae_lambda in (0.0, 0.3):
+        found = advantages(build("ppo", gae_lambda=gae_lambda), [1.0, 5.0, 2.0])
+        np.testing.assert_allclose(found, expected_targets([1.0, 5.0, 2.0], 0.99, gae_lambda), rtol=1e-5)
+
+
+@reaches("ppo", field="train_batch_size")
+def check_ppo_train_batch_size(build, _):
+    algo = build("ppo", train_batch_size=96)
+    steps = [env_steps(algo.train()) for _ in range(3)]
+    # All sub-environments step together, and one may only reset in the last step.
+    assert [96 <= after - before < 98 for before, after in zip([0, *steps], steps, strict=False)] == [True] * 3
+
+
+@reaches("ppo", field="minibatch_size")
+def check_minibatch_size(build, _):
+    algo = build("ppo", minibatch_size=16)
+    sizes = count_updates(algo)
+    algo.train()
+    assert set(sizes) == {16}
+
+
+@reaches("ppo", field="num_epochs")
+def check_num_epochs(build, _):
+    counts = {}
+    for num_epochs in (1, 4):
+        algo = build("ppo", num_epochs=num_epochs)
+        sizes = count_updates(algo)
+        algo.train()
+        counts[num_epochs] = sum(sizes)
+    # RLlib adds a row an episode chunk for the value after its end, and fills the last minibatch up.
+    assert 64 <= counts[1] < 64 + 64
+    assert 4 * 64 <= counts[4] < 4 * (64 + 32)
+    assert counts[4] > 3 * counts[1] - 32

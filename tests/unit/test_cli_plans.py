@@ -1,0 +1,168 @@
+"""The command line: dry runs and bad input by the real validation, presets, schema, and what is imported when."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tune_jobs.cli import cli
+
+ROOT = Path(__file__).parents[2]
+SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
+HEAVY = ("ray", "torch", "pandas", "matplotlib", "imageio", "PIL")
+
+
+# -- dry runs and bad input, by the real validation
+
+
+def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
+    result = run("launch", "cartpole-ppo", "--dry-run", "--set", "resources.max_concurrent=1")
+    assert result.exit_code == 0
+    for part in (
+        "CartPole-v0 (solved at 195)",
+        "20: 20 points",
+        "1, each on 1 CPU",
+        "at most 2,020,620",
+        "MB",
+        "t0019",
+        "64",
+        "linear",
+        "Nothing was started",
+    ):
+        assert part in result.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_of_many_trials_shows_the_first_ones(run):
+    output = run("launch", "cartpole-ppo", "--dry-run", "--set", "num_samples=100").stdout
+    assert "t0023" in output
+    assert "t0024" not in output
+    assert "and 376 more" in output
+
+
+def test_a_dry_run_as_json_holds_spec_and_plan(run):
+    document = json.loads(run("launch", "cartpole-ppo", "--dry-run", "--json", "--name", "mine").stdout)
+    assert document["spec"]["name"] == "mine"
+    assert document["plan"]["num_trials"] == len(document["plan"]["trials"]) == 20
+    assert document["plan"]["env"]["threshold"] == 195.0
+
+
+def test_a_dry_run_for_a_cluster_plans_for_the_clusters_machine(run, sweeps):
+    from tune_jobs.plan import Machine
+
+    sweeps.machine = lambda address: Machine(7, source=f"the cluster at {address}")
+    output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
+    assert "7, each on 1 CPU; the cluster at auto has 7 CPUs" in output
+
+
+BAD_INPUT = {
+    "unknown key": (
+        {"text": SMALL + "num_sample: 3\n"},
+        2,
+        ["sweep.yaml: num_sample", "Did you mean 'num_samples'?"],
+    ),
+    "wrong type": ({"set": "num_samples=many"}, 2, ["num_samples: 'many' is not a number (from --set)"]),
+    "empty grid": ({"set": "space.lr={grid: []}"}, 2, ["space.lr.grid: is empty"]),
+    "lr of zero": (
+        {"set": "space.lr={grid: [0]}"},
+        2,
+        ["space.lr.grid[0]: 0 is not allowed", "greater than 0"],
+    ),
+    "lr below zero": (
+        {"set": "space.lr={uniform: [-1, 1]}"},
+        2,
+        ["space.lr.uniform[0]: -1.0 is not allowed"],
+    ),
+    "activation": (
+        {"set": "hyperparams.activation=rleu"},
+        2,
+        ["hyperparams.activation: 'rleu'", "Did you mean 'relu'?"],
+    ),
+    "not of the algorithm": (
+        {"set": "space.tau={uniform: [0, 1]}"},
+        2,
+        ["space.tau: ppo has no hyperparameter 'tau'"],
+    ),
+    "unregistered env": ({"set": "env=CartPoel-v1"}, 2, ["'CartPoel-v1'", "CartPole-v1"]),
+    "env that imports": ({"set": "env=evil:Env-v0"}, 2, ["'evil:Env-v0'"]),
+    "spaces": (
+        {"set": "env=Pendulum-v1", "more": ["--set", "algorithm=dqn"]},
+        2,
+        ["Pendulum-v1", "continuous"],
+    ),
+    "no file": ({"spec": "nothing.yaml"}, 2, ["'nothing.yaml'", "cartpole-ppo"]),
+    "no yaml": ({"text": "env: [\n"}, 2, ["sweep.yaml, line 2"]),
+    "bad name": ({"more": ["--name", "a/b"]}, 2, ["'a/b'"]),
+    "bad --set": ({"set": "oops"}, 2, ["--set oops: this is no assignment"]),
+    "too many CPUs": ({"set": "resources.num_env_runners=1000"}, 5, ["1001 CPUs", "this machine has"]),
+    "contradiction": (
+        {"set": "hyperparams.minibatch_size=4096"},
+        2,
+        ["point 0", "minibatch_size 4096 is larger"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_is_one_clear_message_and_nothing_is_written(run, tmp_path, case):
+    given, code, parts = BAD_INPUT[case]
+    (tmp_path / "sweep.yaml").write_text(given.get("text", SMALL))
+    overrides = ["--set", given["set"]] if "set" in given else []
+    result = run("launch", given.get("spec", "sweep.yaml"), "--dry-run", *overrides, *given.get("more", []))
+    assert result.exit_code == code
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    for part in parts:
+        assert part in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep.yaml"]
+
+
+# -- presets, schema, speed
+
+
+def test_presets_are_listed_and_printed(run, tmp_path):
+    assert "cartpole-ppo" in run("presets").stdout
+    assert "cartpole-ppo" in {preset["name"] for preset in json.loads(run("presets", "--json").stdout)}
+    (tmp_path / "own.yaml").write_text(run("presets", "cartpole-ppo").stdout)
+    assert run("launch", "own.yaml", "--dry-run").exit_code == 0
+    missing = run("presets", "cartpole-pp")
+    assert missing.exit_code == 2
+    assert "Did you mean 'cartpole-ppo'?" in missing.stderr
+
+
+def test_the_schema_is_json_with_and_without_asking_for_it(run):
+    assert json.loads(run("schema").stdout) == json.loads(run("schema", "--json").stdout)
+    assert "properties" in json.loads(run("schema").stdout)
+
+
+def test_every_command_takes_json_and_has_a_one_line_help():
+    for name, command in cli.commands.items():
+        assert any("--json" in parameter.opts for parameter in command.params), name
+        assert command.help, name
+
+
+def test_version_and_help(run):
+    assert run("--version").stdout.startswith("tune-jobs ")
+    assert run("-h").exit_code == 0
+    assert "130 interrupted" in " ".join(run("--help").stdout.split())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--help"], ["launch", "cartpole-ppo", "--dry-run"], ["launch", "nope", "--dry-run"], ["schema"]],
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
+    code = (
+        "import sys, tune_jobs.cli\n"
+        "try:\n"
+        f"    tune_jobs.cli.cli({arguments!r})\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        f"print('HEAVY', [name for name in {HEAVY!r} if name in sys.modules])\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout.splitlines()[-1] == "HEAVY []"

@@ -1,0 +1,147 @@
+"""Sweep files: `--set`, and their JSON Schema."""
+
+import pytest
+
+from policies.errors import SpecError
+from tune_jobs.spec_file import json_schema, list_presets, load_spec
+
+MINIMAL = {"env": "CartPole-v1", "algorithm": "ppo"}
+
+
+def errors(*, base=MINIMAL, overrides=(), **fields):
+    with pytest.raises(SpecError) as caught:
+        load_spec({**base, **fields}, overrides)
+    assert caught.value.exit_code == 2
+    assert caught.value.hint
+    return caught.value.message
+
+
+def write(tmp_path, text):
+    path = tmp_path / "sweep.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# -- --set
+
+
+def test_set_overrides_and_creates_fields():
+    spec = load_spec(
+        "cartpole-ppo",
+        [
+            "stop.num_env_steps=1000",
+            "env=CartPole-v1",
+            "env.args.sutton_barto_reward=true",
+            "scheduler=asha",
+            "scheduler.grace_env_steps=50",
+            "space.lr={grid: [1e-3, 2e-3]}",
+            "resources.max_concurrent=1",
+            "hyperparams.grad_clip=null",
+            "name=ab",
+        ],
+    )
+    assert spec.stop.num_env_steps == 1000
+    assert spec.stop.training_return == 195
+    assert (spec.env.id, spec.env.args) == ("CartPole-v1", {"sutton_barto_reward": True})
+    assert (spec.scheduler.type, spec.scheduler.grace_env_steps) == ("asha", 50)
+    assert spec.space["lr"].values == (1e-3, 2e-3)
+    assert spec.resources.max_concurrent == 1
+    assert spec.hyperparams["grad_clip"] is None
+
+
+def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed():
+    assert "is fixed at 0.001 and searched" in errors(
+        space={"lr": {"uniform": [1e-4, 1e-2]}}, overrides=["hyperparams.lr=1e-3"]
+    )
+    spec = load_spec("cartpole-ppo", ["space.lr=", "hyperparams.lr=1e-3"])
+    assert "lr" not in spec.space
+    assert spec.hyperparams["lr"] == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("stop", "--set stop: this is no assignment"),
+        ("=3", "this is no assignment"),
+        ("stop..x=3", "this is no assignment"),
+        ("num_samples.x=3", "num_samples is 5, which has no fields"),
+        ("stop.num_env_step=3", "stop.num_env_step: there is no field 'num_env_step' here."),
+        ("stop.num_env_steps=-3", "stop.num_env_steps: -3 is not allowed"),
+        ("space.lr={uniform: [1, 0]}", "space.lr.uniform: goes from 1.0 to 0.0"),
+        ("space.lr={uniform: [", "--set space.lr={uniform: [, line 1"),
+        ("stopp.x=1", "stopp: there is no field"),
+    ],
+)
+def test_bad_overrides(override, part):
+    with pytest.raises(SpecError) as caught:
+        load_spec("cartpole-ppo", [override])
+    assert part in caught.value.message
+
+
+def test_a_problem_says_that_it_came_from_set():
+    message = errors(num_samples=0, overrides=["seed=-1"])
+    lines = message.splitlines()
+    assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(True) == 1
+    assert any(line.strip().startswith("seed:") and line.endswith("(from --set)") for line in lines)
+
+
+def test_overrides_leave_the_mapping_they_were_given_alone():
+    source = {**MINIMAL, "stop": {"num_env_steps": 10}}
+    load_spec(source, ["stop.num_env_steps=20"])
+    assert source["stop"] == {"num_env_steps": 10}
+
+
+# -- JSON Schema
+
+
+def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    good = {
+        **MINIMAL,
+        "hyperparams": {"lr": 0.1},
+        "space": {"hidden_sizes": {"grid": [[32]]}, "gamma": {"uniform": [0, 1]}},
+        "scheduler": "asha",
+    }
+    assert list(validator.iter_errors(good)) == []
+    assert list(validator.iter_errors({**good, "env": {"id": "x", "args": {}}, "space": None})) == []
+    bad = [
+        {"algorithm": "ppo"},
+        {**good, "x": 1},
+        {**good, "hyperparams": {"dueling": True}},
+        {**good, "space": {"tau": {"grid": [1]}}},
+        {**good, "space": {"lr": {"grid": 1}}},
+        {**good, "hyperparams": {"lr": 0}},
+        {**good, "stop": {"x": 1}},
+        {**good, "scheduler": {"type": "x"}},
+    ]
+    for wrong in bad:
+        assert list(validator.iter_errors(wrong)), wrong
+
+
+def test_the_schema_accepts_every_preset():
+    import yaml
+
+    jsonschema = pytest.importorskip("jsonschema")
+    for preset in list_presets():
+        # A plain YAML 1.1 loader is what many editors use; it may take 1e-7 for a text, so numbers are read
+        # our way.
+        data = load_spec(preset.name).model_dump(mode="json")
+        jsonschema.validate(data, json_schema())
+        assert set(yaml.safe_load(preset.text)) <= set(data)
+
+
+def test_the_schema_describes_every_field():
+    schema = json_schema()
+    for name in (
+        "StopSpec",
+        "SchedulerSpec",
+        "EvaluationSpec",
+        "CheckpointSpec",
+        "ResourcesSpec",
+        "PPOHyperparams",
+    ):
+        assert all(field.get("description") for field in schema["$defs"][name]["properties"].values()), name
+    assert all(field.get("description") for field in schema["properties"].values())

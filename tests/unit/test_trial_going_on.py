@@ -1,0 +1,213 @@
+"""How a trial goes on from what is on disk, and how it ends when something goes wrong."""
+
+import json
+import math
+import shutil
+
+import pytest
+from fake_engine import FakeClock, FakeEngine
+from trial_runs import Trial
+
+from policies.errors import CheckpointError
+from tune_jobs.store import SweepStore, TrialStore
+
+# -- going on
+
+
+def test_a_trial_goes_on_from_its_latest_checkpoint(tmp_path):
+    """Opened by another process: results after the checkpoint are done again and stand there once."""
+    first = Trial(tmp_path, scores=lambda i: -float(i), checkpoints={"every_iterations": 4, "keep": 1})
+    first.run_to(6)
+    assert [record.iteration for record in first.results] == [1, 2, 3, 4, 5, 6]
+    assert first.kept == [1, 4]
+
+    second = Trial(
+        tmp_path, scores=lambda i: -float(i), stop={"num_iterations": 9}, checkpoints={"every_iterations": 4, "keep": 1}
+    )
+    assert second.engine.builds == ["000004"]
+    assert second.loop.iteration == 4
+    assert [record.iteration for record in second.results] == [1, 2, 3, 4]
+    progress = second.run()
+    assert (progress.iteration, progress.num_env_steps, progress.num_episodes) == (9, 900, 9)
+    assert [record.iteration for record in second.results] == list(range(1, 10))
+    # The best of before still is.
+    assert (progress.best_iteration, progress.best_evaluation_return) == (1, -1.0)
+    assert second.kept == [1, 9]
+
+
+def test_results_are_written_before_the_checkpoint_that_counts_on_them(tmp_path):
+    """Killed right after it is saved, a trial goes on from it: results that were not written would leave a hole."""
+    trial = Trial(tmp_path, evaluation={"every_iterations": 50})
+    known = []
+    trial.engine.save = lambda folder: known.append([record.iteration for record in trial.results])
+    trial.loop.advance(math.inf)
+    assert known == [list(range(1, number + 1)) for number in (10, 20, 30, 40, 50)]
+
+
+def test_a_trial_without_a_checkpoint_begins_again(tmp_path):
+    first = Trial(tmp_path, evaluation={"every_iterations": 50})
+    first.loop.advance(-1.0)
+    assert first.results
+    second = Trial(tmp_path, evaluation={"every_iterations": 50})
+    assert second.engine.builds == [None]
+    assert (second.results, second.loop.iteration) == ([], 0)
+
+
+def test_time_goes_on_where_it_was(tmp_path):
+    clock = FakeClock()
+    first = Trial(tmp_path, clock=clock, checkpoints={"every_iterations": 1, "keep": 1})
+    clock.now += 40.0
+    assert first.loop.advance(math.inf).time_s == 40.0
+    clock.now += 1_000.0  # nobody ran it
+    second = Trial(tmp_path, clock=clock, stop={"time_s": 100.0}, checkpoints={"every_iterations": 1, "keep": 1})
+    clock.now += 59.0
+    progress = second.loop.advance(math.inf)
+    assert (progress.time_s, progress.status) == (99.0, "running")
+    clock.now += 1.0
+    assert second.loop.advance(math.inf).status == "completed"
+
+
+def test_the_window_of_100_episodes_goes_on_too(tmp_path):
+    task = {"stop": {"training_return": 20.0, "num_iterations": 300}, "evaluation": {"every_iterations": 999},
+            "checkpoints": {"every_iterations": 60, "keep": 1}}  # fmt: skip
+    first = Trial(tmp_path, **task)
+    for _ in range(70):
+        first.loop.advance(-1.0)
+    second = Trial(tmp_path, **task)
+    assert second.loop.iteration == 60
+    assert second.run().iteration == 100
+
+
+def test_the_newest_score_goes_on_too(tmp_path):
+    task = {"evaluation": {"every_iterations": 4}, "checkpoints": {"every_iterations": 3, "keep": 1}}
+    first = Trial(tmp_path, **task)
+    while first.loop.iteration < 6:
+        first.loop.advance(-1.0)
+    report = Trial(tmp_path, **task).loop.advance(-1.0)
+    assert (report.iteration, report.evaluated, report.evaluation_return) == (7, False, 4.0)
+    assert report.best_iteration == 4
+
+
+def test_a_torn_last_line_is_dropped(tmp_path):
+    first = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
+    first.run_to(4)
+    whole = first.store.results_path.read_text()
+    with first.store.results_path.open("a") as file:
+        file.write('{"iteration": 5, "num_env')
+    assert [record.iteration for record in first.results] == [1, 2, 3, 4]
+    second = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
+    assert second.store.results_path.read_text() == whole
+    second.run_to(6)
+    assert [record.iteration for record in second.results] == [1, 2, 3, 4, 5, 6]
+
+
+def test_half_written_checkpoints_are_removed_and_never_used(tmp_path):
+    first = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
+    first.run_to(2)
+    half = first.store.checkpoints_folder / ".000004.123"
+    shutil.copytree(first.store.checkpoints_folder / "000002", half)
+    second = Trial(tmp_path)
+    assert second.engine.builds == ["000002"]
+    assert not half.exists()
+
+
+def test_a_damaged_latest_checkpoint_is_an_error_and_no_fresh_start(tmp_path):
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1}).run_to(2)
+    store = TrialStore(tmp_path, "t0000")
+    (store.checkpoints_folder / "000002" / "engine.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"engine\.json"):
+        Trial(tmp_path)
+    # Nothing was lost by looking.
+    assert [record.iteration for record in store.read_iterations()] == [1, 2]
+
+
+def test_a_trial_that_had_reached_its_end_is_done_at_once(tmp_path):
+    """Killed after its last checkpoint, before anybody was told."""
+    Trial(tmp_path, stop={"num_iterations": 5}).run()
+    again = Trial(tmp_path, stop={"num_iterations": 5})
+    progress = again.loop.advance(math.inf)
+    assert (progress.status, progress.stop_reason) == ("completed", "num_iterations 5 >= 5")
+    assert (progress.iteration, progress.evaluation_return, progress.best_iteration) == (5, 5.0, 5)
+    assert again.engine.iteration == 5
+    assert len(again.results) == 5
+
+
+def test_a_process_runs_one_trial_after_another(tmp_path):
+    engine = FakeEngine()
+    for name in ("a", "b"):
+        trial = Trial(tmp_path / name, engine=engine, stop={"num_iterations": 3})
+        assert trial.run().iteration == 3
+        assert len(trial.results) == 3
+    assert engine.builds == [None, None]
+
+
+# -- the end that nobody wants
+
+
+def test_nan_weights_end_a_trial_as_failed(tmp_path):
+    trial = Trial(tmp_path, engine=FakeEngine(nan_from=5), checkpoints={"every_iterations": 2, "keep": 2})
+    progress = trial.run()
+    assert (progress.status, progress.iteration, progress.stop_reason) == ("failed", 5, None)
+    assert "NaN" in progress.error
+    assert "iteration 5" in progress.error
+    assert progress.ended_at is not None
+    # What was good before is there, and nothing of iteration 5 was saved.
+    assert progress.best_iteration == 4
+    assert trial.kept == [3, 4]
+    assert [(r.iteration, r.evaluation_return) for r in trial.results][-2:] == [(4, 4.0), (5, None)]
+
+
+def test_what_an_engine_raises_is_raised_and_what_was_done_is_written(tmp_path):
+    trial = Trial(tmp_path, engine=FakeEngine(raise_at=4), evaluation={"every_iterations": 50})
+    with pytest.raises(ZeroDivisionError, match="the cart left the track"):
+        trial.run()
+    assert [record.iteration for record in trial.results] == [1, 2, 3]
+
+
+def test_a_stop_request_pauses_with_a_checkpoint_of_this_very_iteration(tmp_path):
+    trial = Trial(tmp_path, evaluation={"every_iterations": 3})
+    trial.run_to(3)
+    trial.loop.advance(-1.0)
+    SweepStore(tmp_path).request_stop()
+    progress = trial.loop.advance(math.inf)
+    assert (progress.status, progress.iteration, progress.stop_reason) == ("paused", 4, None)
+    assert trial.kept == [3, 4]
+    assert trial.store.checkpoints()[-1].evaluation_return is None
+    assert progress.ended_at is not None
+    SweepStore(tmp_path).clear_stop_request()
+    again = Trial(tmp_path, evaluation={"every_iterations": 3})
+    assert again.engine.builds == ["000004"]
+    assert again.run_to(6).num_env_steps == 600
+
+
+def test_a_stop_request_right_after_a_checkpoint_writes_no_other(tmp_path):
+    trial = Trial(tmp_path)
+    trial.run_to(3)
+    before = {path: path.stat().st_mtime_ns for path in trial.store.checkpoints_folder.rglob("*")}
+    SweepStore(tmp_path).request_stop()
+    assert trial.loop.advance(math.inf).status == "paused"
+    assert {path: path.stat().st_mtime_ns for path in trial.store.checkpoints_folder.rglob("*")} == before
+
+
+def test_a_stop_request_before_the_first_iteration_saves_nothing(tmp_path):
+    trial = Trial(tmp_path)
+    SweepStore(tmp_path).request_stop()
+    progress = trial.loop.advance(math.inf)
+    assert (progress.status, progress.iteration, progress.checkpoints) == ("paused", 0, ())
+    assert trial.kept == []
+
+
+def test_results_tell_all_that_an_iteration_gave(tmp_path):
+    clock = FakeClock(step=0.5)
+    engine = FakeEngine(lambda iteration: (float(iteration), -2.0))
+    trial = Trial(tmp_path, engine=engine, clock=clock, stop={"num_iterations": 3}, evaluation={"every_iterations": 2})
+    trial.run()
+    lines = [json.loads(line) for line in trial.store.results_path.read_text().splitlines()]
+    assert [line["num_episodes"] for line in lines] == [2, 4, 6]
+    assert [line["episode_returns"] for line in lines] == [[1.0, -2.0], [2.0, -2.0], [3.0, -2.0]]
+    assert lines[0]["episode_lengths"] == [7, 7]
+    assert lines[1]["learner"] == {"total_loss": 0.5}
+    assert [line["evaluation_return"] for line in lines] == [None, 2.0, 3.0]
+    times = [line["time_s"] for line in lines]
+    assert times == sorted(times)
+    assert times[0] > 0
