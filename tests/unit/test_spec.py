@@ -5,29 +5,13 @@ import math
 from pathlib import Path
 
 import pytest
+from spec_errors import MINIMAL, errors, write
 
 from policies.errors import SpecError
 from policies.hyperparams import ACTIVATIONS
 from tune_jobs.search_space import Grid, Uniform
 from tune_jobs.spec import SweepSpec, check_sweep_name
 from tune_jobs.spec_file import find_preset, list_presets, load_spec
-
-MINIMAL = {"env": "CartPole-v1", "algorithm": "ppo"}
-
-
-def errors(*, base=MINIMAL, overrides=(), **fields):
-    with pytest.raises(SpecError) as caught:
-        load_spec({**base, **fields}, overrides)
-    assert caught.value.exit_code == 2
-    assert caught.value.hint
-    return caught.value.message
-
-
-def write(tmp_path, text):
-    path = tmp_path / "sweep.yaml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
 
 # -- what is read
 

@@ -1,26 +1,10 @@
 """Sweep files: `--set`, and their JSON Schema."""
 
 import pytest
+from spec_errors import MINIMAL, errors
 
 from policies.errors import SpecError
 from tune_jobs.spec_file import json_schema, list_presets, load_spec
-
-MINIMAL = {"env": "CartPole-v1", "algorithm": "ppo"}
-
-
-def errors(*, base=MINIMAL, overrides=(), **fields):
-    with pytest.raises(SpecError) as caught:
-        load_spec({**base, **fields}, overrides)
-    assert caught.value.exit_code == 2
-    assert caught.value.hint
-    return caught.value.message
-
-
-def write(tmp_path, text):
-    path = tmp_path / "sweep.yaml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
 
 # -- --set
 
