@@ -139,7 +139,8 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         """A process took the trial."""
         trial_id = _trial_id(trial)
         self.running.add(trial_id)
-        started_at = self._records[trial_id].started_at or time.time()
+        before = self._records[trial_id].started_at
+        started_at = time.time() if before is None else before
         self._change(trial_id, status="running", started_at=started_at, ended_at=None, error=None)
 
     def on_trial_result(

@@ -143,9 +143,10 @@ def test_a_restored_trial_does_not_see_its_first_episodes_again(engine, tmp_path
     assert first[0].isdisjoint(first[1])
 
 
-def test_dqn_fills_its_replay_buffer_again(engine, tmp_path):
+@pytest.mark.parametrize("num_env_runners", [0, 1])
+def test_dqn_fills_its_replay_buffer_again(engine, tmp_path, num_env_runners):
     """Ray does not save it; training on a handful of transitions would undo what was learned."""
-    task = make_task(tmp_path, "dqn", learning_starts=50)
+    task = make_task(tmp_path, "dqn", learning_starts=50, num_env_runners=num_env_runners)
     weights_after(engine, task, 2)
     sampled_before = engine.algorithm.local_replay_buffer.get_num_timesteps()
     assert sampled_before == 120

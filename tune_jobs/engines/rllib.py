@@ -104,8 +104,10 @@ class RLlibEngine:
         self.algorithm.env_runner_group.foreach_env_runner(reseed)
         if isinstance(self._hyperparams, DQNHyperparams):
             num_steps = max(self._hyperparams.learning_starts, self._hyperparams.train_batch_size)
+            share = math.ceil(num_steps / max(1, self._task.num_env_runners))
+            # Where env runners of their own sample, the main process has one without environments.
             episodes = self.algorithm.env_runner_group.foreach_env_runner(
-                lambda runner: runner.sample(num_timesteps=num_steps)
+                lambda runner: runner.sample(num_timesteps=share) if runner.env is not None else []
             )
             for chunk in episodes:
                 self.algorithm.local_replay_buffer.add(chunk)
