@@ -236,3 +236,10 @@ class Image:
             assert process.poll() is None, f"the service ended:\n{log.read_text()}"
             assert time.monotonic() < deadline, f"never healthy: {done.stdout}\n{log.read_text()}"
             time.sleep(1)
+
+    def wait_until(self, command, pattern: str, *, environment, timeout_s: float = 120) -> None:
+        """Run a command until its output matches."""
+        deadline = time.monotonic() + timeout_s
+        while not re.search(pattern, (done := self.run(command, environment=environment)).stdout):
+            assert time.monotonic() < deadline, f"{command} never said {pattern}: {done.stdout}"
+            time.sleep(1)

@@ -57,8 +57,11 @@ def test_the_composed_services_run_a_sweep_on_two_workers(image, tmp_path):
         log = tmp_path / f"worker-{number}.log"
         worker = image.begin(services["worker"]["command"], environment=services["worker"]["environment"], log=log)
         image.wait_until_healthy(services["worker"], worker, log)
+    # The health check of a worker asks for the head; that both have joined is seen in the cluster's CPUs.
+    image.wait_until(["ray", "status", "--address", "head:6379"], r"/2\.0 CPU", environment=services["head"]["environment"])
     launcher = services["launcher"]
-    settings = ["num_samples=1", "stop.num_env_steps=30000", "evaluation.num_episodes=2"]
+    # Long enough for the slower worker to start before the other has done all: 10 s a trial, never ended early.
+    settings = ["num_samples=1", "stop.num_env_steps=100000", "stop.training_return=null", "evaluation.num_episodes=2"]
     arguments = ["launch", "mine.yaml", "--address", "auto", "--json"]
     for setting in settings:
         arguments += ["--set", setting]
