@@ -1,5 +1,6 @@
 # make sweep   install into .venv, run the tutorial's sweep, show where its results lie
 # make test    install the test tools too, then lint, types and every test that can run here
+# make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make bench   the benchmarks, beside their peers, in one table
 
 PYTHON ?= python3
@@ -9,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test lint types bench clean
+.PHONY: install sweep test lint types learn bench clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -31,6 +32,11 @@ $(VENV)/installed-test: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
 	@touch $@
 
+# Box2D has wheels for some versions of Python only: without it the presets that need it are skipped, with the reason.
+$(VENV)/installed-learn: $(VENV)/installed-test
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[box2d]' || echo "Box2D cannot be installed here"
+	@touch $@
+
 $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
@@ -45,6 +51,9 @@ lint: $(VENV)/installed-test
 
 types: $(VENV)/installed-test
 	$(BIN)/mypy
+
+learn: $(VENV)/installed-learn
+	$(BIN)/python -m tests.learning
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m tests.benchmarks

@@ -334,4 +334,11 @@ def _value_axis(axes: Axes, values: Sequence[float], name: str | None, styles: M
         axes.set_xticks(range(len(labels)), [escape(label) or "all trials" for label in labels])
         axes.set_xlim(-0.6, len(labels) - 0.4)
     elif values and min(values) > 0 and max(values) > 10 * min(values):
+        from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
         axes.set_xscale("log")
+        # Over less than two decades the powers of ten alone are too few labels, and matplotlib's ten overlap.
+        subs = (1.0, 2.0, 5.0) if max(values) < 100 * min(values) else (1.0,)
+        axes.xaxis.set_major_locator(LogLocator(subs=subs))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -64,6 +64,18 @@ class IterationRecord(_Record):
         return finite_or_none(value)
 
 
+class ChangeRecord(_Record):
+    """A trial of a population that went on from a copy of another's checkpoint, with other hyperparameters."""
+
+    iteration: int = Field(description="Iterations the trial itself had done.")
+    num_env_steps: int = Field(description="Env steps the trial itself had done.")
+    source_trial_id: str = Field(description="Whose weights and optimizer state it went on with.")
+    source_iteration: int = Field(description="Iteration of the copied checkpoint in that trial.")
+    before: dict[str, Any] = Field(description="The trial's searched values until then.")
+    after: dict[str, Any] = Field(description="Its searched values from then on.")
+    time: float = Field(description="Unix time, seconds.")
+
+
 class TrialRecord(_Record):
     """One training run: one point and one seed."""
 
@@ -72,8 +84,10 @@ class TrialRecord(_Record):
     point_index: int
     seed_index: int = 0
     seed: int
-    point: dict[str, Any] = Field(description="The sampled values alone.")
+    point: dict[str, Any] = Field(description="The sampled values alone; in a population the newest.")
     hyperparams: dict[str, Any] = Field(default_factory=dict, description="All values, fixed ones too.")
+    has_point: bool = Field(default=True, description="False: the search method chooses the point when the trial starts.")
+    changes: tuple[ChangeRecord, ...] = Field((), description="What population based training changed, oldest first.")
     status: TrialStatus = "pending"
     stop_reason: str | None = Field(None, description="The stop rule, cap or scheduler that ended it.")
     error: str | None = Field(None, description="Why it failed, with the end of its log.")
@@ -96,6 +110,17 @@ class TrialRecord(_Record):
     @classmethod
     def _finite(cls, value: float | None) -> float | None:
         return finite_or_none(value)
+
+    def point_at(self, iteration: int) -> dict[str, Any]:
+        """The searched values the trial had in an iteration; they change only in a population."""
+        # A change after iteration i acts from i + 1 on.
+        later = [change for change in self.changes if change.iteration >= iteration]
+        return later[0].before if later else self.point
+
+    @property
+    def first_hyperparams(self) -> dict[str, Any]:
+        """All values the trial began with."""
+        return {**self.hyperparams, **self.changes[0].before} if self.changes else self.hyperparams
 
 
 class EvaluationRecord(_Record):
@@ -165,3 +190,4 @@ class SweepRecord(_Record):
     versions: dict[str, str] = Field(default_factory=dict)
     git_commit: str | None = None
     address: str | None = None
+    allowed_modules: tuple[str, ...] = Field((), description="Of the user's own, which its trials may import.")

@@ -1,7 +1,7 @@
 """The report of a sweep: one HTML file that needs nothing else; figures and tables also as files beside it.
 
     report/index.html   figures as inline SVG, videos as base64: it can be mailed as it is
-    report/trials.csv, iterations.csv, figures/*.png
+    report/trials.csv, iterations.csv, steps_to_solve.csv, figures/*.png
 
 Everything in the page is escaped (error texts and env ids come from elsewhere), and the page's own content
 security policy keeps it from running or loading anything but its one script.
@@ -21,7 +21,7 @@ from analysis import plots, report_data, report_tables, wording
 from analysis.plot_style import CSS_DARK, CSS_LIGHT, group_names, numeric_names, to_png, to_svg
 from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord
 from analysis.selection import score_trial
-from analysis.tables import iterations_frame, trials_frame, write_csv
+from analysis.tables import iterations_frame, steps_to_solve_frame, trials_frame, write_csv
 from policies.files import write_atomic
 
 if TYPE_CHECKING:
@@ -53,6 +53,13 @@ class _Sweep:
     def axis(self) -> str | None:
         """The searched number that stands on the horizontal axis."""
         return next(iter(numeric_names(self.trials)), None)
+
+    @property
+    def video_titles(self) -> Mapping[str, str]:
+        """Of the videos by name: a baseline has not been trained, so it has no before and after."""
+        if report_data.is_trained(self.sweep):
+            return _VIDEO_TITLES
+        return {"before": "Random actions", "after": "The winner"}
 
     @property
     def winner(self) -> str | None:
@@ -99,6 +106,7 @@ def build_report(
     goal = report_data.goal_of(sweep, best)
     write_csv(target / "trials.csv", trials_frame(trials, results, threshold=goal))
     write_csv(target / "iterations.csv", iterations_frame(results))
+    write_csv(target / "steps_to_solve.csv", steps_to_solve_frame(trials, results, threshold=goal))
     source = _Sweep(folder, sweep, trials, results, best, goal)
     figures = []
     for picture in _pictures(source):
@@ -112,7 +120,7 @@ def build_report(
     page = _render(
         **_content(source),
         figures=figures,
-        videos=[_embed(name, path) for name, path in videos.items() if path.is_file()],
+        videos=[_embed(name, path, source.video_titles) for name, path in videos.items() if path.is_file()],
     )
     write_atomic(target / "index.html", page)
     return target / "index.html"
@@ -127,7 +135,8 @@ def _content(source: _Sweep) -> dict[str, Any]:
     return {
         "sweep": sweep,
         "env_id": report_data.env_of(sweep),
-        "algorithm": str(sweep.spec.get("algorithm", "?")).upper(),
+        "algorithm": report_data.algorithm_of(sweep),
+        "trained": report_data.is_trained(sweep),
         "goal": goal,
         "headline": report_data.headline(sweep, trials, results, goal),
         "winner": None if best is None else report_data.winner_card(best, trials, sweep, source.folder),
@@ -135,6 +144,8 @@ def _content(source: _Sweep) -> dict[str, Any]:
         "sweep_path": wording.shown_path(source.folder),
         "trial_table": report_tables.trial_table(trials, results, goal=goal, best=best),
         "group_table": report_tables.group_table(trials, results, groups, goal=goal),
+        "steps_table": report_tables.steps_table(trials, results, goal=goal),
+        "fewest_env_steps": report_data.fewest_env_steps(trials, results, goal),
         "point_table": report_tables.point_table(trials),
         "failures": report_data.failures(trials),
         "facts": report_data.facts(sweep),
@@ -173,8 +184,9 @@ def _pictures(source: _Sweep) -> list[_Picture]:
             _Picture(
                 "score_per_episode",
                 "The winner, episode by episode",
-                "Every whole training episode of the winning trial, exploring, and how the last ones spread.",
-                lambda size: plots.score_per_episode(returns, goal=goal, size=size),
+                "Every whole training episode of the winning trial with goal and linear trend, exploring; beside them "
+                "how the last 50 spread.",
+                lambda size: plots.score_per_episode(returns, goal=goal, title="score per episode", size=size),
             )
         )
     return pictures
@@ -185,11 +197,11 @@ def _stem(name: str | None) -> str:
     return "".join(letter if letter.isalnum() or letter == "_" else "_" for letter in name or "trial")
 
 
-def _embed(name: str, path: Path) -> dict[str, str]:
+def _embed(name: str, path: Path, titles: Mapping[str, str]) -> dict[str, str]:
     media_type = _MEDIA_TYPES.get(path.suffix.lower(), "video/mp4")
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     return {
-        "title": _VIDEO_TITLES.get(name, name),
+        "title": titles.get(name, name),
         "kind": media_type.partition("/")[0],
         "source": f"data:{media_type};base64,{data}",
     }

@@ -14,8 +14,15 @@ import numpy as np
 from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord, finite_or_none
 from analysis.selection import NoUsableTrialError, error_summary, select_best
 from analysis.statistics import mean_with_ci, paired_difference
-from analysis.tables import format_value, trials_frame
+from analysis.tables import (
+    SOLVED_OVER_NUM_EPISODES,
+    format_value,
+    point_names,
+    steps_to_solve_frame,
+    trials_frame,
+)
 from analysis.wording import NONE, duration, moment, number, seed_range, shown_path
+from policies.portable import BASELINE_KINDS
 
 _MAX_ERROR_CHARS = 4_000
 
@@ -39,6 +46,17 @@ def env_of(sweep: SweepRecord) -> str:
     """The env id of a sweep, from its resolved spec."""
     env = sweep.spec.get("env")
     return str(env.get("id", "?")) if isinstance(env, Mapping) else str(env)
+
+
+def algorithm_of(sweep: SweepRecord) -> str:
+    """What a sweep ran, as a heading names it: "PPO", "Random play"."""
+    name = str(sweep.spec.get("algorithm", "?"))
+    return {"random": "Random play", "constant": "A constant action"}.get(name, name.upper())
+
+
+def is_trained(sweep: SweepRecord) -> bool:
+    """Whether a sweep's policies learn; those of baselines don't."""
+    return sweep.spec.get("algorithm") not in BASELINE_KINDS
 
 
 def headline(
@@ -102,6 +120,29 @@ def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
         f"{selection.trial.trial_id} leads with {selection.score:.1f}, not confirmed on fresh seeds yet.",
         f"Run: tune-jobs best {shlex.quote(shown_path(folder))}",
     )
+
+
+def fewest_env_steps(
+    trials: Sequence[TrialRecord], results: Mapping[str, Sequence[IterationRecord]], goal: float | None
+) -> str:
+    """Which hyperparameters solve the env in the fewest env steps, as a sentence; empty without a goal or trials."""
+    if goal is None or not trials:
+        return ""
+    frame = steps_to_solve_frame(trials, results, threshold=goal)
+    solving = frame[frame["num_solved"] > 0]
+    over = f"a mean training return of {number(goal)} over {SOLVED_OVER_NUM_EPISODES} episodes"
+    if solving.empty:
+        return f"No trial reached {over}."
+    first = solving.iloc[0]
+    values = ", ".join(f"{name} {number(first[name])}" for name in point_names(trials))
+    who = f"{values} reaches" if values else "The sweep's one point reaches"
+    median, num_seeds = finite_or_none(float(first["median_num_env_steps"])), int(first["num_seeds"])
+    if median is None:
+        return (
+            f"{who} {over} with only {int(first['num_solved'])} of {num_seeds} seeds, and no point with more than half."
+        )
+    seeds = "one seed" if num_seeds == 1 else f"the median of {num_seeds} seeds"
+    return f"{who} {over} in the fewest env steps: {number(median)} ({seeds})."
 
 
 def failures(trials: Sequence[TrialRecord]) -> list[dict[str, str]]:

@@ -14,9 +14,11 @@ import numpy as np
 from analysis.records import BestRecord, IterationRecord, TrialRecord
 from analysis.selection import PointScore, rank_points
 from analysis.statistics import iqm, mean_with_ci, small_sample_note
-from analysis.tables import format_value, groups_frame, point_names, trials_frame
+from analysis.tables import format_value, groups_frame, point_names, steps_to_solve_frame, trials_frame
 from analysis.wording import NONE, interval_text, is_number, number
 
+MAX_STEPS_ROWS = 20
+"""Points that the table of env steps to solve shows; the CSV file beside the report has them all."""
 _ONE_DECIMAL = {"score", "training_return", "time_s", "best_score", "mean_score"}
 
 
@@ -88,6 +90,32 @@ def group_table(
     columns |= {"best_score": "best score", "mean_score": "mean score"}
     rows = [[_cell(str(name), row[name]) for name in columns] for row in frame.to_dict("records")]
     return Table(list(columns.values()), rows)
+
+
+def steps_table(
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    *,
+    goal: float | None,
+) -> Table:
+    """The points that solve the env, those in the fewest env steps first, with each seed; none without a goal."""
+    if goal is None:
+        return Table([], [])
+    frame = steps_to_solve_frame(trials, results, threshold=goal)
+    names = point_names(trials)
+    seeds = [str(name) for name in frame.columns if str(name).startswith("num_env_steps_seed_")]
+    rows = []
+    for row in frame[frame["num_solved"] > 0].head(MAX_STEPS_ROWS).to_dict("records"):
+        each = ", ".join("not solved" if (cell := _cell("", row[name])).value is None else cell.text for name in seeds)
+        rows.append(
+            [
+                *(_cell(name, row[name]) for name in names),
+                Cell(row["num_solved"], f"{row['num_solved']} of {row['num_seeds']}"),
+                _cell("median_num_env_steps", row["median_num_env_steps"]),
+                Cell(each, each, "wide"),
+            ]
+        )
+    return Table([*names, "seeds that solve", "median env steps", "env steps of each seed"], rows)
 
 
 def point_table(trials: Sequence[TrialRecord]) -> Table:

@@ -110,7 +110,7 @@ def rank_points(trials: Sequence[TrialRecord]) -> list[PointScore]:
         points.append(
             PointScore(
                 point_index=point_index,
-                point=scored[0].trial.point,
+                point=scored[0].trial.point_at(scored[0].checkpoint.iteration),
                 score=sum(item.score for item in scored) / len(scored),
                 num_env_steps=sum(item.checkpoint.num_env_steps for item in scored) / len(scored),
                 num_seeds=num_seeds,

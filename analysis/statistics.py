@@ -104,6 +104,24 @@ def paired_difference(
     return mean_with_ci(left_array - right_array, rng=rng, num_resamples=num_resamples, level=level)
 
 
+def median_steps(steps: Sequence[int | None]) -> float | None:
+    """Median of the env steps that several seeds took to get somewhere.
+
+    Args:
+        steps: Of each seed; None: it never got there, which counts as later than any number of steps.
+
+    Returns:
+        The median; None if that is "never", as it is where half of the seeds or more never got there.
+
+    Raises:
+        ValueError: There are no seeds.
+    """
+    if not steps:
+        raise ValueError("the median of no seeds is not defined")
+    median = float(np.median([np.inf if value is None else float(value) for value in steps]))
+    return median if np.isfinite(median) else None
+
+
 def small_sample_note(num_values: int) -> str:
     """What a reader must know about an interval over this many seeds; empty if nothing."""
     if num_values < 2:

@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.records import IterationRecord, TrialRecord
+from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
+from analysis.statistics import median_steps
 from policies.files import write_atomic
 
 if TYPE_CHECKING:
@@ -43,6 +44,16 @@ def format_value(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return "x".join(str(item) for item in value)
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def describe_changes(trial: TrialRecord) -> str | None:
+    """What population based training changed, such as "at 4,096 env steps from t0003: lr 0.01"; None: nothing."""
+    texts = [
+        f"at {change.num_env_steps:,} env steps from {change.source_trial_id}: "
+        + ", ".join(f"{name} {format_value(value)}" for name, value in change.after.items())
+        for change in trial.changes
+    ]
+    return "; ".join(texts) or None
 
 
 def point_names(trials: Sequence[TrialRecord]) -> list[str]:
@@ -83,7 +94,8 @@ def trials_frame(
     missing if the trial cannot win), score_num_env_steps (when it was reached), training_return,
     evaluation_return (the newest), num_env_steps_to_solve (see `env_steps_to`; all missing without results
     and a threshold), num_iterations, num_env_steps, num_episodes, time_s, stop_reason, num_failures, error
-    (its first line).
+    (its first line). Of a population, the searched values are those its score was reached with, and the last column is
+    changes (see `describe_changes`).
     """
     import pandas as pd
 
@@ -91,11 +103,12 @@ def trials_frame(
     rows = []
     for trial in sorted(trials, key=lambda item: item.index):
         best = score_trial(trial)
+        point = trial.point if best is None else trial.point_at(best.checkpoint.iteration)
         rows.append(
             {
                 "trial_id": trial.trial_id,
                 "status": trial.status,
-                **{name: format_value(trial.point.get(name)) for name in names},
+                **{name: format_value(point.get(name)) for name in names},
                 "seed": trial.seed,
                 "score": best.score if best is not None else None,
                 "score_num_env_steps": best.checkpoint.num_env_steps if best is not None else None,
@@ -109,9 +122,11 @@ def trials_frame(
                 "stop_reason": trial.stop_reason,
                 "num_failures": trial.num_failures,
                 "error": error_summary(trial.error) if trial.error is not None else None,
+                "changes": describe_changes(trial),
             }
         )
-    frame = pd.DataFrame(rows, columns=["trial_id", "status", *names, *_AFTER_POINT])
+    changes = ["changes"] if any(trial.changes for trial in trials) else []
+    frame = pd.DataFrame(rows, columns=["trial_id", "status", *names, *_AFTER_POINT, *changes])
     floats = ["score", "training_return", "evaluation_return", "time_s"]
     # Int64 (capital I) is pandas' integer that can be missing: env steps stay whole numbers in the CSV.
     counts = ["score_num_env_steps", "num_env_steps_to_solve"]
@@ -170,6 +185,56 @@ def groups_frame(
     )
     order = ["min_num_env_steps_to_solve", "best_score"]
     return table.reset_index().sort_values(order, ascending=[True, False], na_position="last", ignore_index=True)
+
+
+def steps_to_solve_frame(
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    *,
+    threshold: float | None,
+) -> pd.DataFrame:
+    """One row a point: how many env steps it takes to solve the env, seed by seed (see `env_steps_to`).
+
+    Args:
+        trials: Of one sweep.
+        results: Iterations by trial id, oldest first.
+        threshold: Training return that counts as solved; None: none does.
+
+    Returns:
+        The columns point_index, one for each searched hyperparameter, num_seeds (those that have ended or solved),
+        num_solved, median_num_env_steps (missing if that is "never": a seed that ended unsolved counts as later than
+        any other) and num_env_steps_seed_<i>, which is missing where seed i did not solve. Fewest median env steps
+        first, then those that more seeds solved.
+    """
+    import pandas as pd
+
+    names = point_names(trials)
+    num_seeds = max((trial.seed_index for trial in trials), default=-1) + 1
+    columns = [f"num_env_steps_seed_{index}" for index in range(num_seeds)]
+    points: dict[int, list[TrialRecord]] = {}
+    for trial in trials:
+        points.setdefault(trial.point_index, []).append(trial)
+    rows = []
+    for index, members in sorted(points.items()):
+        steps = {trial.seed_index: env_steps_to(threshold, results.get(trial.trial_id, ())) for trial in members}
+        # A seed that still runs may solve it yet.
+        known = [steps[t.seed_index] for t in members if t.status in FINISHED or steps[t.seed_index] is not None]
+        solved = [value for value in known if value is not None]
+        rows.append(
+            {
+                "point_index": index,
+                **{name: format_value(members[0].point.get(name)) for name in names},
+                "num_seeds": len(known),
+                "num_solved": len(solved),
+                "median_num_env_steps": median_steps(known) if known else None,
+                **{column: steps.get(seed_index) for seed_index, column in enumerate(columns)},
+            }
+        )
+    before = ["point_index", *names, "num_seeds", "num_solved", "median_num_env_steps"]
+    frame = pd.DataFrame(rows, columns=[*before, *columns])
+    frame = frame.astype({"median_num_env_steps": "float64", **dict.fromkeys(columns, "Int64")})
+    order = ["median_num_env_steps", "num_solved", "point_index"]
+    return frame.sort_values(order, ascending=[True, False, True], na_position="last", ignore_index=True)
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:

@@ -2,16 +2,17 @@
 
 RLlib's own `SingleAgentEnvRunner` runs two connector pipelines and appends to one Python episode object per
 sub-environment at every step; with small networks that is two thirds of a PPO iteration. The default pipelines do
-nothing to a flat Box observation but copy it, so this runner steps arrays and cuts them into `SingleAgentEpisode`s
+nothing to a Box observation but copy it, so this runner steps arrays and cuts them into `SingleAgentEpisode`s
 when the fragment is done. The episodes are those RLlib's runner would have returned: a test compares the two on equal
 seeds.
 
-Array shapes: T vector steps, N sub-environments, D numbers an observation.
+Array shapes: T vector steps, N sub-environments.
 """
 
 from __future__ import annotations
 
 import uuid
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -26,10 +27,29 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
-from policies.envs import make_vector_env
+from policies.env_modules import allow_modules
+from policies.env_wrappers import FailurePenalty
+from policies.envs import ALLOWED_MODULES, FAILURE_PENALTY, make_vector_env
+from policies.replay import NStep, Transitions
 
 _WEIGHTS_SEQ_NO = "weights_seq_no"
+_UNPENALIZED = "unpenalized_rewards"
 _REWARDS_SPACE = gym.spaces.Box(float("-inf"), float("inf"), (), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What `ArrayEnvRunner.sample_transitions` gives."""
+
+    transitions: Transitions
+    num_env_steps: int
+    num_episodes: int
+    """Whole episodes that ended in it."""
+
+
+def _returned(fragment: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    """The env's own rewards, of which returns are made: without the failure penalty that the learner sees."""
+    return fragment.get(_UNPENALIZED, fragment["rewards"])
 
 
 class _Stream:
@@ -48,7 +68,7 @@ class _Stream:
 
 
 class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
-    """Samples fragments of (T, N) arrays; flat Box observations, Discrete or flat Box actions.
+    """Samples fragments of (T, N) arrays; Box observations, flat or images, Discrete or flat Box actions.
 
     `finished_episodes` gathers (return, length) of every whole episode, over fragment boundaries, until
     `pop_finished_episodes` takes them: RLlib's own mean covers only the episodes of one iteration.
@@ -61,8 +81,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._obs: NDArray[Any] | None = None
         self._seed_override: int | None = None
         self._just_ended: NDArray[np.bool_] | None = None
-        self._synced_steps = 0
-        self._steps_since_sync = 0
+        self._n_step: NStep | None = None
         super().__init__(**kwargs)
 
     def pop_finished_episodes(self) -> list[tuple[float, int]]:
@@ -87,7 +106,11 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         env_args = dict(self.config.env_config)
         if isinstance(self.config.env_config, EnvContext):
             env_args = dict(self.config.env_config.items())
-        self.env = DictInfoToList(make_vector_env(self.config.env, env_args, self.config.num_envs_per_env_runner))
+        # What build_algorithm_config tells beside the env's arguments.
+        allow_modules(env_args.pop(ALLOWED_MODULES, ()))
+        penalty = env_args.pop(FAILURE_PENALTY, None)
+        num_envs = self.config.num_envs_per_env_runner
+        self.env = DictInfoToList(make_vector_env(self.config.env, env_args, num_envs, failure_penalty=penalty))
         self.num_envs = self.env.num_envs
         self._needs_initial_reset = True
 
@@ -104,6 +127,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._obs, _ = self.env.env.reset(seed=seed)
         self._just_ended = np.zeros(self.num_envs, dtype=np.bool_)
         self._streams = [_Stream() for _ in range(self.num_envs)]
+        if self._n_step is not None:
+            self._n_step.forget()
         # The chunks of episodes that will now never end.
         self._ongoing_episodes_for_metrics.clear()
         self._needs_initial_reset = False
@@ -136,8 +161,55 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._increase_sampled_metrics(num_steps, len(done))
         return done + ongoing
 
-    def _collect(self, num_timesteps: int, *, explore: bool) -> dict[str, NDArray[Any]]:
+    def sample_transitions(self, num_timesteps: int, *, num_env_steps: int, num_episodes: int) -> Sample:
+        """Explore for at least so many env steps and return what a replay memory takes, without episode objects.
+
+        For DQN; the config must hold `hyperparams`.
+
+        Args:
+            num_timesteps: Env steps to make.
+            num_env_steps: Env steps of the trial so far, over all env runners: what epsilon may depend on.
+            num_episodes: Whole episodes of the trial so far, over all env runners: the same.
+        """
+        if self._needs_initial_reset or self._obs is None:
+            self._reset_arrays()
+        if self._n_step is None:
+            hyperparams = self.config.hyperparams
+            self._n_step = NStep(self.num_envs, hyperparams.n_step, hyperparams.gamma)
+        fragment = self._collect(num_timesteps, explore=True, num_env_steps=num_env_steps, num_episodes=num_episodes)
+        before = len(self.finished_episodes)
+        self._follow_episodes(fragment)
+        return Sample(
+            transitions=self._n_step.transitions(fragment),
+            num_env_steps=int(fragment["stepped"].sum()),
+            num_episodes=len(self.finished_episodes) - before,
+        )
+
+    def _follow_episodes(self, fragment: dict[str, NDArray[Any]]) -> None:
+        """Gather the returns of whole episodes, as `_cut` does for episode objects."""
+        stepped = fragment["stepped"]
+        rewards = np.where(stepped, _returned(fragment), 0.0)
+        ended = np.logical_or(fragment["terminated"], fragment["truncated"])
+        for index, stream in enumerate(self._streams):
+            start = 0
+            for stop in [*(np.flatnonzero(ended[:, index]) + 1), len(rewards)]:
+                stream.num_steps += int(stepped[start:stop, index].sum())
+                stream.episode_return += float(rewards[start:stop, index].sum(dtype=np.float64))
+                if stop > start and ended[stop - 1, index]:
+                    self.finished_episodes.append((stream.episode_return, stream.num_steps))
+                    stream.start()
+                start = stop
+
+    def _collect(
+        self, num_timesteps: int, *, explore: bool, num_env_steps: int = 0, num_episodes: int = 0
+    ) -> dict[str, NDArray[Any]]:
         """Step until at least num_timesteps env steps were made; returns columns of shape (T, N, ...).
+
+        Args:
+            num_timesteps: Env steps to make.
+            explore: Whether to explore, or to act greedily.
+            num_env_steps: Env steps of the trial so far, for exploration schedules that count them.
+            num_episodes: Whole episodes of the trial so far, for those that count episodes.
 
         Raises:
             Exception: Whatever the environment's step raises.
@@ -146,18 +218,17 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         assert self._just_ended is not None
         env = self.env.env
         num_runners = self.config.num_env_runners or 1
-        if self.num_env_steps_sampled_lifetime != self._synced_steps:
-            self._synced_steps, self._steps_since_sync = self.num_env_steps_sampled_lifetime, 0
-        # RLlib tells the count once an iteration, but DQN samples step by step: without counting on from there, its
-        # epsilon would only move between iterations.
-        steps_before = self._synced_steps // num_runners + self._steps_since_sync
+        by_episode = getattr(self.module, "epsilon_unit", None) == "episode"
         self.module.eval()
         rows: dict[str, list[NDArray[Any]]] = {"obs": [self._obs]}
-        num_steps = 0
+        num_steps = num_ended = 0
         with torch.no_grad():
             while num_steps < num_timesteps:
-                steps_so_far = (steps_before + num_steps) * num_runners
-                row = self._actions(self._obs, explore=explore, num_env_steps=steps_so_far)
+                # The other env runners step and end episodes at about the same pace.
+                units = (
+                    num_episodes + num_ended * num_runners if by_episode else num_env_steps + num_steps * num_runners
+                )
+                row = self._actions(self._obs, explore=explore, num_units=units)
                 to_env = self._for_env(row[Columns.ACTIONS])
                 self._obs, rewards, terminated, truncated, _ = env.step(to_env)
                 row |= {
@@ -166,24 +237,26 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                     "truncated": truncated,
                     "stepped": ~self._just_ended,
                 }
+                if isinstance(env, FailurePenalty):
+                    row[_UNPENALIZED] = env.unpenalized_rewards
                 # NEXT_STEP autoreset: the step after an episode's last one only resets; it is no env step.
                 num_steps += int(row["stepped"].sum())
                 self._just_ended = np.logical_or(terminated, truncated)
+                num_ended += int(self._just_ended.sum())
                 for key, value in row.items():
                     rows.setdefault(key, []).append(value)
                 rows["obs"].append(self._obs)
-        self._steps_since_sync += num_steps
         return {key: np.stack(values) for key, values in rows.items()}
 
-    def _actions(self, obs: NDArray[Any], *, explore: bool, num_env_steps: int) -> dict[str, NDArray[Any]]:
+    def _actions(self, obs: NDArray[Any], *, explore: bool, num_units: int) -> dict[str, NDArray[Any]]:
         """One forward pass: actions and what RLlib's learner wants beside them, each of shape (N, ...)."""
-        batch = {Columns.OBS: torch.from_numpy(np.ascontiguousarray(obs, dtype=np.float32)).to(self._device)}
-        if explore:
-            # Not `forward_exploration`: it walks the module tree twice a step to switch between eval and train mode,
-            # and this runner's module stays in eval mode.
-            out = self.module._forward_exploration(batch, t=num_env_steps)  # noqa: SLF001
-        else:
-            out = self.module._forward_inference(batch)  # noqa: SLF001
+        # Images stay bytes, a quarter of the memory; the module scales them.
+        dtype = np.uint8 if obs.dtype == np.uint8 else np.float32
+        batch = {Columns.OBS: torch.from_numpy(np.ascontiguousarray(obs, dtype=dtype)).to(self._device)}
+        # Not `forward_exploration`: it walks the module tree twice a step to switch between eval and train mode,
+        # and this runner's module stays in eval mode.
+        module = self.module
+        out = module._forward_exploration(batch, t=num_units) if explore else module._forward_inference(batch)  # noqa: SLF001
         if Columns.ACTIONS not in out:
             which = "exploration" if explore else "inference"
             dist = getattr(self.module, f"get_{which}_action_dist_cls")().from_logits(out[Columns.ACTION_DIST_INPUTS])
@@ -237,7 +310,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         columns = {
             key: values[start : stop + (key == "obs"), index]
             for key, values in fragment.items()
-            if key not in ("stepped", "terminated", "truncated")
+            if key not in ("stepped", "terminated", "truncated", _UNPENALIZED)
         }
         num_steps = stop - start
         columns[_WEIGHTS_SEQ_NO] = np.full(num_steps, self._weights_seq_no, dtype=np.int64)
@@ -262,7 +335,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             len_lookback_buffer=lookback,
         )
         stream.num_steps += num_steps
-        stream.episode_return += float(rewards[lookback:].sum(dtype=np.float64))
+        stream.episode_return += float(_returned(fragment)[start:stop, index].sum(dtype=np.float64))
         return episode
 
     def _keep_tail(self, stream: _Stream, chunk: SingleAgentEpisode) -> None:

@@ -3,9 +3,9 @@
 Words: an *env id* names a registered environment (`CartPole-v1`); *env arguments* are the keyword arguments
 its constructor takes; a *sub-environment* is one of the copies that a vector environment steps at once.
 
-Environments are always made from the registry's entry, never by handing the id to Gymnasium: Gymnasium would
-import the module that an id such as `module:Env-v0` names, which runs whatever code a sweep file or policy
-file asks for.
+What an id means is decided in `env_ids`; Gymnasium is given what was found, never the id. The env arguments may hold
+the reserved keys of `env_wrappers`, so that whoever makes the environment of a policy observes what the policy did in
+training.
 """
 
 from __future__ import annotations
@@ -19,19 +19,29 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import (
-    EnvSpec,
-    find_highest_version,
-    get_env_id,
-    load_env_creator,
-    parse_env_id,
-)
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from policies.env_plugins import load_env_plugins
+from policies.env_ids import find_env, normalize_env_id
+from policies.env_wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError
+from policies.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.hyperparams import Algorithm
+from policies.rendering import draw_without_display
 
-# Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file.
+__all__ = [
+    "ALLOWED_MODULES",
+    "FAILURE_PENALTY",
+    "EnvInfo",
+    "check_env",
+    "make_env",
+    "make_vector_env",
+    "normalize_env_id",
+]
+
+# In an env runner's `env_config` beside the env's arguments, never among them.
+FAILURE_PENALTY, ALLOWED_MODULES = "failure_penalty", "allowed_modules"
+# Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and what env runners are
+# told beside the env's arguments.
 _RESERVED_ARGS = frozenset(
     {
         "id",
@@ -41,8 +51,11 @@ _RESERVED_ARGS = frozenset(
         "vectorization_mode",
         "vector_kwargs",
         "wrappers",
+        FAILURE_PENALTY,
+        ALLOWED_MODULES,
     }
 )
+_RGB_ARRAY = "rgb_array"
 # The one argument of gym.make, not of the constructor, that a sweep file may set.
 _MAKE_ARGS = frozenset({"max_episode_steps"})
 
@@ -61,50 +74,13 @@ class EnvInfo:
     """Env steps after which an episode is truncated; None if it never is."""
     has_vector_entry_point: bool
     """Whether `make_vector_env` uses the env's own vectorised version."""
+    failure: FailureRule | None = None
+    """When its episodes end by failure; None: never, or it is not known."""
 
-
-def normalize_env_id(env_id: str) -> str:
-    """The registered id that a user's id means: `CartPole` is the newest `CartPole-v<n>`.
-
-    Raises:
-        EnvError: Not a string, empty, of the form `module:id`, or not registered.
-    """
-    if not isinstance(env_id, str) or not env_id.strip():
-        raise EnvError(
-            f"The env id is {env_id!r}, which names no environment.",
-            "Give a Gymnasium id such as 'CartPole-v1'.",
-        )
-    env_id = env_id.strip()
-    if ":" in env_id:
-        raise EnvError(
-            f"The env id {env_id!r} names a Python module to import; ids with a colon are refused, because "
-            "importing the module would run its code.",
-            "Install a package that registers the env with Gymnasium (entry point 'gymnasium.envs') and give "
-            f"the registered id alone: {env_id.rpartition(':')[2]!r}.",
-        )
-    problems: tuple[str, ...] = ()
-    found = _find_registered(env_id)
-    if found is None:
-        problems = load_env_plugins()
-        found = _find_registered(env_id)
-    if found is None:
-        reasons = "".join(f" {problem}" for problem in problems)
-        raise EnvError(
-            f"No environment {env_id!r} is registered with Gymnasium.{_did_you_mean(env_id)}{reasons}",
-            "Correct the id, or install the package that registers it.",
-        )
-    return found
-
-
-def _find_registered(env_id: str) -> str | None:
-    if env_id in gym.registry:
-        return env_id
-    try:
-        namespace, name, version = parse_env_id(env_id)
-        newest = find_highest_version(namespace, name) if version is None else None
-    except gym.error.Error:  # of no form that an id can have
-        return None
-    return None if newest is None else get_env_id(namespace, name, newest)
+    @property
+    def observes_images(self) -> bool:
+        """Whether observations are images, of shape (rows, columns, channels), and not vectors."""
+        return len(self.observation_space.shape or ()) == 3
 
 
 def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algorithm | None = None) -> EnvInfo:
@@ -121,15 +97,18 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
     """
     env = make_env(env_id, env_args)
     try:
-        spec = _registered(env_id)
+        env_id, spec = find_env(env_id)
+        kwargs = dict(env_args or {})
+        wrappers = ObservationWrappers.take_from(kwargs)
         info = EnvInfo(
-            env_id=spec.id,
+            env_id=env_id,
             env_args=copy.deepcopy(dict(env_args or {})),
             observation_space=env.observation_space,
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
             max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
-            has_vector_entry_point=_takes_vector_entry_point(spec, dict(env_args or {})),
+            has_vector_entry_point=not wrappers.pixels and _takes_vector_entry_point(spec, kwargs),
+            failure=failure_rule(env_id, spec, env.metadata, kwargs),
         )
         _check_observation_space(info)
         _check_action_space(info, algorithm)
@@ -142,30 +121,35 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
 def make_env(
     env_id: str, env_args: Mapping[str, Any] | None = None, *, render_mode: str | None = None
 ) -> gym.Env[Any, Any]:
-    """Make one environment, with its time limit.
+    """Make one environment, with its time limit and the wrappers that its arguments ask for.
 
     Args:
-        env_id: Gymnasium id.
-        env_args: Keyword arguments of its constructor; None: none.
+        env_id: Gymnasium id, or `module:Name`.
+        env_args: Keyword arguments of its constructor, and reserved keys of `env_wrappers`; None: none.
         render_mode: As Gymnasium's; None: no rendering.
 
     Raises:
         EnvError: The id is not registered, an argument is wrong, or the constructor failed.
     """
-    spec = _registered(env_id)
+    env_id, spec = find_env(env_id)
     kwargs = copy.deepcopy(dict(env_args or {}))
-    _check_args(spec, kwargs)
+    wrappers = ObservationWrappers.take_from(kwargs)
+    _check_args(env_id, spec, kwargs)
+    if wrappers.pixels:
+        if render_mode not in (None, _RGB_ARRAY):
+            raise EnvError(f"{env_id} observes pixels, so it cannot have the render mode {render_mode!r}.", "Use none.")
+        render_mode = _prepare_pixels(env_id, spec)
     if render_mode is not None:
         kwargs["render_mode"] = render_mode
     try:
         # The passive checker only prints warnings, at each env made, and slows every step.
-        return gym.make(spec, disable_env_checker=True, **kwargs)
+        return wrappers.wrap(gym.make(spec, disable_env_checker=True, **kwargs))
     except Exception as error:  # an env's constructor may raise anything
-        raise _cannot_make(spec.id, env_args, error) from error
+        raise _cannot_make(env_id, env_args, error) from error
 
 
 def make_vector_env(
-    env_id: str, env_args: Mapping[str, Any] | None, num_envs: int
+    env_id: str, env_args: Mapping[str, Any] | None, num_envs: int, *, failure_penalty: float | None = None
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Make a vector environment: the env's own vectorised version if it has one, else a loop over envs.
 
@@ -173,43 +157,77 @@ def make_vector_env(
     the env's time limit. Which one is made is `EnvInfo.has_vector_entry_point`.
 
     Args:
-        env_id: Gymnasium id.
-        env_args: Keyword arguments of its constructor; None: none.
+        env_id: Gymnasium id, or `module:Name`.
+        env_args: As `make_env`.
         num_envs: Number of sub-environments.
+        failure_penalty: Reward of steps that end by failure, for training alone: the outermost wrapper is then a
+            `FailurePenalty`. None: the env's own reward.
 
     Raises:
-        EnvError: As `make_env`.
+        EnvError: As `make_env`; or there is a penalty, and the env has no failure.
     """
-    spec = _registered(env_id)
+    env_id, spec = find_env(env_id)
     kwargs = copy.deepcopy(dict(env_args or {}))
-    _check_args(spec, kwargs)
+    wrappers = ObservationWrappers.take_from(kwargs)
+    _check_args(env_id, spec, kwargs)
+    # Before the render mode joins them.
+    own_args = dict(kwargs)
     try:
-        if _takes_vector_entry_point(spec, kwargs):
-            return gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
-        return gym.make_vec(spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True, **kwargs)
+        if not wrappers.pixels and _takes_vector_entry_point(spec, kwargs):
+            env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+        else:
+            if wrappers.pixels:
+                kwargs["render_mode"] = _prepare_pixels(env_id, spec)
+            env = gym.make_vec(
+                spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
+                wrappers=(wrappers.wrap_pixels,), **kwargs,
+            )  # fmt: skip
+        env = wrappers.wrap_vector(env)
     except Exception as error:  # an env's constructor may raise anything
-        raise _cannot_make(spec.id, env_args, error) from error
+        raise _cannot_make(env_id, env_args, error) from error
+    if failure_penalty is None:
+        return env
+    inner: Any = env.unwrapped
+    scalar = inner.envs[0] if isinstance(inner, gym.vector.SyncVectorEnv) else _creator(env_id, spec)
+    rule = failure_rule(env_id, spec, getattr(scalar, "metadata", {}), own_args)
+    return FailurePenalty(env, check_failure_penalty(env_id, rule, failure_penalty), failure_penalty)
 
 
-def _registered(env_id: str) -> EnvSpec:
-    return gym.registry[normalize_env_id(env_id)]
+def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
+    """The render mode that gives pixels.
+
+    Raises:
+        EnvError: The env does not have it.
+    """
+    draw_without_display()
+    modes = (getattr(_creator(env_id, spec), "metadata", None) or {}).get("render_modes")
+    if modes is not None and _RGB_ARRAY not in modes:
+        raise EnvError(
+            f"{env_id} has pixels: true, but cannot be drawn: it has no render mode {_RGB_ARRAY!r} "
+            f"(it has: {', '.join(map(str, modes)) or 'none'}).",
+            "Leave pixels out, or add the render mode to the env.",
+        )
+    return _RGB_ARRAY
 
 
-def _did_you_mean(env_id: str) -> str:
-    by_lower_case = {name.lower(): name for name in gym.registry}
-    close = difflib.get_close_matches(env_id.lower(), by_lower_case, n=3, cutoff=0.7)
-    names = [repr(by_lower_case[name]) for name in close]
-    return f" Did you mean {' or '.join(names)}?" if names else ""
+def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
+    """The env's class, or the function that makes it; None if the entry has none.
 
-
-def _check_args(spec: EnvSpec, env_args: dict[str, Any]) -> None:
-    """Refuse arguments that the constructor does not take, naming the nearest that it does."""
-    creator: Callable[..., Any] | None = spec.entry_point if callable(spec.entry_point) else None
-    if creator is None and isinstance(spec.entry_point, str):
+    Raises:
+        EnvError: The env's module cannot be imported.
+    """
+    if isinstance(spec.entry_point, str):
         try:
-            creator = load_env_creator(spec.entry_point)
+            creator: Callable[..., Any] = load_env_creator(spec.entry_point)
         except Exception as error:  # importing an env's module may raise anything
-            raise _cannot_make(spec.id, env_args, error) from error
+            raise _cannot_make(env_id, {}, error) from error
+        return creator
+    return spec.entry_point
+
+
+def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
+    """Refuse arguments that the constructor does not take, naming the nearest that it does."""
+    creator = _creator(env_id, spec)
     takes_any = creator is None
     known = set(_MAKE_ARGS)
     if creator is not None:
@@ -227,11 +245,11 @@ def _check_args(spec: EnvSpec, env_args: dict[str, Any]) -> None:
             close = difflib.get_close_matches(str(name), known, n=1)
             did_you_mean = f" Did you mean {close[0]!r}?" if close else ""
             raise EnvError(
-                f"{spec.id} takes no argument {name!r} (value {value!r}).{did_you_mean}",
+                f"{env_id} takes no argument {name!r} (value {value!r}).{did_you_mean}",
                 f"It takes: {', '.join(sorted(known))}.",
             )
     if "max_episode_steps" in env_args:
-        _check_limit(spec.id, env_args["max_episode_steps"])
+        _check_limit(env_id, env_args["max_episode_steps"])
 
 
 def _check_limit(env_id: str, limit: Any) -> None:
@@ -260,6 +278,8 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
 
 
 def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: Exception) -> EnvError:
+    if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
+        return error
     detail = str(error).strip().rstrip(".") or "no message"
     arguments = f" with arguments {dict(env_args)!r}" if env_args else ""
     message = f"The environment {env_id!r} cannot be made{arguments}: {type(error).__name__}: {detail}."
@@ -293,19 +313,21 @@ def _check_observation_space(info: EnvInfo) -> None:
     space = info.observation_space
     if not isinstance(space, gym.spaces.Box):
         raise EnvError(
-            f"{info.env_id} has observations of kind {type(space).__name__} ({space}); only 1-D Box "
-            "observations are supported.",
+            f"{info.env_id} has observations of kind {type(space).__name__} ({space}); only Box observations are "
+            "supported: vectors of numbers, and images.",
             "Choose an env whose observations are a vector of numbers, such as 'CartPole-v1'.",
         )
-    if len(space.shape) != 1 or space.shape[0] == 0:
+    if len(space.shape) not in (1, 3) or 0 in space.shape:
         raise EnvError(
-            f"{info.env_id} has observations of shape {space.shape}; only 1-D Box observations, of shape "
-            "(n,), are supported.",
-            "Choose an env whose observations are a vector of numbers; images need a convolutional network.",
+            f"{info.env_id} has observations of shape {space.shape}; only vectors, of shape (n,), and images, of shape "
+            "(rows, columns, channels), are supported.",
+            "Choose an env with such observations, or wrap it in one of your own that reshapes them.",
         )
-    if not np.issubdtype(space.dtype, np.floating):
+    if not np.issubdtype(space.dtype, np.floating) and not (info.observes_images and space.dtype == np.uint8):
+        kinds = "bytes (uint8) and floating-point numbers" if info.observes_images else "floating-point observations"
         raise EnvError(
-            f"{info.env_id} has observations of dtype {space.dtype}; only floating-point observations are supported.",
+            f"{info.env_id} has {'images' if info.observes_images else 'observations'} of dtype {space.dtype}; only "
+            f"{kinds} are supported.",
             "Register a variant of the env that returns float32 observations, scaled to about [-1, 1].",
         )
 

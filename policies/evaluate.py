@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from policies.envs import make_env, make_vector_env
 from policies.errors import EnvError, SpecError
-from policies.policy import NetworkPolicy, Policy
+from policies.policy import Policy
 
 MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
@@ -201,8 +201,7 @@ def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
         NonFiniteWeightsError: The policy's weights are NaN or infinite.
         EnvError: The policy is for other observations or actions.
     """
-    if isinstance(policy, NetworkPolicy):
-        policy.check_finite()
+    policy.check_finite()
     pairs = {
         "observations": (policy.observation_space, env.observation_space),
         "actions": (policy.action_space, env.action_space),
@@ -303,6 +302,8 @@ class _CartPoles:
 
         inner = scalar_env.unwrapped
         if type(inner) is not CartPoleEnv or (scalar_env.spec and scalar_env.spec.additional_wrappers):
+            return None
+        if scalar_env.observation_space.shape != inner.observation_space.shape:  # pixels, or stacked frames
             return None
         vector_env = make_vector_env(env_id, env_args, min(len(seeds), _MAX_CARTPOLES))
         if type(vector_env) is not CartPoleVectorEnv:

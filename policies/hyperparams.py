@@ -1,4 +1,4 @@
-"""Typed, frozen hyperparameters of PPO and DQN.
+"""Typed, frozen hyperparameters of PPO and DQN, and of the baselines that do not learn.
 
 Words: a *hyperparameter* is a value that training is given; *weights* are what training finds. Everything here can be
 fixed in a sweep file or searched. Units: env steps are steps of one sub-environment; sizes of batches are in env steps
@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Activation = Literal["linear", "relu", "tanh", "silu", "elu", "gelu"]
-Algorithm = Literal["ppo", "dqn"]
+Algorithm = Literal["ppo", "dqn", "random", "constant"]
+Initializer = Literal["torch", "he_uniform", "orthogonal"]
 ACTIVATIONS: tuple[str, ...] = ("linear", "relu", "tanh", "silu", "elu", "gelu")
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -21,21 +22,45 @@ NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 PositiveInt = Annotated[int, Field(ge=1)]
 
 
-class _Hyperparams(BaseModel):
-    """What PPO and DQN share."""
-
+class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class _Hyperparams(_Frozen):
+    """What PPO and DQN share."""
 
     hidden_sizes: tuple[PositiveInt, ...] = Field(
         (64, 64), min_length=1, description="Units of each hidden layer, from input to output."
     )
     activation: Activation = Field("tanh", description="Activation after each hidden layer.")
-    lr: PositiveFloat = Field(3e-4, description="Adam's learning rate, > 0.")
+    initializer: Initializer = Field(
+        "torch",
+        description="First weights: torch's default, he_uniform (He et al. 2015) or orthogonal (Saxe et al. 2014), "
+        "the last two with zero biases.",
+    )
+    conv_filters: tuple[tuple[PositiveInt, PositiveInt, PositiveInt], ...] | None = Field(
+        None,
+        min_length=1,
+        description="Convolutions before the hidden layers, for image observations: [channels, kernel, stride] each.",
+    )
+    normalize_observations: bool = Field(
+        False, description="Shift and scale observations by their running mean and deviation in training."
+    )
+    lr: PositiveFloat = Field(3e-4, description="The optimizer's learning rate, > 0.")
+    lr_final: NonNegativeFloat | None = Field(
+        None, description="Move lr linearly to this over lr_decay_steps; null: lr stays."
+    )
+    lr_decay_steps: PositiveInt | None = Field(None, description="Env steps from lr to lr_final.")
     gamma: Fraction = Field(0.99, description="Discount a step, in [0, 1].")
     grad_clip: PositiveFloat | None = Field(
         None, description="Clip the gradient's global L2 norm at this; null: no clipping."
     )
     num_envs: PositiveInt = Field(8, le=512, description="Sub-environments that one env runner steps at once.")
+
+    @model_validator(mode="after")
+    def _schedules_are_whole(self) -> Self:
+        _check_schedule("lr_final", self.lr_final, "lr_decay_steps", self.lr_decay_steps)
+        return self
 
 
 class PPOHyperparams(_Hyperparams):
@@ -51,6 +76,12 @@ class PPOHyperparams(_Hyperparams):
     vf_loss_coeff: NonNegativeFloat = Field(0.5, description="Weight of the value loss.")
     vf_share_layers: bool = Field(False, description="One encoder for policy and value function.")
     entropy_coeff: NonNegativeFloat = Field(0.0, description="Weight of the entropy bonus.")
+    entropy_coeff_final: NonNegativeFloat | None = Field(
+        None, description="Move entropy_coeff linearly to this over entropy_decay_steps; null: it stays."
+    )
+    entropy_decay_steps: PositiveInt | None = Field(
+        None, description="Env steps from entropy_coeff to entropy_coeff_final."
+    )
     use_kl_loss: bool = Field(False, description="Add RLlib's adaptive KL penalty to the loss.")
     kl_coeff: NonNegativeFloat = Field(0.2, description="First weight of the KL penalty, if used.")
     kl_target: PositiveFloat = Field(0.01, description="KL divergence the penalty aims at, if used.")
@@ -65,49 +96,132 @@ class PPOHyperparams(_Hyperparams):
                 f"minibatch_size {self.minibatch_size} is larger than train_batch_size {self.train_batch_size}: "
                 "lower the one or raise the other"
             )
+        _check_schedule(
+            "entropy_coeff_final", self.entropy_coeff_final, "entropy_decay_steps", self.entropy_decay_steps
+        )
         return self
 
 
 class DQNHyperparams(_Hyperparams):
-    """Hyperparameters of DQN (Mnih et al. 2015) with its double, dueling and n-step variants."""
+    """Hyperparameters of DQN (Mnih et al. 2015) with its double, dueling, n-step and prioritized variants.
+
+    A training phase follows every `train_freq` env steps; it makes `updates_per_env_step` updates for each of them.
+    """
 
     activation: Activation = Field("relu", description="Activation after each hidden layer.")
-    lr: PositiveFloat = Field(5e-4, description="Adam's learning rate, > 0.")
+    lr: PositiveFloat = Field(5e-4, description="The optimizer's learning rate, > 0.")
     num_envs: PositiveInt = Field(1, le=512, description="Sub-environments that one env runner steps at once.")
     train_batch_size: PositiveInt = Field(32, description="Transitions an update.")
     env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps an iteration, at least.")
-    training_intensity: PositiveFloat | None = Field(
-        None,
-        description="Transitions trained on for each env step sampled; null: one update a sampling step.",
+    train_freq: PositiveInt = Field(4, description="Env steps sampled between two training phases, at least num_envs.")
+    updates_per_env_step: PositiveFloat = Field(
+        0.25, description="Updates for each env step sampled (training intensity); may be a fraction."
     )
     double_q: bool = Field(True, description="Double Q-learning (van Hasselt et al. 2016).")
     dueling: bool = Field(True, description="Dueling heads (Wang et al. 2016).")
     n_step: PositiveInt = Field(1, description="Steps of reward before bootstrapping.")
-    adam_epsilon: PositiveFloat = Field(1e-8, description="Adam's epsilon.")
-    target_network_update_freq: PositiveInt = Field(500, description="Env steps between target updates.")
-    tau: Fraction = Field(1.0, description="Share of the online weights in a target update; 1: a copy.")
+    td_loss: Literal["huber", "mse"] = Field("huber", description="Loss of the TD error: Huber (delta 1) or squared.")
+    optimizer: Literal["adam", "rmsprop"] = Field("adam", description="Adam or RMSprop.")
+    optimizer_epsilon: PositiveFloat = Field(1e-8, description="Epsilon of Adam or RMSprop.")
+    adam_beta1: Fraction = Field(0.9, lt=1.0, description="Adam's decay of the mean gradient.")
+    adam_beta2: Fraction = Field(0.999, lt=1.0, description="Adam's decay of the squared gradient.")
+    rmsprop_rho: Fraction = Field(0.99, description="RMSprop's decay of the squared gradient.")
+    rmsprop_momentum: NonNegativeFloat = Field(0.0, description="RMSprop's momentum.")
+    target_network: bool = Field(True, description="Bootstrap from a target network; false: from the online one.")
+    target_update_freq: PositiveInt | None = Field(
+        None,
+        description="target_update_units between target updates; null: 500 if hard, every update if soft.",
+    )
+    target_update_unit: Literal["env_step", "episode"] = Field(
+        "env_step", description="What target_update_freq counts."
+    )
+    tau: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+        1.0, description="Share of the online weights in a target update; 1: hard, a copy; less: soft."
+    )
+    replay: Literal["uniform", "prioritized", "none"] = Field(
+        "uniform",
+        description="Batches drawn from a replay buffer uniformly or by priority (Schaul et al. 2016); none: the last "
+        "train_batch_size transitions.",
+    )
     replay_capacity: PositiveInt = Field(50_000, description="Transitions the replay buffer holds.")
+    prioritized_alpha: Fraction = Field(0.6, description="Exponent of the priorities; 0: uniform.")
+    prioritized_beta: Fraction = Field(0.4, description="Exponent of the importance weights.")
     learning_starts: int = Field(1_000, ge=0, description="Env steps sampled before the first update.")
-    prioritized_replay: bool = Field(False, description="Prioritized instead of uniform replay.")
+    epsilon_schedule: Literal["linear", "exponential", "geometric"] = Field(
+        "linear",
+        description="How epsilon moves with t units: linear, from initial to final in epsilon_decay; exponential: "
+        "final + (initial - final) exp(-t / epsilon_decay); geometric: initial exp(-t / epsilon_decay), never < final.",
+    )
+    epsilon_unit: Literal["env_step", "episode"] = Field("env_step", description="What the schedule counts.")
     epsilon_initial: Fraction = Field(1.0, description="Share of random actions at the start.")
     epsilon_final: Fraction = Field(0.05, description="Share of random actions at the end.")
-    epsilon_decay_steps: PositiveInt = Field(10_000, description="Env steps from the first share to the last.")
+    epsilon_decay: PositiveFloat = Field(10_000, description="Length or scale of the decay, in epsilon_units.")
+    epsilon_start: int = Field(0, ge=0, description="epsilon_units before the decay begins.")
+
+    @property
+    def target_update_interval(self) -> int | None:
+        """`target_update_units` between target updates; None: every update is followed by one."""
+        if self.target_update_freq is not None:
+            return self.target_update_freq
+        return 500 if self.tau == 1.0 else None
 
     @model_validator(mode="after")
     def _buffer_holds_a_batch(self) -> Self:
-        if self.replay_capacity < self.train_batch_size:
+        if self.replay != "none" and self.replay_capacity < self.train_batch_size:
             raise ValueError(
                 f"replay_capacity {self.replay_capacity} is smaller than train_batch_size {self.train_batch_size}: "
                 "raise the one or lower the other"
             )
         return self
 
+    @model_validator(mode="after")
+    def _variants_go_together(self) -> Self:
+        if not self.target_network:
+            if self.tau != 1.0:
+                raise ValueError(
+                    f"tau {self.tau:g} makes soft updates of a target network, but target_network is false: "
+                    "set target_network: true, or leave tau out"
+                )
+            if self.double_q:
+                raise ValueError(
+                    "double_q is true, which needs a target network, but target_network is false: set double_q: false, "
+                    "or target_network: true"
+                )
+        if self.replay == "none" and self.n_step > 1:
+            raise ValueError(
+                f"n_step {self.n_step} needs a replay buffer, but replay is none: set replay: uniform, or n_step: 1"
+            )
+        return self
 
-Hyperparams = PPOHyperparams | DQNHyperparams
-HYPERPARAMS_BY_ALGORITHM: dict[str, type[PPOHyperparams | DQNHyperparams]] = {
+
+class RandomHyperparams(_Frozen):
+    """Of the baseline that draws its actions uniformly."""
+
+    num_envs: PositiveInt = Field(1, le=512, description="Sub-environments stepped at once.")
+    env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps an iteration, at least.")
+
+
+class ConstantHyperparams(RandomHyperparams):
+    """Of the baseline that repeats one action."""
+
+    action: int | tuple[float, ...] = Field(0, description="The action: a number, or a list for continuous actions.")
+
+
+def _check_schedule(final_name: str, final: float | None, steps_name: str, steps: int | None) -> None:
+    if (final is None) is not (steps is None):
+        given, missing = (final_name, steps_name) if steps is None else (steps_name, final_name)
+        raise ValueError(f"{given} is given without {missing}: a schedule needs both; leave out both for none")
+
+
+TrainedHyperparams = PPOHyperparams | DQNHyperparams
+Hyperparams = TrainedHyperparams | RandomHyperparams
+HYPERPARAMS_BY_ALGORITHM: dict[str, type[Hyperparams]] = {
     "ppo": PPOHyperparams,
     "dqn": DQNHyperparams,
+    "random": RandomHyperparams,
+    "constant": ConstantHyperparams,
 }
+"""Of every algorithm, baselines last."""
 
 
 def make_hyperparams(algorithm: Algorithm, values: dict[str, Any]) -> Hyperparams:

@@ -1,9 +1,8 @@
-"""Policies that act: a network read from a portable file, or a random one; NumPy alone.
+"""Policies that act: a network read from a portable file, or a baseline without one; NumPy alone.
 
-`Policy.act` takes one observation, shape (n,), and gives one action ready for `env.step`, or takes a batch,
-shape (num, n), and gives a batch of actions. Acting is greedy. The actions are those that RLlib sends to the
-env: shifted by
-the start of a Discrete space, and for Box actions transformed as the policy file says:
+`Policy.act` takes one observation, shape (n,) or (height, width, channels), and gives one action ready for `env.step`,
+or takes a batch, shape (num, ...), and gives a batch of actions. Acting is greedy. The actions are those that RLlib
+sends to the env: shifted by the start of a Discrete space, and for Box actions transformed as the policy file says:
 
 * `unsquash`: the network's [-1, 1] is stretched over the bounds and clipped to them, if all bounds are
   finite; otherwise the action is left as it is (`normalize_actions=True`, RLlib's default).
@@ -24,7 +23,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from policies.envs import check_env
 from policies.errors import TuneJobsError
-from policies.portable import Layer, PortablePolicy, read_policy, space_from_description
+from policies.forward import ForwardPass
+from policies.portable import (
+    BASELINE_KINDS,
+    PolicyNetwork,
+    PortablePolicy,
+    read_policy,
+    space_from_description,
+)
 
 ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
 Action = int | NDArray[Any]
@@ -68,7 +74,7 @@ class Policy(ABC):
         """The greedy action for one observation, or for each of a batch.
 
         Args:
-            observations: Shape (n,) or (num, n).
+            observations: Of the shape of an observation, or (num, *that shape).
 
         Returns:
             For one observation what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
@@ -99,9 +105,16 @@ class Policy(ABC):
             int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", actions[0])
         )
 
+    def check_finite(self) -> None:  # noqa: B027 (a baseline has no weights)
+        """Raise unless all weights are finite.
+
+        Raises:
+            NonFiniteWeightsError: A weight is NaN or infinite; the message names its layer.
+        """
+
     @abstractmethod
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
-        """Actions for observations of shape (num, n)."""
+        """Actions for observations of shape (num, ...)."""
 
 
 class NetworkPolicy(Policy):
@@ -125,39 +138,23 @@ class NetworkPolicy(Policy):
             description=description or f"{portable.algorithm.upper()} on {portable.env_id}",
         )
         self.portable = portable
-        self._layers = [_Linear(layer) for layer in portable.network.layers]
-        self._to_actions = _action_function(portable, action_space)
+        self._forward = ForwardPass(portable.network)
+        self._to_actions = action_function(portable, action_space)
 
     def check_finite(self) -> None:
-        """Raise unless all weights are finite.
-
-        Raises:
-            NonFiniteWeightsError: A weight is NaN or infinite; the message names its layer.
-        """
-        for index, layer in enumerate(self.portable.network.layers):
-            count = sum(int(array.size - np.isfinite(array).sum()) for array in (layer.weight, layer.bias))
-            if count:
-                raise NonFiniteWeightsError(
-                    f"The policy {self.description!r} has {count} weights that are NaN or infinite in layer {index}.",
-                    "Lower the learning rate, or set grad_clip.",
-                )
+        """See `Policy.check_finite`."""
+        check_finite_tensors(self.portable.network, self.description)
 
     def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
         """The network's raw output: logits, means and log standard deviations, or Q-values or advantages.
 
         Args:
-            observations: Shape (num, n).
+            observations: Shape (num, n), or (num, height, width, channels).
 
         Returns:
             Shape (num, num_outputs).
         """
-        # One vector-matrix product an observation (a stack of 1-row matrices): a single product of the batch
-        # takes other BLAS kernels at other batch sizes, whose results differ in the last bit. It costs no
-        # more at these sizes.
-        x = np.asarray(observations, dtype=np.float32)[:, None, :]
-        for layer in self._layers:
-            x = layer(x)
-        return x[:, 0, :]
+        return self._forward(np.asarray(observations, dtype=np.float32))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         return self._to_actions(self.outputs(observations))
@@ -184,7 +181,7 @@ class RandomPolicy(Policy):
         seed: int = 0,
     ) -> None:
         # A copy: a space has one generator, and the env's own must not be touched.
-        own_space = _copy_space(action_space)
+        own_space = copy_space(action_space)
         super().__init__(observation_space, own_space, env_id=env_id, env_args=env_args, description="random policy")
         self.reset(seed)
 
@@ -210,8 +207,38 @@ class RandomPolicy(Policy):
         return np.array(actions).reshape(len(observations), *(self.action_space.shape or ()))
 
 
-def load_policy(path: str | Path) -> NetworkPolicy:
+def policy_from_portable(portable: PortablePolicy, description: str | None = None) -> Policy:
+    """The policy that a portable one describes: a network's, or a baseline's.
+
+    Args:
+        portable: What was read from a file, or made in memory.
+        description: Shown in captions and messages; None: by kind, algorithm and env.
+    """
+    network = portable.network
+    policy: Policy
+    if network.kind == "module":
+        from policies.module_policy import ModulePolicy  # torch and RLlib, which no other policy needs
+
+        return ModulePolicy(portable, description)
+    if network.kind not in BASELINE_KINDS:
+        return NetworkPolicy(portable, description)
+    spaces = (space_from_description(portable.observation_space), space_from_description(portable.action_space))
+    if network.kind == "random":
+        policy = RandomPolicy(*spaces, env_id=portable.env_id, env_args=portable.env_args)
+    else:
+        from policies.baselines import ConstantPolicy  # it is a Policy, so it imports this module
+
+        assert network.action is not None  # read_policy and save_policy have checked it
+        policy = ConstantPolicy(*spaces, network.action, env_id=portable.env_id, env_args=portable.env_args)
+    if description is not None:
+        policy.description = description
+    return policy
+
+
+def load_policy(path: str | Path) -> Policy:
     """Read a policy from its portable file; needs no Ray and no torch, and executes nothing in the file.
+
+    A policy whose network is an RLModule of the user's own does need them, and its class from an allowed module.
 
     Args:
         path: `policy.json`, `policy.safetensors`, or the folder that holds them.
@@ -219,25 +246,13 @@ def load_policy(path: str | Path) -> NetworkPolicy:
     Raises:
         NotFoundError: There is no such file.
         CheckpointError: The file is incomplete, altered, or of another format.
+        SpecError: It needs a class from a module that is not allowed.
     """
-    return NetworkPolicy(read_policy(Path(path)))
+    return policy_from_portable(read_policy(Path(path)))
 
 
-class _Linear:
-    """A layer, its weights transposed once into the order that the product wants."""
-
-    def __init__(self, layer: Layer) -> None:
-        self._matrix = np.ascontiguousarray(layer.weight.T, dtype=np.float32)
-        self._bias = np.asarray(layer.bias, dtype=np.float32)
-        self._activation = _ACTIVATION_FUNCTIONS[layer.activation]
-
-    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        x = np.matmul(x, self._matrix)
-        x += self._bias
-        return x if self._activation is None else self._activation(x)
-
-
-def _copy_space(space: gym.Space[Any]) -> gym.Space[Any]:
+def copy_space(space: gym.Space[Any]) -> ActionSpace:
+    """A space equal to this one, with a random generator of its own."""
     if isinstance(space, gym.spaces.Box):
         return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
     if isinstance(space, gym.spaces.Discrete):
@@ -245,7 +260,26 @@ def _copy_space(space: gym.Space[Any]) -> gym.Space[Any]:
     raise TuneJobsError(f"Actions of kind {type(space).__name__} are not supported.", "Use Box or Discrete actions.")
 
 
-def _action_function(
+def check_finite_tensors(network: PolicyNetwork, description: str) -> None:
+    """Raise unless all numbers of a network are finite.
+
+    Args:
+        network: Of any kind.
+        description: Of the policy, for the message.
+
+    Raises:
+        NonFiniteWeightsError: A weight or a statistic is NaN or infinite; the message says where.
+    """
+    for place, arrays in network.parts().items():
+        count = sum(int(array.size - np.isfinite(array).sum()) for array in arrays)
+        if count:
+            raise NonFiniteWeightsError(
+                f"The policy {description!r} has {count} weights that are NaN or infinite in {place}.",
+                "Lower the learning rate, or set grad_clip.",
+            )
+
+
+def action_function(
     portable: PortablePolicy, action_space: ActionSpace
 ) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
     """What turns the network's outputs, shape (num, num_outputs), into actions for the env."""
@@ -269,41 +303,3 @@ def _action_function(
         return actions.astype(dtype)
 
     return to_actions
-
-
-def _relu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.maximum(x, np.float32(0.0), out=x)
-
-
-def _tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.tanh(x, out=x)
-
-
-def _silu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    # x * sigmoid(x). For very negative x the exponential overflows, and the quotient is the right limit, -0.
-    with np.errstate(over="ignore"):
-        return np.asarray(x / (np.float32(1.0) + np.exp(-x)), dtype=np.float32)
-
-
-def _elu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    negative = np.expm1(np.minimum(x, np.float32(0.0)))
-    return np.asarray(np.where(x > 0, x, negative), dtype=np.float32)
-
-
-def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    # The exact form, torch's default: x times the normal distribution function.
-    # math.erf number by number costs a few times the product of the layer; only SciPy has a faster one.
-    cumulative = 0.5 * (1.0 + _erf(x / math.sqrt(2.0)).astype(np.float64))
-    return np.asarray(x * cumulative, dtype=np.float32)
-
-
-_erf = np.frompyfunc(math.erf, 1, 1)
-
-_ACTIVATION_FUNCTIONS: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]] | None] = {
-    "linear": None,
-    "relu": _relu,
-    "tanh": _tanh,
-    "silu": _silu,
-    "elu": _elu,
-    "gelu": _gelu,
-}

@@ -1,15 +1,11 @@
 """The portable policy file: what it takes to act, without Ray, torch or pickle.
 
 It is a pair of files side by side. `policy.safetensors` holds the weights; `policy.json` says what network
-they form, which environment it acts in and how it was trained, and carries the SHA-256 of the weights. Words:
-a *layer* is a linear map followed by an activation; the *network* is the chain of layers from observation to
-output; what the output means is the network's *kind*:
+they form (see `policies.policy_network`), which environment it acts in and how it was trained, and carries the SHA-256
+of the weights.
 
-* `categorical` (PPO, Discrete actions): one logit an action; greedy: the largest.
-* `gaussian` (PPO, Box actions): mean and log standard deviation of each component; greedy: the mean.
-* `q_values` (DQN): one value an action; greedy: the largest. Of a dueling network the layers end in the
-  advantages: the state value is the same for all actions, so it never changes which one is greedy, and is
-  left out.
+Formats: 1 had layers alone; 2 has all that `policies.policy_network` describes, and writes the bounds of a space as one
+number where they are all equal. Both are read.
 """
 
 from __future__ import annotations
@@ -22,38 +18,35 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import write_atomic
-from policies.hyperparams import ACTIVATIONS
+from policies.policy_network import (
+    BASELINE_KINDS,
+    ConvLayer,
+    Layer,
+    ModuleWeights,
+    NetworkKind,
+    Normalization,
+    PolicyNetwork,
+    action_problem,
+    network_from_json,
+    network_problem,
+    network_to_json,
+)
+from policies.spaces import describe_space, space_from_description
 
-FORMAT_VERSION = 1
+__all__ = [
+    "BASELINE_KINDS", "FORMAT_VERSION", "ActionTransform", "ConvLayer", "Layer", "ModuleWeights", "NetworkKind",
+    "Normalization", "PolicyNetwork", "PortablePolicy", "action_problem", "describe_space", "read_policy",
+    "save_policy", "space_from_description",
+]  # fmt: skip
 
-NetworkKind = Literal["categorical", "gaussian", "q_values"]
+FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, 2)
+
 ActionTransform = Literal["none", "unsquash", "clip"]
-
-
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """One linear map and the activation after it: `activation(weight @ x + bias)`."""
-
-    weight: NDArray[np.float32]
-    """Shape (num_outputs, num_inputs)."""
-    bias: NDArray[np.float32]
-    """Shape (num_outputs,)."""
-    activation: str = "linear"
-    """A name of `policies.hyperparams.ACTIVATIONS`."""
-
-
-@dataclass(frozen=True, eq=False)
-class PolicyNetwork:
-    """The layers from observation to output, and what the output means (see the module)."""
-
-    kind: NetworkKind
-    layers: tuple[Layer, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,53 +66,6 @@ class PortablePolicy:
     """Where it comes from: trial id, iteration, hyperparameters, seed, ... Free, and not needed to act."""
 
 
-def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
-    """A Box or Discrete space as a JSON object; infinite bounds become the strings "inf" and "-inf".
-
-    Raises:
-        CheckpointError: A space of another kind.
-    """
-    if isinstance(space, gym.spaces.Box):
-        return {
-            "type": "box",
-            "shape": [int(size) for size in space.shape],
-            "low": _numbers_to_json(space.low.tolist()),
-            "high": _numbers_to_json(space.high.tolist()),
-            "dtype": str(space.dtype),
-        }
-    if isinstance(space, gym.spaces.Discrete):
-        return {"type": "discrete", "n": int(space.n), "start": int(space.start)}
-    raise CheckpointError(
-        f"A policy file cannot describe a space of kind {type(space).__name__}.",
-        "Use Box or Discrete spaces.",
-    )
-
-
-def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | gym.spaces.Discrete[Any]:
-    """The space that `describe_space` described.
-
-    Raises:
-        CheckpointError: The description is incomplete or contradicts itself.
-    """
-    try:
-        if description["type"] == "discrete":
-            return gym.spaces.Discrete(int(description["n"]), start=int(description.get("start", 0)))
-        if description["type"] == "box":
-            dtype = np.dtype(description["dtype"])
-            low, high = (np.array(_numbers_from_json(description[key]), dtype=dtype) for key in ("low", "high"))
-            shape = tuple(int(size) for size in description["shape"])
-            return gym.spaces.Box(low.reshape(shape), high.reshape(shape), shape, dtype.type)
-    except (KeyError, TypeError, ValueError, AssertionError) as error:
-        raise CheckpointError(
-            f"A space is described as {dict(description)!r}, which makes none: {error}.",
-            "Write the policy file again from its checkpoint.",
-        ) from error
-    raise CheckpointError(
-        f"A space is described as of type {description['type']!r}; known are 'box' and 'discrete'.",
-        "Write the policy file again from its checkpoint, or update tune-jobs.",
-    )
-
-
 def save_policy(policy: PortablePolicy, folder: Path, stem: str = "policy") -> Path:
     """Write `<stem>.safetensors` and `<stem>.json` into a folder.
 
@@ -130,17 +76,13 @@ def save_policy(policy: PortablePolicy, folder: Path, stem: str = "policy") -> P
         The path of the JSON file.
 
     Raises:
-        CheckpointError: The layers do not form a network that maps the observations to the actions.
+        CheckpointError: The network does not map the observations to the actions.
         CannotRunError: The folder cannot be written.
     """
     from safetensors.numpy import save
 
     _check(policy, f"policy to save as {folder / stem}")
-    # Contiguous: safetensors writes the memory as it lies, so a transposed view would be written transposed.
-    tensors = {}
-    for index, layer in enumerate(policy.network.layers):
-        tensors[f"layers.{index}.weight"] = np.ascontiguousarray(layer.weight, dtype=np.float32)
-        tensors[f"layers.{index}.bias"] = np.ascontiguousarray(layer.bias, dtype=np.float32)
+    network, tensors = network_to_json(policy.network)
     weights: bytes = save(tensors)
     description = {
         "format_version": FORMAT_VERSION,
@@ -150,11 +92,7 @@ def save_policy(policy: PortablePolicy, folder: Path, stem: str = "policy") -> P
         "observation_space": policy.observation_space,
         "action_space": policy.action_space,
         "action_transform": policy.action_transform,
-        "network": {
-            "kind": policy.network.kind,
-            "activations": [layer.activation for layer in policy.network.layers],
-            "sizes": [layer.weight.shape[0] for layer in policy.network.layers],
-        },
+        "network": network,
         "weights_sha256": hashlib.sha256(weights).hexdigest(),
         "training": policy.training,
     }
@@ -186,9 +124,10 @@ def read_policy(path: Path) -> PortablePolicy:
     if not isinstance(description, dict) or "format_version" not in description:
         raise _broken(json_path, "is not a policy file: it has no format_version")
     version = description["format_version"]
-    if version != FORMAT_VERSION:
+    if version not in READABLE_VERSIONS:
+        known = " and ".join(str(number) for number in READABLE_VERSIONS)
         raise CheckpointError(
-            f"The policy file {json_path} has format version {version!r}; this tune-jobs reads {FORMAT_VERSION}.",
+            f"The policy file {json_path} has format version {version!r}; this tune-jobs reads {known}.",
             "Update tune-jobs, or write the policy file again from its checkpoint.",
         )
     digest = hashlib.sha256(weights).hexdigest()
@@ -236,15 +175,11 @@ def _assemble(description: dict[str, Any], weights: bytes, place: Path) -> Porta
 
     try:
         tensors = load(weights)
-        network = description["network"]
-        layers = tuple(
-            Layer(tensors.pop(f"layers.{index}.weight"), tensors.pop(f"layers.{index}.bias"), str(activation))
-            for index, activation in enumerate(network["activations"])
-        )
+        network = network_from_json(description["network"], tensors)
         if tensors:
             raise _broken(place, f"does not describe the tensors {sorted(tensors)}")
         return PortablePolicy(
-            network=PolicyNetwork(network["kind"], layers),
+            network=network,
             algorithm=str(description["algorithm"]),
             env_id=str(description["env_id"]),
             env_args=dict(description["env_args"]),
@@ -260,54 +195,18 @@ def _assemble(description: dict[str, Any], weights: bytes, place: Path) -> Porta
 
 
 def _check(policy: PortablePolicy, place: str) -> None:
-    """Check that the layers chain from the observations to the actions.
+    """Check that the network maps the observations to the actions.
 
     Raises:
-        CheckpointError: They do not, or a name is unknown.
+        CheckpointError: It does not, or a name is unknown.
     """
     observation_space = space_from_description(policy.observation_space)
     action_space = space_from_description(policy.action_space)
-    kind, transform = policy.network.kind, policy.action_transform
-    if kind not in get_args(NetworkKind):
-        problem = f"network kind {kind!r} is none of {', '.join(get_args(NetworkKind))}"
-    elif transform not in get_args(ActionTransform):
-        problem = f"action transform {transform!r} is none of {', '.join(get_args(ActionTransform))}"
-    elif isinstance(action_space, gym.spaces.Box) is not (kind == "gaussian"):
-        problem = f"a network of kind {kind!r} gives no actions of type {policy.action_space['type']!r}"
-    else:
-        num_actions = (
-            2 * math.prod(action_space.shape) if isinstance(action_space, gym.spaces.Box) else int(action_space.n)
-        )
-        problem = _layers_problem(policy.network.layers, math.prod(observation_space.shape or ()), num_actions)
+    problem = network_problem(policy.network, observation_space, action_space)
+    if policy.action_transform not in get_args(ActionTransform):
+        problem = f"action transform {policy.action_transform!r} is none of {', '.join(get_args(ActionTransform))}"
     if problem:
         raise CheckpointError(f"Wrong {place}: {problem}.", "Write the policy file again from its checkpoint.")
-
-
-def _layers_problem(layers: tuple[Layer, ...], num_inputs: int, num_outputs: int) -> str:
-    """Why the layers do not map so many inputs to so many outputs; empty if they do."""
-    size = num_inputs
-    for index, layer in enumerate(layers):
-        weight, bias = layer.weight, layer.bias
-        if layer.activation not in ACTIVATIONS:
-            return f"layer {index} has activation {layer.activation!r}; known are {', '.join(ACTIVATIONS)}"
-        if weight.ndim != 2 or weight.shape[1] != size:
-            return f"layer {index} has weights of shape {weight.shape}, but its input has {size} numbers"
-        if bias.shape != weight.shape[:1]:
-            return f"layer {index} has a bias of shape {bias.shape} but weights of shape {weight.shape}"
-        size = weight.shape[0]
-    if not layers:
-        return "the network has no layers"
-    return "" if size == num_outputs else f"the network has {size} outputs, but its actions need {num_outputs}"
-
-
-def _numbers_to_json(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_numbers_to_json(item) for item in value]
-    return str(float(value)) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _numbers_from_json(value: Any) -> Any:
-    return [_numbers_from_json(item) for item in value] if isinstance(value, list) else float(value)
 
 
 def _jsonable(value: Any) -> Any:

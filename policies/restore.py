@@ -16,12 +16,18 @@ from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
 
-from policies.errors import CheckpointError
-from policies.hyperparams import Hyperparams, PPOHyperparams
+from policies.errors import CheckpointError, TuneJobsError
+from policies.hyperparams import PPOHyperparams, TrainedHyperparams
+from policies.network_layers import normalization_of, observation_scale
+from policies.networks import RL_MODULE_KEY, import_module_class
+from policies.policy_network import conv_filters
 from policies.portable import (
     ActionTransform,
+    ConvLayer,
     Layer,
+    ModuleWeights,
     NetworkKind,
+    Normalization,
     PolicyNetwork,
     PortablePolicy,
     describe_space,
@@ -32,12 +38,15 @@ Weights = Mapping[str, NDArray[Any]]
 _RESTORE_HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
 
 
-def network_from_weights(weights: Weights, hyperparams: Hyperparams, action_space: gym.Space[Any]) -> PolicyNetwork:
-    """The greedy part of an RLlib module's weights as a chain of layers.
+def network_from_weights(
+    weights: Weights, hyperparams: TrainedHyperparams, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+) -> PolicyNetwork:
+    """The greedy part of the weights of one of our RLModules as a chain of layers.
 
     Args:
-        weights: State of the default PPO or DQN RLModule, numpy.
+        weights: State of a `policies.networks` module, numpy.
         hyperparams: What the module was built from.
+        observation_space: The environment's.
         action_space: The environment's.
 
     Raises:
@@ -51,36 +60,75 @@ def network_from_weights(weights: Weights, hyperparams: Hyperparams, action_spac
     else:
         # DQN's first head gives Q-values, or advantages where it is dueling: both have the same greedy action.
         encoder, head, kind = "encoder", "af", "q_values"
-    # Linear layers stand at every other place in RLlib's Sequential, the activations (none if linear) between them.
+    # Layers with weights stand at every other place, the activations (none if linear) between them.
     step = 1 if hyperparams.activation == "linear" else 2
+    filters = hyperparams.conv_filters or ()
+    conv = tuple(
+        ConvLayer(*_tensors(weights, f"{encoder}.conv.{position * step}"), stride, hyperparams.activation)
+        for position, (_, _, stride) in enumerate(filters)
+    )
     layers = [
-        _layer(weights, f"{encoder}.net.mlp.{position * step}", hyperparams.activation)
+        Layer(*_tensors(weights, f"{encoder}.mlp.{position * step}"), hyperparams.activation)
         for position in range(len(hyperparams.hidden_sizes))
     ]
-    layers.append(_layer(weights, f"{head}.net.mlp.0", "linear"))
-    sizes = tuple(len(layer.bias) for layer in layers[:-1])
-    if sizes != hyperparams.hidden_sizes:
-        raise CheckpointError(
-            f"The network has hidden layers {list(sizes)}, its hyperparameters say {list(hyperparams.hidden_sizes)}.",
-            "Report this: RLlib built another network than the one asked for.",
-        )
-    return PolicyNetwork(kind=kind, layers=tuple(layers))
+    layers.append(Layer(*_tensors(weights, head), "linear"))
+    network = PolicyNetwork(
+        kind=kind,
+        layers=tuple(layers),
+        conv=conv,
+        normalization=_normalization(weights) if hyperparams.normalize_observations else None,
+        scale=observation_scale(observation_space),
+    )
+    _check_sizes(network, hyperparams, weights, encoder)
+    return network
 
 
-def _layer(weights: Weights, name: str, activation: str) -> Layer:
-    try:
-        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
-    except KeyError as error:
+def _check_sizes(network: PolicyNetwork, hyperparams: TrainedHyperparams, weights: Weights, encoder: str) -> None:
+    """Check that the weights are those of the network the hyperparameters describe, and of no larger one."""
+    num_layers = sum(name.startswith(f"{encoder}.") and name.endswith(".weight") for name in weights)
+    filters = hyperparams.conv_filters or ()
+    pairs = {
+        "hidden layers": ([len(layer.bias) for layer in network.layers[:-1]], list(hyperparams.hidden_sizes)),
+        "convolutions": (conv_filters(network.conv), list(filters)),
+        "so many convolutions and hidden layers:": (num_layers, len(filters) + len(hyperparams.hidden_sizes)),
+        "normalised observations:": ("obs_mean" in weights, hyperparams.normalize_observations),
+    }
+    for what, (found, expected) in pairs.items():
+        if found != expected:
+            raise CheckpointError(
+                f"The network has {what} {found}, its hyperparameters say {expected}.",
+                "Report this: RLlib built another network than the one asked for.",
+            )
+
+
+def _tensors(weights: Weights, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Weight and bias of a layer."""
+    return _tensor(weights, f"{name}.weight"), _tensor(weights, f"{name}.bias")
+
+
+def _tensor(weights: Weights, name: str) -> NDArray[np.float32]:
+    if name not in weights:
         raise CheckpointError(
-            f"The RLModule has no weights {error.args[0]!r}; it has {sorted(weights)}.",
+            f"The RLModule has no weights {name!r}; it has {sorted(weights)}.",
             "Only the networks that tune-jobs builds can be made portable.",
-        ) from error
-    return Layer(np.array(weight, dtype=np.float32), np.array(bias, dtype=np.float32), activation)
+        )
+    return np.array(weights[name], dtype=np.float32)
+
+
+def _normalization(weights: Weights) -> Normalization:
+    return normalization_of(_tensor(weights, "obs_mean"), _tensor(weights, "obs_var"))
+
+
+def _module_network(algorithm: Algorithm, class_path: str) -> PolicyNetwork:
+    """What a module of the user's own is built from again, with the weights that acting needs."""
+    module = _modules(algorithm)["learner"]
+    weights = ModuleWeights(class_path, dict(module.model_config), module.get_state(inference_only=True))
+    return PolicyNetwork(kind="module", layers=(), module=weights)
 
 
 def portable_policy(
     algorithm: Algorithm,
-    hyperparams: Hyperparams,
+    hyperparams: TrainedHyperparams,
     *,
     env_id: str,
     env_args: dict[str, Any],
@@ -91,15 +139,19 @@ def portable_policy(
     Raises:
         CheckpointError: Its network is not the one the hyperparameters describe.
     """
-    weights = learner_weights(algorithm)
     config = algorithm.config
     module = algorithm.get_module()
     observation_space, action_space = module.observation_space, module.action_space
+    class_path = module.model_config.get(RL_MODULE_KEY)
+    if class_path is None:
+        network = network_from_weights(learner_weights(algorithm), hyperparams, observation_space, action_space)
+    else:
+        network = _module_network(algorithm, class_path)
     transform: ActionTransform = "none"
     if isinstance(action_space, gym.spaces.Box):
         transform = "unsquash" if config.normalize_actions else "clip" if config.clip_actions else "none"
     return PortablePolicy(
-        network=network_from_weights(weights, hyperparams, action_space),
+        network=network,
         algorithm="ppo" if isinstance(hyperparams, PPOHyperparams) else "dqn",
         env_id=env_id,
         env_args=env_args,
@@ -128,17 +180,76 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     Raises:
         CheckpointError: RLlib cannot restore it, or the weights are not the expected ones.
     """
+    if expected is not None and expected.module is not None:
+        # Before RLlib imports it: it would go on with another class where this one is missing.
+        import_module_class(expected.module.class_path)
     try:
         algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
     except Exception as error:
         raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
-    if expected is not None:
-        try:
+    try:
+        _check_module_classes(algorithm)
+        if expected is not None:
             check_weights(algorithm, expected)
-        except CheckpointError as error:
-            algorithm.stop()
-            raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
+    except TuneJobsError as error:
+        algorithm.stop()
+        raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
     return algorithm
+
+
+def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: PolicyNetwork) -> None:
+    """Give a new Algorithm the state of a checkpoint, and let its own settings act on it.
+
+    Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's.
+    Learning rate, betas and the like are the Algorithm's: RLlib's optimizer state brings the old ones along (2.60).
+
+    Args:
+        algorithm: Just built, with networks of the same shapes. It is stopped if this fails.
+        rllib_checkpoint: The folder RLlib's `save_to_path` wrote; a pickle, as in `restore_algorithm`.
+        expected: The network that was saved beside it.
+
+    Raises:
+        CheckpointError: RLlib cannot restore it, or the weights are not the expected ones.
+    """
+    settings = [
+        {name: value for name, value in group.items() if name != "params"} for group in _optimizer_groups(algorithm)
+    ]
+    try:
+        algorithm.restore_from_path(str(rllib_checkpoint.absolute()))
+        for group, own in zip(_optimizer_groups(algorithm), settings, strict=True):
+            group.update(own)
+        check_weights(algorithm, expected)
+    except TuneJobsError as error:
+        algorithm.stop()
+        raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
+    except Exception as error:
+        algorithm.stop()
+        raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
+
+
+def _optimizer_groups(algorithm: Algorithm) -> list[dict[str, Any]]:
+    """The optimizer's groups of parameters, each with its settings; as in torch."""
+    learner = algorithm.learner_group._learner  # noqa: SLF001 - RLlib has no public way to the local one
+    return [group for _, item in learner.get_optimizers_for_module(DEFAULT_MODULE_ID) for group in item.param_groups]
+
+
+def _modules(algorithm: Algorithm) -> dict[str, Any]:
+    """The RLModules of this process: the one that learns, and the one that acts, if it is here."""
+    modules = {"learner": algorithm.learner_group._learner.module[DEFAULT_MODULE_ID]}  # noqa: SLF001
+    runner = algorithm.env_runner
+    if runner is not None and runner.module is not None:
+        modules["env runner"] = runner.module
+    return modules
+
+
+def _check_module_classes(algorithm: Algorithm) -> None:
+    for source, module in _modules(algorithm).items():
+        class_path = module.model_config.get(RL_MODULE_KEY)
+        if class_path is not None and type(module) is not import_module_class(class_path):
+            raise CheckpointError(
+                f"the restored {source} has a module of class {type(module).__name__}, but {class_path} was saved.",
+                _RESTORE_HINT,
+            )
 
 
 def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
@@ -147,14 +258,14 @@ def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
     Raises:
         CheckpointError: They differ.
     """
-    runner = algorithm.env_runner
-    sources = {"learner": learner_weights(algorithm)}
-    if runner is not None and runner.module is not None:
-        sources["env runner"] = runner.module.get_state()
+    sources = {source: module.get_state() for source, module in _modules(algorithm).items()}
     for source, weights in sources.items():
-        held = {array.tobytes() for array in (np.asarray(value, dtype=np.float32) for value in weights.values())}
-        for number, layer in enumerate(expected.layers):
-            if layer.weight.tobytes() not in held or layer.bias.tobytes() not in held:
+        held = {np.asarray(value).tobytes() for value in weights.values()}
+        if "obs_mean" in weights:
+            normalization = _normalization(weights)
+            held |= {normalization.mean.tobytes(), normalization.std.tobytes()}
+        for place, arrays in expected.parts().items():
+            if any(array.tobytes() not in held for array in arrays):
                 raise CheckpointError(
-                    f"the restored {source} does not hold the saved weights of layer {number}.", _RESTORE_HINT
+                    f"the restored {source} does not hold the saved weights of {place}.", _RESTORE_HINT
                 )

@@ -8,60 +8,31 @@ PPO's value layers).
 from __future__ import annotations
 
 import math
-from typing import Any, TypeAlias
+from typing import Any
 
-import torch
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
-from ray.rllib.algorithms.dqn import DQNConfig
-from ray.rllib.algorithms.dqn.torch.dqn_torch_learner import DQNTorchLearner
 from ray.rllib.algorithms.ppo import PPOConfig
 
+from policies.dqn_algorithm import ReplayDQNConfig
+from policies.dqn_learner import DQNLearner
+from policies.env_modules import allowed_modules
 from policies.env_runner import ArrayEnvRunner
-from policies.hyperparams import DQNHyperparams, Hyperparams, PPOHyperparams
-
-# RLlib resolves an activation by these names (its models/utils.py): a torch.nn class name or one of its own.
-RLLIB_ACTIVATIONS = {
-    "linear": "linear", "relu": "relu", "tanh": "tanh", "silu": "silu", "elu": "elu", "gelu": "GELU",
-}  # fmt: skip
-
-ModelConfig: TypeAlias = dict[str, Any]
-
-
-class AdamEpsilonDQNLearner(DQNTorchLearner):  # type: ignore[misc]
-    """RLlib's DQN learner, whose Adam takes `adam_epsilon`; on the new API stack RLlib ignores it (2.60)."""
-
-    def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
-        """Register Adam for a module, with the config's learning rate and epsilon."""
-        params = self.get_parameters(self.module[module_id])
-        self.register_optimizer(
-            module_id=module_id,
-            optimizer=torch.optim.Adam(params, eps=config.adam_epsilon),
-            params=params,
-            lr_or_lr_schedule=config.lr,
-        )
-
-
-def model_config(hyperparams: Hyperparams) -> ModelConfig:
-    """RLlib's `model_config` of the network: hidden layers, then one linear layer a head."""
-    config: ModelConfig = {
-        "fcnet_hiddens": list(hyperparams.hidden_sizes),
-        "fcnet_activation": RLLIB_ACTIVATIONS[hyperparams.activation],
-        # The heads are one linear layer each: the portable policy counts on it.
-        "head_fcnet_hiddens": [],
-    }
-    if isinstance(hyperparams, PPOHyperparams):
-        config["vf_share_layers"] = hyperparams.vf_share_layers
-    return config
+from policies.envs import ALLOWED_MODULES, FAILURE_PENALTY
+from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.networks import module_spec
+from policies.ppo_learner import PPOLearner
 
 
 def build_algorithm_config(
-    hyperparams: Hyperparams,
+    hyperparams: TrainedHyperparams,
     *,
     env_id: str,
     env_args: dict[str, Any] | None = None,
     seed: int,
     num_env_runners: int = 0,
     num_gpus: float = 0.0,
+    failure_penalty: float | None = None,
+    rl_module: str | None = None,
 ) -> AlgorithmConfig:
     """The RLlib config of one trial; `.build_algo()` makes the Algorithm.
 
@@ -72,17 +43,26 @@ def build_algorithm_config(
         seed: Seed of weights, exploration and environments.
         num_env_runners: Processes that sample beside the main one; 0: the main process samples.
         num_gpus: GPUs of the learner; 0: the CPU.
+        failure_penalty: Reward of steps that end by failure, which the learner sees and returns do not; None: the
+            env's own.
+        rl_module: `module:Class` of an RLModule of the user's own, in an allowed module; None: ours.
     """
-    config = _ppo(hyperparams) if isinstance(hyperparams, PPOHyperparams) else _dqn(hyperparams, num_env_runners)
+    config = _ppo(hyperparams) if isinstance(hyperparams, PPOHyperparams) else _dqn(hyperparams)
+    env_config = dict(env_args or {})
+    if failure_penalty is not None:
+        env_config[FAILURE_PENALTY] = failure_penalty
+    if modules := allowed_modules():
+        # Env runners of their own processes have not been told yet.
+        env_config[ALLOWED_MODULES] = modules
     return (
-        config.environment(env_id, env_config=env_args or {}, disable_env_checking=True)
+        config.environment(env_id, env_config=env_config, disable_env_checking=True)
         .env_runners(
             env_runner_cls=ArrayEnvRunner,
             num_env_runners=num_env_runners,
             num_envs_per_env_runner=hyperparams.num_envs,
         )
         .learners(num_learners=0, num_gpus_per_learner=num_gpus)
-        .rl_module(model_config=model_config(hyperparams))
+        .rl_module(rl_module_spec=module_spec(hyperparams, rl_module))
         # A greedy evaluation of our own, on fixed seeds, takes the place of RLlib's.
         .evaluation(evaluation_interval=None)
         # An environment that raises ends the trial with its error; RLlib's own restarts have no cap. An env runner
@@ -93,9 +73,19 @@ def build_algorithm_config(
     )
 
 
+def _schedule(value: float, final: float | None, num_env_steps: int | None) -> float | list[list[float]]:
+    """RLlib's form of a value that moves linearly to another one over so many env steps, or stays if there is none."""
+    if final is None or num_env_steps is None:
+        return value
+    return [[0, value], [num_env_steps, final]]
+
+
 def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
-    return PPOConfig().training(
-        lr=hyperparams.lr,
+    entropy_coeff = _schedule(
+        hyperparams.entropy_coeff, hyperparams.entropy_coeff_final, hyperparams.entropy_decay_steps
+    )
+    config = PPOConfig().training(
+        lr=_schedule(hyperparams.lr, hyperparams.lr_final, hyperparams.lr_decay_steps),
         gamma=hyperparams.gamma,
         grad_clip=hyperparams.grad_clip,
         grad_clip_by="global_norm",
@@ -103,7 +93,7 @@ def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
         clip_param=hyperparams.clip_param,
         vf_clip_param=math.inf if hyperparams.vf_clip_param is None else hyperparams.vf_clip_param,
         vf_loss_coeff=hyperparams.vf_loss_coeff,
-        entropy_coeff=hyperparams.entropy_coeff,
+        entropy_coeff=entropy_coeff,
         use_kl_loss=hyperparams.use_kl_loss,
         kl_coeff=hyperparams.kl_coeff,
         kl_target=hyperparams.kl_target,
@@ -111,33 +101,21 @@ def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
         minibatch_size=hyperparams.minibatch_size,
         num_epochs=hyperparams.num_epochs,
     )
+    return config.learners(learner_class=PPOLearner)
 
 
-def _dqn(hyperparams: DQNHyperparams, num_env_runners: int) -> AlgorithmConfig:
-    intensity = hyperparams.training_intensity
-    if intensity is not None and num_env_runners > 0:
-        # RLlib's `calculate_rr_weights` counts the main process as one more that samples, and would train more (2.60).
-        intensity *= num_env_runners / (num_env_runners + 1)
-    buffer: dict[str, Any] = {"type": "EpisodeReplayBuffer", "capacity": hyperparams.replay_capacity}
-    if hyperparams.prioritized_replay:
-        buffer = {**buffer, "type": "PrioritizedEpisodeReplayBuffer", "alpha": 0.6, "beta": 0.4}
-    epsilon = [(0, hyperparams.epsilon_initial), (hyperparams.epsilon_decay_steps, hyperparams.epsilon_final)]
-    config = DQNConfig().training(
+def _dqn(hyperparams: DQNHyperparams) -> AlgorithmConfig:
+    config = ReplayDQNConfig()
+    config.hyperparams = hyperparams
+    config.training(
         lr=hyperparams.lr,
         gamma=hyperparams.gamma,
-        grad_clip=hyperparams.grad_clip,
-        grad_clip_by="global_norm",
         train_batch_size_per_learner=hyperparams.train_batch_size,
-        training_intensity=intensity,
         double_q=hyperparams.double_q,
         dueling=hyperparams.dueling,
-        n_step=hyperparams.n_step,
-        adam_epsilon=hyperparams.adam_epsilon,
-        target_network_update_freq=hyperparams.target_network_update_freq,
-        tau=hyperparams.tau,
-        replay_buffer_config=buffer,
-        num_steps_sampled_before_learning_starts=hyperparams.learning_starts,
-        epsilon=epsilon,
+        # Sampling makes the n-step sums: see policies/replay.py.
+        n_step=1,
     )
-    config.learners(learner_class=AdamEpsilonDQNLearner)
-    return config.reporting(min_sample_timesteps_per_iteration=hyperparams.env_steps_per_iteration)
+    config.learners(learner_class=DQNLearner)
+    # One training step is one iteration.
+    return config.reporting(min_sample_timesteps_per_iteration=0, min_train_timesteps_per_iteration=0)

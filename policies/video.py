@@ -6,8 +6,6 @@ drawn, so a long episode needs no memory for its MP4; the GIF keeps a bounded nu
 
 from __future__ import annotations
 
-import os
-import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -26,6 +24,7 @@ from policies.errors import EnvError, SpecError
 from policies.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
 from policies.movies import GifWriter, Mp4Writer
 from policies.policy import Policy
+from policies.rendering import draw_without_display
 
 _HOLD_S = 1.0  # the last picture stays, so that the final return can be read
 _DEFAULT_FPS = 30.0
@@ -233,11 +232,7 @@ class _Film:
 
 
 def _make_drawable_env(env_id: str, env_args: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
-    # pygame would open a window's connection and greet on standard output.
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+    draw_without_display()
     with warnings.catch_warnings():
         # Gymnasium warns of an unknown render mode; it is an error here, raised below.
         warnings.simplefilter("ignore")

@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from policies.env_modules import allow_modules as allow_modules
     from policies.errors import TuneJobsError as TuneJobsError
     from policies.policy import load_policy as load_policy
     from tune_jobs.spec import SweepSpec as SweepSpec
@@ -37,6 +38,7 @@ _SWEEPS = (
 )  # fmt: skip
 _HOME = {
     "TuneJobsError": "policies.errors",
+    "allow_modules": "policies.env_modules",
     "load_policy": "policies.policy",
     "SweepSpec": "tune_jobs.spec",
     "list_presets": "tune_jobs.spec_file",

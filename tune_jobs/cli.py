@@ -15,6 +15,8 @@ from policies.errors import SpecError
 from tune_jobs.cli_base import (
     DEBUG,
     CommandGroup,
+    action_option,
+    allow_module_option,
     env_option,
     json_option,
     num_episodes_option,
@@ -71,7 +73,8 @@ def launch(
     from tune_jobs import cli_output
 
     if dry_run:
-        loaded, plan = _plan(spec, overrides, name=name, address=options["address"])
+        with stdout_for(as_json=as_json):
+            loaded, plan = _plan(spec, overrides, name=name, address=options["address"])
         cli_output.show_plan(loaded, plan, as_json=as_json)
         return
     from tune_jobs import sweeps
@@ -183,6 +186,7 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
 @cli.command()
 @click.argument("sweep")
 @num_episodes_option
+@allow_module_option
 @storage_option
 @json_option
 def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -> None:
@@ -199,6 +203,8 @@ def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -
 @num_episodes_option
 @click.option("--first-seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the first episode; they count up.")
 @env_option
+@action_option
+@allow_module_option
 @storage_option
 @json_option
 def evaluate(
@@ -207,20 +213,21 @@ def evaluate(
     num_episodes: int,
     first_seed: int | None,
     env_id: str | None,
+    action: int | tuple[float, ...] | None,
     storage: str | None,
     as_json: bool,
 ) -> None:
     """Run greedy episodes of a policy, beside a random one.
 
     SOURCE is a sweep (its best policy), SWEEP/TRIAL such as mysweep/t0003, a checkpoint folder, a policy
-    file, or 'random' with --env.
+    file, or a baseline with --env: 'random', or 'constant' with --action.
     """
     from tune_jobs import cli_output, sweeps
 
-    _check_random(source, env_id)
+    _check_baseline(source, env_id)
     with stdout_for(as_json=as_json):
         policy, random = sweeps.evaluate(
-            source, storage=storage, num_episodes=num_episodes, first_seed=first_seed, env_id=env_id
+            source, storage=storage, num_episodes=num_episodes, first_seed=first_seed, env_id=env_id, action=action
         )
     cli_output.show_evaluation(policy, random, as_json=as_json)
 
@@ -230,10 +237,19 @@ def evaluate(
 @click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the files go.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
+@action_option
+@allow_module_option
 @storage_option
 @json_option
 def video(
-    *, source: str, output: Path | None, seed: int | None, env_id: str | None, storage: str | None, as_json: bool
+    *,
+    source: str,
+    output: Path | None,
+    seed: int | None,
+    env_id: str | None,
+    action: int | tuple[float, ...] | None,
+    storage: str | None,
+    as_json: bool,
 ) -> None:
     """Film a policy: MP4 and GIF; of a sweep also before and after training side by side.
 
@@ -241,19 +257,20 @@ def video(
     """
     from tune_jobs import cli_output, sweeps
 
-    _check_random(source, env_id)
+    _check_baseline(source, env_id)
     with stdout_for(as_json=as_json):
-        paths = sweeps.video(source, storage=storage, output=output, seed=seed, env_id=env_id)
+        paths = sweeps.video(source, storage=storage, output=output, seed=seed, env_id=env_id, action=action)
     cli_output.show_paths(paths, as_json=as_json)
 
 
-def _check_random(source: str, env_id: str | None) -> None:
-    if source == "random" and env_id is None:
-        raise SpecError("A random policy has no environment of its own.", "Add --env, such as --env CartPole-v1.")
+def _check_baseline(source: str, env_id: str | None) -> None:
+    if source in ("random", "constant") and env_id is None:
+        raise SpecError(f"A {source} policy has no environment of its own.", "Add --env, such as --env CartPole-v1.")
 
 
 @cli.command()
 @click.argument("sweep")
+@allow_module_option
 @storage_option
 @json_option
 def report(*, sweep: str, storage: str | None, as_json: bool) -> None:

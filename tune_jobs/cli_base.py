@@ -105,9 +105,39 @@ set_option = click.option(
     "--set", "overrides", multiple=True, metavar="A.B=VALUE",
     help="Override one field of the sweep file; VALUE is YAML, empty takes the field out. May be repeated.",
 )  # fmt: skip
+
+
+def _allow(_: click.Context, __: click.Parameter, names: tuple[str, ...]) -> None:
+    from policies.env_modules import allow_modules
+
+    allow_modules(names)
+
+
+allow_module_option = click.option(
+    "--allow-module", multiple=True, metavar="NAME", callback=_allow, expose_value=False,
+    help="Let env ids and rl_module name this Python module, which runs its code. May be repeated.",
+)  # fmt: skip
 env_option = click.option(
-    "--env", "env_id", metavar="ID", help="Environment; needed for 'random', else the policy's own."
+    "--env", "env_id", metavar="ID", help="Environment; needed for a baseline, else the policy's own."
 )
+
+
+def _read_action(_: click.Context, __: click.Parameter, text: str | None) -> int | tuple[float, ...] | None:
+    """A whole number, or numbers with commas between them: brackets may stand around those."""
+    if text is None:
+        return None
+    try:
+        if not text.lstrip().startswith("[") and "," not in text and "." not in text:
+            return int(text)
+        return tuple(float(part) for part in text.strip().strip("[]").split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is neither a whole number nor a list such as [0.5,-1].") from error
+
+
+action_option = click.option(
+    "--action", metavar="VALUE", callback=_read_action,
+    help="What 'constant' does: a number, or a list such as [0.5,-1].  [default: 0]",
+)  # fmt: skip
 
 
 def run_options(command: _Command) -> _Command:
@@ -116,6 +146,7 @@ def run_options(command: _Command) -> _Command:
         click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report."),
         click.option("--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."),
         click.option("--address", metavar="ADDRESS", help="Ray cluster: auto or ray://...; without it, this machine."),
+        allow_module_option,
         storage_option,
         json_option,
     ):

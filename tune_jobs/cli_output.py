@@ -113,6 +113,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
     machine, stop = plan.machine, spec.stop
     returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
     rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
+    rules += [] if stop.num_episodes is None else [f"{stop.num_episodes:,} episodes"]
     rules += [
         f"{stop.num_env_steps:,} env steps",
         f"{stop.num_iterations:,} iterations",
@@ -128,6 +129,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "trials": f"{len(plan.trials):,}: {plan.num_points:,} points, {spec.seeds_per_point} seed(s) each",
         "at once": f"{plan.max_concurrent}, each on {resources}; {machine.source} has {has}",
         "a trial stops at": " or ".join(rules),
+        "search": _search_fact(spec),
         "scheduler": spec.scheduler.type,
         "env steps": f"at most {plan.max_env_steps:,} in all",
         "disk": f"at most about {format_bytes(plan.max_disk_bytes)}",
@@ -136,15 +138,23 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
     }
 
 
+def _search_fact(spec: SweepSpec) -> str:
+    if spec.search.type == "random":
+        return "random, and all of the grids"
+    return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
+
+
 def _span(seeds: Sequence[int]) -> str:
     return f"{seeds[0]} to {seeds[-1]}"
 
 
 def _plan_table(trials: Sequence[TrialPlan]) -> Table:
+    # The first trial's point is known; where a searcher chooses the later ones, they have none yet.
     names = list(trials[0].point)
     table = _table("trial", "seed", *names)
     for trial in trials[:_MAX_TRIALS_SHOWN]:
-        table.add_row(trial.trial_id, str(trial.seed), *(format_value(trial.point[name]) for name in names))
+        values = [format_value(trial.point[name]) if trial.has_point else "by tpe" for name in names]
+        table.add_row(trial.trial_id, str(trial.seed), *values)
     return table
 
 
@@ -233,7 +243,9 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
     from rich.text import Text
 
     names = list(dict.fromkeys(name for trial in trials for name in trial.point))
-    table = _table("trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by")
+    columns = ["trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by"]
+    copies = any(trial.changes for trial in trials)
+    table = _table(*columns, *(["copied"] if copies else []))
     for trial in trials:
         table.add_row(
             trial.trial_id,
@@ -245,6 +257,7 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
             format_score(trial.evaluation_return),
             format_score(trial.best_evaluation_return),
             Text(_first_line(trial.error) if trial.status == "failed" else (trial.stop_reason or "-")),
+            *([", ".join(change.source_trial_id for change in trial.changes) or "-"] if copies else []),
         )
     _console().print(table)
 
@@ -313,11 +326,21 @@ def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
 
 
 def show_presets(presets: Sequence[Preset], *, as_json: bool) -> None:
-    """Print name and description of each preset."""
+    """Print one line a preset: what it is, what it reaches, and what that costs."""
     if as_json:
         print_json([preset._asdict() for preset in presets])
-    else:
-        _print_facts(_console(), {preset.name: preset.description for preset in presets})
+        return
+    from rich.text import Text
+
+    console = _console()
+    details = ("what", "expected", "env steps", "time on 2 cores")
+    table = _table("preset", *details, wrapped=details)
+    for preset in presets:
+        # As texts, or a title in brackets would be read as a style.
+        cells = (preset.title, preset.expected, preset.env_steps, preset.time.removesuffix(" on 2 cores"))
+        table.add_row(preset.name, *(Text(cell) for cell in cells))
+    console.print(table)
+    console.print("Print one with `tune-jobs presets NAME`, run it with `tune-jobs launch NAME`.", style="dim")
 
 
 def show_preset(preset: Preset, *, as_json: bool) -> None:
@@ -336,13 +359,13 @@ def _console() -> Console:
     return Console(markup=False, highlight=False, emoji=False, width=width, soft_wrap=False)
 
 
-def _table(*columns: str) -> Table:
+def _table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Table:
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
-        table.add_column(column, no_wrap=column not in ("ended by", "trials"))
+        table.add_column(column, no_wrap=column not in wrapped)
     return table
 
 

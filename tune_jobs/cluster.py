@@ -21,6 +21,7 @@ import ray
 from ray.exceptions import AuthenticationError, GetTimeoutError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from policies.env_modules import module_folders
 from policies.errors import CannotRunError, TuneJobsError
 from policies.files import write_atomic
 from tune_jobs.address import recorded_cluster
@@ -81,15 +82,35 @@ def _start(machine: Machine | None) -> None:
     if machine is not None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
     try:
-        # "local": a cluster of this sweep's own, even where one happens to run already.
-        ray.init(
-            address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
-        )
+        with _finding_own_modules():
+            # "local": a cluster of this sweep's own, even where one happens to run already.
+            ray.init(
+                address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
+            )
     except Exception as error:
         raise CannotRunError(
             f"Ray cannot be started on this machine: {_first_line(error)}",
             "See the Ray logs in /tmp/ray/session_latest/logs.",
         ) from error
+
+
+@contextlib.contextmanager
+def _finding_own_modules() -> Iterator[None]:
+    """Let the processes that Ray starts find the modules of the user's own where this process found them.
+
+    Ray itself gives them this process's working directory and the main script's folder, but not the rest of its path.
+    """
+    before = os.environ.get("PYTHONPATH")
+    folders = [*module_folders(), *([before] if before else [])]
+    if folders:
+        os.environ["PYTHONPATH"] = os.pathsep.join(folders)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["PYTHONPATH"] = before
+        else:
+            os.environ.pop("PYTHONPATH", None)
 
 
 def _join(address: str) -> None:

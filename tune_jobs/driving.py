@@ -20,6 +20,7 @@ from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.address import check_address
 from tune_jobs.monitor import SweepMonitor
+from tune_jobs.own_code import modules_of
 from tune_jobs.plan import Machine, SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec, check_sweep_name
 from tune_jobs.store import SweepStore, name_taken
@@ -93,6 +94,7 @@ def write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str 
             versions=_versions(),
             git_commit=_git_commit(),
             address=address,
+            allowed_modules=modules_of(spec),
         )
     )
 
@@ -107,6 +109,7 @@ def pending_record(trial: TrialPlan) -> TrialRecord:
         seed=trial.seed,
         point=trial.point,
         hyperparams=trial.hyperparams,
+        has_point=trial.has_point,
     )
 
 
@@ -119,7 +122,9 @@ def check_same_trials(store: SweepStore, plan: SweepPlan) -> None:
     planned = {trial.trial_id: trial for trial in plan.trials}
     for record in store.read_trials():
         trial = planned.get(record.trial_id)
-        if trial is None or trial.seed != record.seed or trial.hyperparams != record.hyperparams:
+        # A point that is not planned was chosen by the trials before it, which may be more by now.
+        same = trial is not None and (not trial.has_point or trial.hyperparams == record.first_hyperparams)
+        if trial is None or trial.seed != record.seed or not same:
             raise CannotRunError(
                 f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: sweep.json was changed, "
                 "or was written by a version that draws other points.",

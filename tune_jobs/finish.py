@@ -11,18 +11,21 @@ from typing import Any
 
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord, TrialRecord
 from analysis.selection import NoUsableTrialError, score_trial, select_best
+from policies.baselines import BASELINES, ConstantPolicy
+from policies.env_modules import allow_modules
+from policies.env_wrappers import FRAME_STACK, PIXELS
 from policies.envs import check_env
-from policies.errors import NotFoundError, SpecError
+from policies.errors import CheckpointError, NotFoundError, SpecError
 from policies.evaluate import evaluate_policy
-from policies.policy import NetworkPolicy, Policy, RandomPolicy, load_policy
-from policies.portable import read_policy, save_policy
+from policies.hyperparams import ConstantHyperparams
+from policies.policy import Policy, RandomPolicy, load_policy, policy_from_portable
+from policies.portable import PolicyNetwork, read_policy, save_policy
 from policies.video import record_side_by_side, record_video
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
 
 DEFAULT_STORAGE = "sweeps"
-RANDOM = "random"
 # The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
 FRESH_SEED = 2**31
 
@@ -75,21 +78,22 @@ def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
         NoUsableTrialError: No trial can win; the message says why.
         CheckpointError: The winner's checkpoint is damaged.
     """
-    sweep = store.read_record()
+    sweep = _trusted(store).read_record()
     spec = SweepSpec.model_validate(sweep.spec)
     selection = select_best(read_trials(store))
     folder = store.folder / selection.checkpoint.path
     verify_checkpoint(folder)
     portable = read_policy(folder)
     seeds = confirmation_seeds(spec.seed, num_episodes)
-    policy = NetworkPolicy(portable, description=f"{store.name}/{selection.trial.trial_id}")
+    policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
+    env_args = spec.env.wrapped_args
     record = BestRecord(
         checkpoint=selection.checkpoint,
-        point=selection.trial.point,
+        point=selection.trial.point_at(selection.checkpoint.iteration),
         seed=selection.trial.seed,
         selection_score=selection.score,
-        confirmation=run_evaluation(policy, spec.env.id, spec.env.args, seeds),
-        random=run_evaluation(_random_policy(spec.env.id, spec.env.args), spec.env.id, spec.env.args, seeds),
+        confirmation=run_evaluation(policy, spec.env.id, env_args, seeds),
+        random=run_evaluation(random_policy(spec.env.id, env_args), spec.env.id, env_args, seeds),
     )
     save_policy(portable, store.best_folder)
     store.write_best(record)
@@ -110,7 +114,8 @@ def run_evaluation(policy: Policy, env_id: str, env_args: dict[str, Any], seeds:
     )
 
 
-def _random_policy(env_id: str, env_args: dict[str, Any]) -> RandomPolicy:
+def random_policy(env_id: str, env_args: dict[str, Any]) -> RandomPolicy:
+    """What trained policies are held against, in an environment."""
     return RandomPolicy.for_env(env_id, env_args)
 
 
@@ -125,25 +130,30 @@ class PolicySource:
     """The sweep, where the policy is a sweep's best."""
 
 
-def find_policy(source: str | Path, storage: str | Path | None = None, env_id: str | None = None) -> PolicySource:
+def find_policy(
+    source: str | Path,
+    storage: str | Path | None = None,
+    env_id: str | None = None,
+    action: int | Sequence[float] | None = None,
+) -> PolicySource:
     """A policy by any of its names.
 
     Args:
         source: A sweep (its best; chosen now if it has not been), `SWEEP/TRIAL` (its best checkpoint), a checkpoint
-            folder, a policy file, or `random`.
+            folder, a policy file, or a baseline: `random` or `constant`.
         storage: Where sweeps are looked for by name.
-        env_id: Where it acts; needed for `random`, else the environment it was trained in.
+        env_id: Where it acts; needed for a baseline, else the environment it was trained in.
+        action: What `constant` does; None: the action 0.
 
     Raises:
         NotFoundError: There is no such thing.
         CheckpointError: It is damaged.
-        SpecError: `random` without an environment.
+        SpecError: A baseline without an environment or with an action it does not have; an action for another policy.
     """
     text = str(source)
-    if text == RANDOM:
-        if env_id is None:
-            raise SpecError("A random policy needs an environment.", "Name one with --env, such as --env CartPole-v1.")
-        return PolicySource(_random_policy(env_id, {}), env_id, {})
+    if text in BASELINES:
+        return _baseline(text, env_id, action)
+    _refuse_action(text, action)
     path = Path(text).expanduser()
     store: SweepStore | None = None
     if (path / MANIFEST).is_file():
@@ -163,23 +173,52 @@ def find_policy(source: str | Path, storage: str | Path | None = None, env_id: s
             policy = load_policy(checkpoint)
             store = None
     if env_id is not None and env_id != policy.env_id:
-        return PolicySource(policy, env_id, {})
+        # Its constructor's arguments are the other environment's; what the policy observes is its own.
+        wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS)}
+        return PolicySource(policy, env_id, wrappers)
     return PolicySource(policy, policy.env_id, dict(policy.env_args), store)
+
+
+def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | None) -> PolicySource:
+    if env_id is None:
+        raise SpecError(
+            f"A {name} policy has no environment of its own.", "Name one with --env, such as --env CartPole-v1."
+        )
+    if name == "random":
+        _refuse_action(name, action)
+        return PolicySource(random_policy(env_id, {}), env_id, {})
+    if action is None:
+        action = ConstantHyperparams().action
+    chosen = action if isinstance(action, int) else tuple(float(number) for number in action)
+    return PolicySource(ConstantPolicy.for_env(env_id, {}, chosen), env_id, {})
+
+
+def _refuse_action(source: str, action: int | Sequence[float] | None) -> None:
+    if action is not None:
+        raise SpecError(
+            f"The action {action!r} was given for {source!r}; only 'constant' takes one.", "Leave the action out."
+        )
 
 
 def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[SweepStore, str | None]:
     try:
-        return find_sweep(text, storage), None
+        return _trusted(find_sweep(text, storage)), None
     except NotFoundError:
         sweep, _, trial_id = text.rpartition("/")
         if not sweep:
             raise
         try:
-            return find_sweep(sweep, storage), trial_id
+            return _trusted(find_sweep(sweep, storage)), trial_id
         except NotFoundError as error:
             raise NotFoundError(
                 f"No sweep, trial, checkpoint or policy file {text!r}: {error.message}", error.hint
             ) from error
+
+
+def _trusted(store: SweepStore) -> SweepStore:
+    """The sweep, with the modules allowed that its launcher did: its policies and environment may be from there."""
+    allow_modules(store.read_record().allowed_modules)
+    return store
 
 
 def best_checkpoint(store: SweepStore, trial_id: str) -> CheckpointRecord:
@@ -225,6 +264,23 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
     return folder
 
 
+def find_rllib_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, PolicyNetwork]:
+    """RLlib's own folder in a verified checkpoint, and the network that was saved beside it.
+
+    Raises:
+        NotFoundError: There is no such checkpoint.
+        CheckpointError: It is damaged, or a baseline's, which RLlib has no part in.
+    """
+    folder = find_checkpoint(source, storage)
+    saved = read_policy(folder)
+    if saved.algorithm in BASELINES:
+        raise CheckpointError(
+            f"{folder} is of the baseline {saved.algorithm}, which is no RLlib algorithm: there is nothing to restore.",
+            "Load its policy with load_policy, or restore a trial of ppo or dqn.",
+        )
+    return folder / "rllib", saved.network
+
+
 def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     """Film a random policy (before) and the winner (after) on one seed, alone and side by side, into best/.
 
@@ -234,7 +290,7 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     source = find_policy(store.folder)
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
-    before = _random_policy(source.env_id, source.env_args)
+    before = random_policy(source.env_id, source.env_args)
     names = {
         "before_mp4": "before.mp4",
         "after_mp4": "after.mp4",
@@ -243,15 +299,18 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     }
     paths = {key: store.best_folder / name for key, name in names.items()}
     env: dict[str, Any] = {"env_id": source.env_id, "env_args": source.env_args, "seeds": chosen}
-    record_video(before, **env, mp4=paths["before_mp4"], caption="before training: random")
-    caption = f"after training: {best.checkpoint.trial_id}"
-    record_video(source.policy, **env, mp4=paths["after_mp4"], gif=paths["after_gif"], caption=caption)
+    # A baseline has not been trained: it is shown as what it is.
+    trained = not isinstance(source.policy, RandomPolicy | ConstantPolicy)
+    first = "before training: random" if trained else before.description
+    second = f"after training: {best.checkpoint.trial_id}" if trained else source.policy.description
+    record_video(before, **env, mp4=paths["before_mp4"], caption=first)
+    record_video(source.policy, **env, mp4=paths["after_mp4"], gif=paths["after_gif"], caption=second)
     record_side_by_side(
         before,
         source.policy,
         **env,
         mp4=paths["before_after_mp4"],
-        captions=("before: random", "after training"),
+        captions=("before: random", "after training") if trained else (first, second),
     )
     return paths
 

@@ -32,6 +32,8 @@ _MAX_RUNNING_ROWS = 12
 
 def describe_point(record: TrialRecord) -> str:
     """A trial's sampled values in a line."""
+    if not record.has_point:
+        return "chosen at its start"
     return ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items()) or "no searched values"
 
 

@@ -18,10 +18,20 @@ from pydantic import ValidationError
 
 from policies.envs import EnvInfo, check_env
 from policies.errors import CannotRunError, SpecError
-from policies.hyperparams import DQNHyperparams, Hyperparams, make_hyperparams
-from tune_jobs.search_space import Grid, draw_points
+from policies.hyperparams import (
+    DQNHyperparams,
+    Hyperparams,
+    PPOHyperparams,
+    RandomHyperparams,
+    make_hyperparams,
+)
+from tune_jobs.env_rules import check_env_args, check_env_rules
+from tune_jobs.own_code import check_rl_module
+from tune_jobs.points import largest_hyperparams, planned_points
+from tune_jobs.search_space import num_points
 from tune_jobs.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec import SweepSpec, describe, dotted
+from tune_jobs.tpe import check_installed
 
 NUM_CONFIRMATION_EPISODES = 100
 MAX_TRIALS = 100_000
@@ -61,6 +71,8 @@ class TrialPlan:
     """The sampled values alone."""
     hyperparams: dict[str, Any]
     """All values, validated, as JSON."""
+    has_point: bool = True
+    """False: the search method chooses the point when the trial starts; point and hyperparams are empty until then."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +122,15 @@ def make_plan(spec: SweepSpec, machine: Machine) -> SweepPlan:
 
     Raises:
         EnvError: The environment isn't registered, can't be made, or doesn't go with the algorithm.
-        SpecError: A point's values contradict each other, or there are too many trials.
-        CannotRunError: One trial needs more than the machine has.
+        SpecError: A point's values contradict each other or the environment, there are too many trials, or something is
+            in a module that is not allowed.
+        CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
-    env = check_env(spec.env.id, spec.env.args, spec.algorithm)
+    if spec.search.type == "tpe":
+        check_installed()
+    check_env_args(spec)
+    env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm)
+    check_rl_module(spec)
     num_trials = _num_trials(spec)
     if num_trials > MAX_TRIALS:
         raise SpecError(
@@ -121,8 +138,9 @@ def make_plan(spec: SweepSpec, machine: Machine) -> SweepPlan:
             "Lower num_samples or seeds_per_point, or make the grids smaller.",
         )
     concurrent = _max_concurrent(spec, machine, num_trials)
-    trials, hyperparams = _trials(spec)
-    steps = [_max_env_steps(spec, values) for values in hyperparams]
+    trials, known = _trials(spec)
+    check_env_rules(spec, env, known)
+    sizes = _sizes(spec, known)
     return SweepPlan(
         trials=trials,
         num_points=num_trials // spec.seeds_per_point,
@@ -131,9 +149,9 @@ def make_plan(spec: SweepSpec, machine: Machine) -> SweepPlan:
         max_concurrent=concurrent,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
-        max_env_steps=spec.seeds_per_point * sum(steps),
+        max_env_steps=spec.seeds_per_point * sum(max(_max_env_steps(spec, each) for each in sets) for sets in sizes),
         max_disk_bytes=_SWEEP_BYTES
-        + spec.seeds_per_point * sum(_max_trial_bytes(spec, env, values) for values in hyperparams),
+        + spec.seeds_per_point * sum(max(_max_trial_bytes(spec, env, each) for each in sets) for sets in sizes),
         env=env,
         machine=machine,
         notes=tuple(_notes(spec, env, concurrent)),
@@ -141,27 +159,52 @@ def make_plan(spec: SweepSpec, machine: Machine) -> SweepPlan:
 
 
 def _num_trials(spec: SweepSpec) -> int:
-    sizes = [len(domain.values) for domain in spec.space.values() if isinstance(domain, Grid)]
-    return math.prod(sizes) * spec.num_samples * spec.seeds_per_point
+    points = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+    return points * spec.seeds_per_point
 
 
 def _trials(spec: SweepSpec) -> tuple[tuple[TrialPlan, ...], list[Hyperparams]]:
-    """The trials, and the hyperparameters of each point."""
-    points = draw_points(spec.space, spec.num_samples, spec.seed)
+    """The trials, and the hyperparameters of each point that is known."""
+    points = planned_points(spec)
     seeds = trial_seeds(spec.seed, len(points) * spec.seeds_per_point)
     trials: list[TrialPlan] = []
-    hyperparams = []
+    known = []
     for point_index, point in enumerate(points):
-        values = _point_hyperparams(spec, point, point_index)
-        hyperparams.append(values)
-        dumped = values.model_dump(mode="json")
+        dumped: dict[str, Any] = {}
+        if point is not None:
+            known.append(point_hyperparams(spec, point, point_index))
+            dumped = known[-1].model_dump(mode="json")
         for seed_index in range(spec.seeds_per_point):
             index = len(trials)
-            trials.append(TrialPlan(trial_id(index), index, point_index, seed_index, seeds[index], point, dumped))
-    return tuple(trials), hyperparams
+            trials.append(
+                TrialPlan(
+                    trial_id(index),
+                    index,
+                    point_index,
+                    seed_index,
+                    seeds[index],
+                    point or {},
+                    dumped,
+                    point is not None,
+                )
+            )
+    return tuple(trials), known
 
 
-def _point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int) -> Hyperparams:
+def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]:
+    """For each point the hyperparameters whose trials are the largest it may have."""
+    if spec.scheduler.type == "pbt":
+        return [[values, *largest_hyperparams(spec, known)] for values in known]
+    unknown = spec.num_samples - len(known) if spec.search.type == "tpe" else 0
+    return [[values] for values in known] + ([largest_hyperparams(spec, known)] * unknown if unknown else [])
+
+
+def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int) -> Hyperparams:
+    """All values of a point's trials, validated.
+
+    Raises:
+        SpecError: They don't go together.
+    """
     shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
     place = f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
     try:
@@ -175,6 +218,12 @@ def _point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: i
             f"The values of {place} don't go together: {problems}",
             "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
         ) from error
+    if isinstance(values, RandomHyperparams) and spec.resources.num_env_runners:
+        raise SpecError(
+            f"resources.num_env_runners is {spec.resources.num_env_runners}, but the baseline {spec.algorithm} plays "
+            "in one process.",
+            "Leave resources.num_env_runners out, or set num_envs to play in several sub-environments.",
+        )
     num_streams = values.num_envs * max(1, spec.resources.num_env_runners)
     if num_streams > SEEDS_PER_TRIAL:
         raise SpecError(
@@ -240,9 +289,14 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
 
 def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     """Most env steps of one iteration: all sub-environments step together, so the last step overshoots."""
-    wanted = values.env_steps_per_iteration if isinstance(values, DQNHyperparams) else values.train_batch_size
+    wanted = _wanted_env_steps(values)
     together = values.num_envs * max(1, spec.resources.num_env_runners)
     return (math.ceil(wanted / together) + 1) * together
+
+
+def _wanted_env_steps(values: Hyperparams) -> int:
+    """Env steps an iteration has at least."""
+    return values.train_batch_size if isinstance(values, PPOHyperparams) else values.env_steps_per_iteration
 
 
 def _max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
@@ -252,23 +306,31 @@ def _max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
 
 
 def _max_trial_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
-    wanted = values.env_steps_per_iteration if isinstance(values, DQNHyperparams) else values.train_batch_size
-    iterations = min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / wanted))
-    num_outputs = (
-        2 * int(env.action_space.n) if hasattr(env.action_space, "n") else 2 * math.prod(env.action_space.shape or ())
-    )
-    sizes = [math.prod(env.observation_space.shape or ()), *values.hidden_sizes, num_outputs + 1]
-    weights = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
-    networks = 1 if isinstance(values, DQNHyperparams) else 2  # PPO: policy and value function
-    checkpoint = _CHECKPOINT_BASE_BYTES + networks * weights * _BYTES_PER_WEIGHT * _COPIES_OF_WEIGHTS
+    iterations = min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
+    checkpoint = _CHECKPOINT_BASE_BYTES + _num_weights(env, values) * _BYTES_PER_WEIGHT * _COPIES_OF_WEIGHTS
     kept = min(spec.checkpoints.keep + 2, math.ceil(iterations / spec.checkpoints.every_iterations) + 2)
     # One more while a new one is being written and the old one not yet deleted.
     return (kept + 1) * checkpoint + iterations * _ITERATION_BYTES
 
 
+def _num_weights(env: EnvInfo, values: Hyperparams) -> int:
+    if isinstance(values, RandomHyperparams):
+        return 0
+    space: Any = env.action_space
+    num_outputs = 2 * int(space.n) if hasattr(space, "n") else 2 * math.prod(space.shape or ())
+    sizes = [math.prod(env.observation_space.shape or ()), *values.hidden_sizes, num_outputs + 1]
+    weights = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
+    networks = 1 if isinstance(values, DQNHyperparams) else 2  # PPO: policy and value function
+    return networks * weights
+
+
 def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int) -> list[str]:
     notes = []
-    if spec.num_samples > 1 and not any(domain.is_random for domain in spec.space.values()):
+    if (
+        spec.search.type == "random"
+        and spec.num_samples > 1
+        and not any(domain.is_random for domain in spec.space.values())
+    ):
         notes.append(
             f"The space has no random domain, so num_samples {spec.num_samples} repeats every point; "
             "seeds_per_point does that and averages over the seeds."

@@ -17,11 +17,14 @@ import cloudpickle
 from ray import tune
 from ray.exceptions import RayActorError, RayTaskError
 from ray.tune.experiment import Trial
+from ray.tune.schedulers import TrialScheduler
 
 from analysis.records import CheckpointRecord, TrialRecord
 from policies.errors import TuneJobsError
+from tune_jobs.population import PopulationScheduler
 from tune_jobs.ray_environment import prepare_environment
-from tune_jobs.schedulers import build_scheduler
+from tune_jobs.schedulers import build_scheduler, waits_for_others
+from tune_jobs.searcher import PointSearcher
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
 from tune_jobs.tensorboard import ScalarWriter
@@ -56,15 +59,21 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     spec = SweepSpec.model_validate(store.read_record().spec)
     keeper = RecordKeeper(store, job.trial_ids, listener)
     shutil.rmtree(store.tune_folder, ignore_errors=True)
+    param_space: dict[str, Any] = {"sweep_folder": str(store.folder)}
+    searcher = None
+    if spec.search.type == "tpe":
+        searcher = PointSearcher(spec, job.trial_ids, keeper.all_records, keeper.change)
+    else:
+        param_space["trial_id"] = tune.grid_search(list(job.trial_ids))
     tuner = tune.Tuner(
         tune.with_resources(TrialTrainable, _resources(spec, job)),
-        param_space={
-            "sweep_folder": str(store.folder),
-            "trial_id": tune.grid_search(list(job.trial_ids)),
-        },
+        param_space=param_space,
         tune_config=tune.TuneConfig(
-            scheduler=build_scheduler(spec.scheduler, spec.stop.num_env_steps),
-            max_concurrent_trials=job.max_concurrent,
+            search_alg=searcher,
+            num_samples=1 if searcher is None else len(job.trial_ids),
+            scheduler=_scheduler(spec, store, keeper),
+            # Without it Tune runs one trial at a time where there is a searcher.
+            max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
             reuse_actors=True,
             trial_name_creator=_trial_id,
             trial_dirname_creator=_trial_id,
@@ -84,6 +93,12 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         tuner.fit()
     finally:
         keeper.close()
+
+
+def _scheduler(spec: SweepSpec, store: SweepStore, keeper: RecordKeeper) -> TrialScheduler:
+    if spec.scheduler.type == "pbt":
+        return PopulationScheduler(spec, store, keeper.record, keeper.change)
+    return build_scheduler(spec.scheduler, spec.stop.num_env_steps)
 
 
 def _trial_id(trial: Trial) -> str:
@@ -125,11 +140,21 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
     def __init__(self, store: SweepStore, trial_ids: Sequence[str], listener: Listener) -> None:
         self._store = store
         self._records = {name: store.trial(name).read_record() for name in trial_ids}
+        self._others = [record for record in store.read_trials() if record.trial_id not in self._records]
         self._listener = listener
         self._scalars = ScalarWriter(store.folder)
         self.running: set[str] = set()
 
-    def _change(self, trial_id: str, **changes: Any) -> None:
+    def record(self, trial_id: str) -> TrialRecord:
+        """A trial's newest record."""
+        return self._records[trial_id]
+
+    def all_records(self) -> list[TrialRecord]:
+        """The newest record of every trial of the sweep, those of earlier runs too."""
+        return sorted([*self._others, *self._records.values()], key=lambda record: record.index)
+
+    def change(self, trial_id: str, **changes: Any) -> None:
+        """Change fields of a trial's record."""
         record = self._records[trial_id].model_copy(update=changes)
         self._records[trial_id] = record
         self._store.trial(trial_id).write_record(record)
@@ -141,7 +166,7 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         self.running.add(trial_id)
         before = self._records[trial_id].started_at
         started_at = time.time() if before is None else before
-        self._change(trial_id, status="running", started_at=started_at, ended_at=None, error=None)
+        self.change(trial_id, status="running", started_at=started_at, ended_at=None, error=None)
 
     def on_trial_result(
         self,
@@ -159,21 +184,29 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         fields["checkpoints"] = tuple(CheckpointRecord.model_validate(item) for item in fields["checkpoints"])
         if status != "running":
             self.running.discard(trial_id)
-        self._change(trial_id, status=status, node=result["node"], pid=result["pid"], **fields)
+        self.change(trial_id, status=status, node=result["node"], pid=result["pid"], **fields)
         self._scalars.write(self._records[trial_id], evaluated=evaluated)
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        """Schedulers pause trials and tell no one; a paused trial has saved its checkpoint and needs no waiting for."""
+        for trial in trials:
+            trial_id = _trial_id(trial)
+            if trial.status == Trial.PAUSED and trial_id in self.running:
+                self.running.discard(trial_id)
+                self.change(trial_id, status="paused")
 
     def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Tune is done with the trial: its own end, the scheduler's decision, or the end of the run."""
         trial_id = _trial_id(trial)
         self.running.discard(trial_id)
         self._scalars.close(trial_id)
-        if self._records[trial_id].status != "running":
+        if self._records[trial_id].status not in ("running", "paused"):
             return
         if self._store.stop_requested():
-            self._change(trial_id, status="paused")
+            self.change(trial_id, status="paused")
         else:
             steps = self._records[trial_id].num_env_steps
-            self._change(
+            self.change(
                 trial_id,
                 status="stopped",
                 stop_reason=f"scheduler, at {steps} env steps",
@@ -185,7 +218,7 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         trial_id = _trial_id(trial)
         self.running.discard(trial_id)
         failures = self._records[trial_id].num_failures + 1
-        self._change(trial_id, status="pending", num_failures=failures, error=self._error(trial))
+        self.change(trial_id, status="pending", num_failures=failures, error=self._error(trial))
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will not."""
@@ -193,7 +226,7 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         self.running.discard(trial_id)
         self._scalars.close(trial_id)
         failures = self._records[trial_id].num_failures + 1
-        self._change(trial_id, status="failed", num_failures=failures, error=self._error(trial), ended_at=time.time())
+        self.change(trial_id, status="failed", num_failures=failures, error=self._error(trial), ended_at=time.time())
 
     def _error(self, trial: Trial) -> str:
         # Trial.get_pickled_error looks where Tune syncs to, and nothing has been synced yet; this is where it writes.

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -61,7 +62,7 @@ class _Domain(BaseModel, ABC):
         """
 
 
-class _Listed(_Domain):
+class Listed(_Domain):
     """A domain that lists its values."""
 
     @property
@@ -85,11 +86,20 @@ class _Listed(_Domain):
             seen.append(key)
         return self
 
+    def index_of(self, value: Any) -> int:
+        """Place of a value in the list; the type counts, a tuple is a list.
+
+        Raises:
+            ValueError: It isn't in the list.
+        """
+        return [json.dumps(known) for known in self.values].index(json.dumps(value))
+
     def probes(self) -> list[tuple[int | None, Any]]:
+        """See `_Domain`."""
         return list(enumerate(self.values))
 
 
-class Grid(_Listed):
+class Grid(Listed):
     """Every value is tried, in combination with every value of the other grids."""
 
     kind: ClassVar[str] = "grid"
@@ -101,7 +111,7 @@ class Grid(_Listed):
         return self.values[int(rng.integers(len(self.values)))]
 
 
-class Choice(_Listed):
+class Choice(Listed):
     """One of the values, each as likely as the others."""
 
     kind: ClassVar[str] = "choice"
@@ -112,7 +122,7 @@ class Choice(_Listed):
         return self.values[int(rng.integers(len(self.values)))]
 
 
-class _Range(_Domain):
+class Range(_Domain):
     """A domain between two ends, perhaps on a log scale, perhaps of multiples of a step q."""
 
     is_log: ClassVar[bool] = False
@@ -137,12 +147,13 @@ class _Range(_Domain):
     def bounds(self) -> tuple[float, float]:
         """Least and greatest value that can be drawn."""
         if self.q is not None:
-            first, last = self._indices()
+            first, last = self.factors
             return _multiple(first, self.q), _multiple(last, self.q)
         return (self.low, self.high - 1) if self.is_whole else (self.low, self.high)
 
-    def _indices(self) -> tuple[int, int]:
-        """First and last multiple of q that can be drawn, as factors of q."""
+    @property
+    def factors(self) -> tuple[int, int]:
+        """First and last multiple of q that can be drawn, as factors of q (of 1 where there is no q)."""
         q = self.q or 1.0
         first, last = _index(self.low, q, up=True), _index(self.high, q, up=False)
         # As in ray.tune: upper ends of whole ranges are included, except that a step of 1 changes nothing.
@@ -158,12 +169,13 @@ class _Range(_Domain):
         if self.is_log and low <= 0:
             raise ValueError(f"starts at {low!r}: a log scale needs a start greater than 0")
         if self.q is not None:
-            first, last = self._indices()
+            first, last = self.factors
             if first > last:
                 raise ValueError(f"has no multiple of {self.q:g} between {low!r} and {high!r}")
         return self
 
     def probes(self) -> list[tuple[int | None, Any]]:
+        """See `_Domain`."""
         low, high = self.bounds
         if self.is_whole:
             return [(0, int(low)), (1, int(high))]
@@ -172,27 +184,30 @@ class _Range(_Domain):
         inside = [] if fraction is None else [(None, fraction)]
         return [(0, low), (1, high), *inside]
 
+    def at_factor(self, factor: int) -> Any:
+        """The value that is so many times q: int in a whole range, else float."""
+        return factor * int(self.q or 1) if self.is_whole else _multiple(factor, self.q or 1.0)
+
     def sample(self, rng: np.random.Generator) -> Any:
         """Draw one value: int from a whole range, else float."""
         if self.is_whole:
-            first, last = self._indices()
-            factor = _draw_whole(rng, first, last, log=self.is_log)
-            return factor * int(self.q or 1)
+            first, last = self.factors
+            return self.at_factor(_draw_whole(rng, first, last, log=self.is_log))
         if self.q is None:
             return _draw_real(rng, self.low, self.high, log=self.is_log)
         low, high = self.bounds
         # Drawn between the outermost multiples, so that rounding can't lead out of the range.
-        return _multiple(round(_draw_real(rng, low, high, log=self.is_log) / self.q), self.q)
+        return self.at_factor(round(_draw_real(rng, low, high, log=self.is_log) / self.q))
 
 
-class Uniform(_Range):
+class Uniform(Range):
     """A float, uniform between the ends."""
 
     kind: ClassVar[str] = "uniform"
     uniform: tuple[Number, Number] = Field(description="[low, high], floats.")
 
 
-class LogUniform(_Range):
+class LogUniform(Range):
     """A float, uniform between the ends on a log scale."""
 
     kind: ClassVar[str] = "loguniform"
@@ -200,14 +215,14 @@ class LogUniform(_Range):
     loguniform: tuple[Number, Number] = Field(description="[low, high], floats > 0, drawn on a log scale.")
 
 
-class QUniform(_Range):
+class QUniform(Range):
     """A multiple of q, uniform between the ends."""
 
     kind: ClassVar[str] = "quniform"
     quniform: tuple[Number, Number, Number] = Field(description="[low, high, q]: multiples of q.")
 
 
-class QLogUniform(_Range):
+class QLogUniform(Range):
     """A multiple of q, uniform between the ends on a log scale."""
 
     kind: ClassVar[str] = "qloguniform"
@@ -215,7 +230,7 @@ class QLogUniform(_Range):
     qloguniform: tuple[Number, Number, Number] = Field(description="[low, high, q]: multiples of q, log scale.")
 
 
-class RandInt(_Range):
+class RandInt(Range):
     """A whole number from the lower end up to but without the upper end."""
 
     kind: ClassVar[str] = "randint"
@@ -223,7 +238,7 @@ class RandInt(_Range):
     randint: tuple[WholeNumber, WholeNumber] = Field(description="[low, high): whole numbers, high left out.")
 
 
-class LogRandInt(_Range):
+class LogRandInt(Range):
     """As randint, on a log scale."""
 
     kind: ClassVar[str] = "lograndint"
@@ -232,7 +247,7 @@ class LogRandInt(_Range):
     lograndint: tuple[WholeNumber, WholeNumber] = Field(description="[low, high): whole numbers, log scale.")
 
 
-class QRandInt(_Range):
+class QRandInt(Range):
     """A whole multiple of q between the ends, both included (with q = 1: as randint)."""
 
     kind: ClassVar[str] = "qrandint"
@@ -242,7 +257,7 @@ class QRandInt(_Range):
     )
 
 
-class QLogRandInt(_Range):
+class QLogRandInt(Range):
     """As qrandint, on a log scale."""
 
     kind: ClassVar[str] = "qlograndint"
@@ -308,6 +323,11 @@ Domain = Annotated[
 """Any domain, for use as the type of a pydantic field."""
 
 
+def num_points(space: Mapping[str, Domain], num_samples: int) -> int:
+    """How many points `draw_points` gives."""
+    return num_samples * math.prod(len(domain.values) for domain in space.values() if isinstance(domain, Grid))
+
+
 def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) -> list[dict[str, Any]]:
     """Draw the points of a sweep: for each sample, one for each combination of the grids' values.
 
@@ -324,14 +344,26 @@ def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) 
     """
     grids = {name: domain.values for name, domain in space.items() if isinstance(domain, Grid)}
     combinations = [dict(zip(grids, values, strict=True)) for values in itertools.product(*grids.values())]
-    points: list[dict[str, Any]] = []
-    for combination in combinations * num_samples:
-        sequence = np.random.SeedSequence(sweep_seed, spawn_key=(POINTS_SPAWN_KEY, len(points)))
-        rng = np.random.default_rng(sequence)
-        points.append(
-            {name: combination[name] if name in combination else domain.sample(rng) for name, domain in space.items()}
-        )
-    return points
+    return [
+        draw_point(space, index, sweep_seed, combination)
+        for index, combination in enumerate(combinations * num_samples)
+    ]
+
+
+def draw_point(
+    space: Mapping[str, Domain], index: int, sweep_seed: int, given: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Draw point `index` alone; grids are drawn from like choices.
+
+    Args:
+        space: Domains by hyperparameter.
+        index: Of the point.
+        sweep_seed: Seed of the sweep, at least 0.
+        given: Values that are not drawn.
+    """
+    given = given or {}
+    rng = np.random.default_rng(np.random.SeedSequence(sweep_seed, spawn_key=(POINTS_SPAWN_KEY, index)))
+    return {name: given[name] if name in given else domain.sample(rng) for name, domain in space.items()}
 
 
 def _index(end: float, q: float, *, up: bool) -> int:

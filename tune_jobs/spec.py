@@ -16,10 +16,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
+from tune_jobs.search_checks import search_problems
 from tune_jobs.search_space import Domain, Number, WholeNumber
 from tune_jobs.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
-SchedulerType = Literal["none", "asha", "hyperband", "median"]
+SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
 _NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
 NAME_RULE = "up to 100 letters, digits, '_', '-' and '.', beginning with none of the last two"
@@ -59,6 +60,25 @@ class EnvSpec(_Section):
 
     id: str = Field(description="Gymnasium id, such as CartPole-v1.", min_length=1)
     args: dict[str, Any] = Field(default_factory=dict, description="Keyword arguments of gymnasium.make.")
+    frame_stack: Annotated[WholeNumber, Field(ge=1, le=64)] = Field(
+        1, description="Observe the last so many observations at once."
+    )
+    pixels: bool = Field(
+        default=False, description="Observe small grey images of what the env renders, not its numbers."
+    )
+    failure_penalty: Number | None = Field(
+        None,
+        description="Reward of the step in which the env ends by failure, such as the pole's fall. Training sees it, "
+        "evaluation and reported returns never do. null: the env's own reward.",
+    )
+
+    @property
+    def wrapped_args(self) -> dict[str, Any]:
+        """`args` and the wrappers of observations: what everybody who makes this environment needs."""
+        # Not above: the command line reads and prints sweep files without Gymnasium.
+        from policies.env_wrappers import with_wrappers
+
+        return with_wrappers(self.args, frame_stack=self.frame_stack, pixels=self.pixels)
 
 
 class StopSpec(_Section):
@@ -70,22 +90,49 @@ class StopSpec(_Section):
     evaluation_return: Number | None = Field(
         None, description="End when the mean return of the greedy evaluation episodes reaches this."
     )
+    num_episodes: PositiveWhole | None = Field(
+        None, description="End with the iteration in which this many whole training episodes are done."
+    )
     num_env_steps: PositiveWhole = Field(200_000, description="End after this many env steps.")
     num_iterations: PositiveWhole = Field(100_000, description="End after this many iterations.")
     time_s: PositiveNumber = Field(3600.0, description="End after this many seconds of training.")
 
 
+class SearchSpec(_Section):
+    """How the points of the space are chosen."""
+
+    type: Literal["random", "tpe"] = Field(
+        "random",
+        description="random: independent draws, and every combination of grids; tpe: a model of the finished trials "
+        "proposes the next points (Bergstra et al. 2011; install tune-jobs[tpe]).",
+    )
+    num_startup_trials: PositiveWhole = Field(
+        10, description="tpe: points are random until so many have been tried to their end; the model's follow."
+    )
+
+
 class SchedulerSpec(_Section):
-    """Whether trials that do worse than others, after as many env steps, are ended early."""
+    """Whether trials that do worse than others, after as many env steps, are ended early, or take over from them."""
 
     type: SchedulerType = Field(
-        "none", description="none, asha (successive halving), hyperband or median (worse than the median)."
+        "none",
+        description="none, asha (successive halving), hyperband, median (worse than the median) or pbt (population "
+        "based training: the worst go on from copies of the best, with mutated hyperparameters).",
     )
     grace_env_steps: PositiveWhole | None = Field(
         None, description="No trial is ended before this many env steps; null: 1/20 of stop.num_env_steps."
     )
     reduction_factor: Annotated[Number, Field(gt=1)] = Field(
         3.0, description="asha, hyperband: one trial in this many goes on at each rung."
+    )
+    perturb_every_env_steps: PositiveWhole | None = Field(
+        None, description="pbt: env steps between two comparisons of a trial; null: 1/10 of stop.num_env_steps."
+    )
+    quantile_fraction: Annotated[Number, Field(gt=0, le=0.5)] = Field(
+        0.25, description="pbt: the worst share of the trials, which copies the best share."
+    )
+    resample_probability: Annotated[Number, Field(ge=0, le=1)] = Field(
+        0.25, description="pbt: how often a mutation draws a new value; else it moves to a neighbouring one."
     )
 
 
@@ -134,13 +181,23 @@ class SweepSpec(_Section):
         description="Name of the sweep and of its folder; null: made from the file's name and the time.",
     )
     env: Annotated[EnvSpec, _from_text("id")] = Field(description="Gymnasium id, or a mapping of id and args.")
-    algorithm: Algorithm = Field(description="ppo or dqn.")
+    algorithm: Algorithm = Field(description="ppo or dqn; or a baseline that does not learn: random or constant.")
+    rl_module: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$",
+        description="An RLModule class of your own as module:Class, in a module that was allowed.",
+    )
     hyperparams: dict[str, Any] = Field(default_factory=dict, description="Fixed hyperparameters.")
     space: dict[str, Domain] = Field(default_factory=dict, description="Searched hyperparameters.")
-    num_samples: PositiveWhole = Field(1, description="Random draws for each combination of the grids' values.")
+    num_samples: PositiveWhole = Field(
+        1, description="Random draws for each combination of the grids' values; with tpe: points."
+    )
     seeds_per_point: PositiveWhole = Field(1, description="Trials a point, each with its own seed.")
     seed: Annotated[WholeNumber, Field(ge=0)] = Field(0, description="Sweep seed: fixes points and all other seeds.")
     stop: StopSpec = Field(default_factory=StopSpec, description="When a trial ends.")
+    search: Annotated[SearchSpec, _from_text("type")] = Field(
+        default_factory=SearchSpec, description="Search method: random or tpe, or a mapping."
+    )
     scheduler: Annotated[SchedulerSpec, _from_text("type")] = Field(
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
     )
@@ -175,6 +232,11 @@ class SweepSpec(_Section):
         return max(1, self.stop.num_env_steps // 20)
 
     @property
+    def perturb_every_env_steps(self) -> int:
+        """pbt: env steps between two comparisons of a trial."""
+        return self.scheduler.perturb_every_env_steps or max(1, self.stop.num_env_steps // 10)
+
+    @property
     def cpus_per_trial(self) -> int:
         """CPUs one trial takes: its own process and its env runners."""
         if self.resources.num_cpus is not None:
@@ -205,7 +267,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def _section_problems(spec: SweepSpec) -> list[Problem]:
     """Settings that contradict each other."""
-    problems = []
+    problems = [Problem(path, text) for path, text in search_problems(spec)]
     grace, cap, resources = spec.scheduler.grace_env_steps, spec.stop.num_env_steps, spec.resources
     if spec.scheduler.type != "none" and grace is not None and grace >= cap:
         text = f"{grace} is not less than stop.num_env_steps, {cap}: no trial would ever be ended early"

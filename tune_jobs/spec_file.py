@@ -31,25 +31,57 @@ _HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tu
 
 
 class Preset(NamedTuple):
-    """A sweep file that ships with the package."""
+    """A sweep file that ships with the package; all but name and text stand in the comment it begins with."""
 
     name: str
+    title: str
+    """One line."""
+    source: str
+    """Where its settings come from."""
+    shows: str
+    expected: str
+    """The score that it reaches."""
+    env_steps: str
+    time: str
+    """On 2 cores."""
     description: str
+    """The rest of the comment."""
     text: str
+    """The whole file."""
+
+
+_PRESET_LABELS = {
+    "Source": "source", "Shows": "shows", "Expected": "expected", "Env steps": "env_steps", "Time": "time",
+}  # fmt: skip
 
 
 def list_presets() -> list[Preset]:
-    """The presets, by name; a preset's description is the comment its file begins with."""
+    """The presets, by name."""
     folder = resources.files("tune_jobs").joinpath("presets")
-    presets = []
-    for file in folder.iterdir():
-        if file.name.endswith(".yaml"):
-            text = file.read_text(encoding="utf-8")
-            comment = re.match(r"(?:#.*\n)*", text)
-            lines = comment.group().splitlines() if comment else []
-            description = " ".join(line.lstrip("# ").rstrip() for line in lines).strip()
-            presets.append(Preset(file.name.removesuffix(".yaml"), description, text))
+    files = [file for file in folder.iterdir() if file.name.endswith(".yaml")]
+    presets = [read_preset(file.name.removesuffix(".yaml"), file.read_text(encoding="utf-8")) for file in files]
     return sorted(presets)
+
+
+def read_preset(name: str, text: str) -> Preset:
+    """A preset from its file's text: a title, then labelled lines, then more; what is missing is empty.
+
+    Args:
+        name: The file's name without its ending.
+        text: The file. Its first lines are `# <title>`, `# Source: ...`, `# Shows: ...`, `# Expected: ...`,
+            `# Env steps: ...`, `# Time: ... on 2 cores`, and free comment lines.
+    """
+    comment = re.match(r"(?:#.*\n)*", text)
+    title, *lines = [line.lstrip("#").strip() for line in (comment.group() if comment else "").splitlines()] or [""]
+    fields = dict.fromkeys(_PRESET_LABELS.values(), "")
+    rest: list[str] = []
+    for line in lines:
+        label, _, value = line.partition(": ")
+        if label in _PRESET_LABELS and not rest:
+            fields[_PRESET_LABELS[label]] = value.strip()
+        else:
+            rest.append(line)
+    return Preset(name=name, title=title, **fields, description=" ".join(rest).strip(), text=text)
 
 
 def find_preset(name: str) -> Preset:
@@ -120,7 +152,7 @@ def json_schema() -> dict[str, Any]:
     properties = schema["properties"]
     properties["hyperparams"] = {"description": properties["hyperparams"]["description"]}
     properties["space"] = {"description": properties["space"]["description"]}
-    for section in ("env", "scheduler"):
+    for section in ("env", "scheduler", "search"):
         # These may also be written as one text.
         properties[section] = {
             "anyOf": [{"type": "string"}, {"$ref": properties[section]["$ref"]}],
@@ -234,9 +266,9 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
     section = data
     for index, parent in enumerate(parents):
         child = section.get(parent)
-        if child is None or (isinstance(child, str) and parent in ("env", "scheduler") and index == 0):
+        if child is None or (isinstance(child, str) and parent in ("env", "scheduler", "search") and index == 0):
             # `env: CartPole-v1` is short for a mapping, which --set env.args... has to go into.
-            child = {} if child is None else {{"env": "id", "scheduler": "type"}[parent]: child}
+            child = {} if child is None else {{"env": "id", "scheduler": "type", "search": "type"}[parent]: child}
             section[parent] = child
         if not isinstance(child, dict):
             here = ".".join(parents[: index + 1])

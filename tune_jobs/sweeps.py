@@ -7,13 +7,15 @@ one that another process runs. A sweep is named by its folder, or by its name in
 from __future__ import annotations
 
 import contextlib
+import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.records import BestRecord, EvaluationRecord, SweepRecord, TrialRecord
+from policies.env_modules import allow_modules
 from policies.errors import SpecError
 from tune_jobs.driving import (
     SweepResult,
@@ -24,9 +26,9 @@ from tune_jobs.driving import (
     run_sweep,
     write_new,
 )
+from tune_jobs.own_code import Source, load_source
 from tune_jobs.plan import Machine, local_machine, make_plan
 from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import load_spec
 from tune_jobs.store import SweepStore, list_sweep_stores
 
 if TYPE_CHECKING:
@@ -37,8 +39,6 @@ __all__ = [
     "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "machine",
     "report", "restore", "resume", "status", "stop", "trials", "video",
 ]  # fmt: skip
-
-Source = str | Path | Mapping[str, Any] | SweepSpec
 
 
 @dataclass(frozen=True)
@@ -61,17 +61,20 @@ def launch(
     address: str | None = None,
     finish: bool = True,
     progress: str = "auto",
+    rl_module: type[Any] | str | None = None,
 ) -> SweepResult:
     """Run a new sweep to its end.
 
     Args:
-        source: A sweep file, a preset's name, a mapping with a sweep file's keys, or a `SweepSpec`.
+        source: A sweep file, a preset's name, a `SweepSpec`, or a mapping with a sweep file's keys, in which `env` or
+            `env.id` may be a class of your own.
         overrides: `a.b=value` settings that replace the source's.
         name: Name of the sweep and its folder; None: the spec's, else the source's with a number if it is taken.
         storage: Folder for sweeps; None: $TUNE_JOBS_STORAGE, else ./sweeps.
         address: Ray cluster to run on; None: this machine.
         finish: Also choose and confirm the best, film it and write the report.
         progress: `auto` or `none`.
+        rl_module: An RLModule class of your own, or its `module:Class`; None: the source's, mostly none.
 
     Returns:
         The records, and where each result lies. Failed trials are in the records; they raise nothing.
@@ -82,7 +85,7 @@ def launch(
     """
     from tune_jobs.finish import storage_folder
 
-    spec = _load(source, overrides)
+    spec = load_source(source, overrides, rl_module)
     stem = Path(source).stem if isinstance(source, str | Path) else "sweep"
     store = choose_store(name if name is not None else spec.name, stem, storage_folder(storage))
     # Here and not only on the cluster's machine, so that a bad env or point is known before Ray starts.
@@ -178,6 +181,7 @@ def _go_on(
     with contextlib.ExitStack() as stack:
         stack.enter_context(store.lock())
         record = store.read_record()
+        allow_modules(record.allowed_modules)
         spec = SweepSpec.model_validate(record.spec)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
         machine = local_machine() if address is None else None
@@ -284,15 +288,17 @@ def evaluate(
     num_episodes: int = 100,
     first_seed: int | None = None,
     env_id: str | None = None,
+    action: int | Sequence[float] | None = None,
 ) -> tuple[EvaluationRecord, EvaluationRecord]:
     """Run greedy episodes of a policy, and of a random one on the same seeds.
 
     Args:
-        source: A sweep (its best), `SWEEP/TRIAL`, a checkpoint folder, a policy file, or `random`.
+        source: A sweep (its best), `SWEEP/TRIAL`, a checkpoint folder, a policy file, `random` or `constant`.
         storage: Folder for sweeps.
         num_episodes: How many.
         first_seed: Seeds are this and the next ones; None: seeds that no training or selection uses.
-        env_id: Another environment than the policy's own.
+        env_id: Another environment than the policy's own; needed for a baseline.
+        action: What `constant` does; None: 0.
 
     Returns:
         The policy's record, and the random policy's.
@@ -304,12 +310,12 @@ def evaluate(
 
     if num_episodes < 1:
         raise SpecError(f"num_episodes is {num_episodes}.", "Ask for at least 1 episode.")
-    found = finish.find_policy(source, storage, env_id)
+    found = finish.find_policy(source, storage, env_id, action)
     first = finish.FRESH_SEED if first_seed is None else first_seed
     seeds = tuple(range(first, first + num_episodes))
     record = finish.run_evaluation(found.policy, found.env_id, found.env_args, seeds)
-    baseline = finish.find_policy(finish.RANDOM, env_id=found.env_id)
-    return record, finish.run_evaluation(baseline.policy, found.env_id, found.env_args, seeds)
+    baseline = finish.random_policy(found.env_id, found.env_args)
+    return record, finish.run_evaluation(baseline, found.env_id, found.env_args, seeds)
 
 
 def video(
@@ -319,6 +325,7 @@ def video(
     output: str | Path | None = None,
     seed: int | None = None,
     env_id: str | None = None,
+    action: int | Sequence[float] | None = None,
 ) -> dict[str, Path]:
     """Film a policy.
 
@@ -328,7 +335,8 @@ def video(
         output: File to write (its ending is replaced by .mp4 and .gif); None: into a sweep's best/ (with the random
             policy before, and both side by side), else `./<policy>.mp4`.
         seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
-        env_id: Another environment than the policy's own.
+        env_id: Another environment than the policy's own; needed for a baseline.
+        action: What `constant` does; None: 0.
 
     Returns:
         The files.
@@ -339,11 +347,11 @@ def video(
     """
     from tune_jobs import finish
 
-    found = finish.find_policy(source, storage, env_id)
+    found = finish.find_policy(source, storage, env_id, action)
     if output is None and found.store is not None:
         return finish.make_videos(found.store, seed)
     name = str(source).replace("/", "-").lstrip(".-") or "policy"
-    target = Path(output) if output is not None else Path(f"{name}-{found.env_id.replace('/', '-')}.mp4")
+    target = Path(output) if output is not None else Path(f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
     return finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed)
 
 
@@ -369,14 +377,14 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
 
     Raises:
         NotFoundError: There is no such checkpoint.
-        CheckpointError: It is damaged, or does not restore to the very weights that were saved.
+        CheckpointError: It is damaged, of a baseline, or does not restore to the very weights that were saved.
     """
-    from policies.portable import read_policy
-    from policies.restore import restore_algorithm
-    from tune_jobs.finish import find_checkpoint
+    from tune_jobs.finish import find_rllib_checkpoint
 
-    folder = find_checkpoint(source, storage)
-    return restore_algorithm(folder / "rllib", read_policy(folder).network)
+    folder, network = find_rllib_checkpoint(source, storage)
+    from policies.restore import restore_algorithm
+
+    return restore_algorithm(folder, network)
 
 
 def machine(address: str) -> Machine:
@@ -387,9 +395,3 @@ def machine(address: str) -> Machine:
     """
     with connected(address, None) as connection:
         return connection.machine
-
-
-def _load(source: Source, overrides: Sequence[str]) -> SweepSpec:
-    if isinstance(source, SweepSpec):
-        source = source.model_dump(mode="json")
-    return load_spec(source, overrides)

@@ -21,6 +21,8 @@ from typing import IO, Any
 import ray
 from ray import tune
 
+from policies.baselines import BASELINES
+from policies.env_modules import allow_modules
 from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
@@ -78,7 +80,7 @@ def read_task(sweep_folder: Path, trial_id: str) -> TrialTask:
         algorithm=spec.algorithm,
         hyperparams=trial.hyperparams,
         env_id=spec.env.id,
-        env_args=spec.env.args,
+        env_args=spec.env.wrapped_args,
         stop=spec.stop,
         evaluation=spec.evaluation,
         checkpoints=spec.checkpoints,
@@ -86,7 +88,22 @@ def read_task(sweep_folder: Path, trial_id: str) -> TrialTask:
         num_env_runners=spec.resources.num_env_runners,
         num_gpus=spec.resources.num_gpus,
         iteration_timeout_s=spec.iteration_timeout_s,
+        failure_penalty=spec.env.failure_penalty,
+        rl_module=spec.rl_module,
+        changes=trial.changes,
     )
+
+
+def make_engine(algorithm: str) -> TrainingEngine:
+    """The engine that trains an algorithm, or plays a baseline."""
+    if algorithm in BASELINES:
+        from tune_jobs.engines.baseline import BaselineEngine
+
+        return BaselineEngine()
+    # Imported in the trial's process only: the driver imports this module too, and needs neither torch nor RLlib.
+    from tune_jobs.engines.rllib import RLlibEngine
+
+    return RLlibEngine()
 
 
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
@@ -94,11 +111,8 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the trial; it is built in the first step, so that every error comes from there."""
-        # Imported in the trial's process only: the driver imports this module too, and needs neither torch nor RLlib.
-        from tune_jobs.engines.rllib import RLlibEngine
-
         self._log = TrialLog()
-        self._engine: TrainingEngine = RLlibEngine()
+        self._engine: TrainingEngine | None = None
         self._evaluators: dict[str, Evaluator] = {}
         self._node = f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
         self._take(config)
@@ -135,11 +149,15 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         store = SweepStore(folder)
         self._file = self._log.open(store.trial(trial_id).log_path)
         task = read_task(folder, trial_id)
+        allow_modules(store.read_record().allowed_modules)
         key = json.dumps([task.env_id, task.env_args, task.evaluation_seeds], sort_keys=True)
         if key not in self._evaluators:
             self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
         spec = SweepSpec.model_validate(store.read_record().spec)
         self._grace = grace_env_steps(spec.scheduler, spec.stop.num_env_steps)
+        if self._engine is None:
+            # All trials of a sweep are of one algorithm, so this process never needs another engine.
+            self._engine = make_engine(task.algorithm)
         loop = TrialLoop(task, self._engine, self._evaluators[key])
         with self._watchdog(task.iteration_timeout_s):
             loop.open()
@@ -178,24 +196,26 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """For Tune's pauses: the checkpoint itself goes to the sweep folder, Tune gets a pointer to it."""
-        iteration = 0
+        folder, trial_id = self._trial
         if self._loop is not None:
             self._loop.pause()
-            iteration = self._loop.iteration
-        folder, trial_id = self._trial
-        pointer = {"sweep_folder": str(folder), "trial_id": trial_id, "iteration": iteration}
+        pointer = {"sweep_folder": str(folder), "trial_id": trial_id, "iteration": _latest_iteration(folder, trial_id)}
         (Path(checkpoint_dir) / _POINTER).write_text(json.dumps(pointer), encoding="utf-8")
 
     def load_checkpoint(self, checkpoint: str) -> None:
-        """Check that what the sweep folder holds is what Tune paused; the next step goes on from it.
+        """Check that the sweep folder holds what Tune paused, or newer; the next step goes on from it.
+
+        A pointer to another trial's checkpoint comes from population based training; what it points to has been
+        copied into this trial's folder.
 
         Raises:
             CheckpointError: The checkpoint Tune wants is not there.
         """
         pointer = json.loads((Path(checkpoint) / _POINTER).read_text(encoding="utf-8"))
         folder, trial_id = self._trial
-        latest = max((record.iteration for record in SweepStore(folder).trial(trial_id).checkpoints()), default=0)
-        if latest != pointer["iteration"]:
+        latest = _latest_iteration(folder, trial_id)
+        # Newer where the trial went on after a pause and its process died: Tune goes back to the pause's pointer.
+        if pointer["trial_id"] == trial_id and latest < pointer["iteration"]:
             raise CheckpointError(
                 f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is {latest}.",
                 "Resume the sweep: its trials go on from their latest checkpoints.",
@@ -204,7 +224,13 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
     def cleanup(self) -> None:
         """Free the trial; the process may end."""
-        self._engine.close()
+        if self._engine is not None:
+            self._engine.close()
         for evaluator in self._evaluators.values():
             evaluator.close()
         self._log.close()
+
+
+def _latest_iteration(folder: Path, trial_id: str) -> int:
+    """Of a trial's checkpoints on disk; 0: it has none."""
+    return max((record.iteration for record in SweepStore(folder).trial(trial_id).checkpoints()), default=0)

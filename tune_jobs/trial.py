@@ -9,13 +9,14 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
 from policies.evaluate import Evaluator
-from policies.policy import NetworkPolicy, NonFiniteWeightsError
+from policies.policy import NonFiniteWeightsError, policy_from_portable
 from policies.portable import save_policy
+from tune_jobs.copies import pending_copy, remove_copies
 from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
 from tune_jobs.store import SweepStore, verify_checkpoint
 
@@ -76,6 +77,8 @@ class TrialLoop:
         self._checkpoints: list[CheckpointRecord] = []
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
+        # Whether the engine holds a copy of another trial's weights that has not been trained on yet.
+        self._is_copy = False
         self._started = 0.0
         self._started_at: float | None = None
 
@@ -85,7 +88,7 @@ class TrialLoop:
         return self._last.iteration
 
     def open(self) -> None:
-        """Build the trial: from its latest checkpoint if it has one, else from its seed.
+        """Build the trial: from its latest checkpoint or a newer copy of another trial's, else from its seed.
 
         Raises:
             CheckpointError: The latest checkpoint is damaged or cannot be restored.
@@ -93,25 +96,38 @@ class TrialLoop:
         self._store.folder.mkdir(parents=True, exist_ok=True)
         self._store.remove_leftovers()
         self._checkpoints = self._store.checkpoints()
+        self._best = _best_of(self._checkpoints)
         latest = self._checkpoints[-1] if self._checkpoints else None
-        known = self._store.read_iterations() if latest is not None else []
-        # What was done after the checkpoint is done again, so its results must not stay.
-        kept = [record for record in known if latest is not None and record.iteration <= latest.iteration]
+        change = self.task.changes[-1] if self.task.changes else None
+        folder = pending_copy(self._store, change, latest.iteration if latest is not None else 0)
+        self._is_copy = folder is not None
+        start = latest.iteration if latest is not None else 0
+        if folder is not None and change is not None:
+            start = change.iteration
+        elif latest is not None:
+            folder = self.task.sweep_folder / latest.path
+        self._take_up_results(start, change.iteration if change is not None else 0)
+        if folder is not None:
+            verify_checkpoint(folder)
+        done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
+        self._engine.build(done, folder)
+        self._started = self._clock() - self._last.time_s
+        self._started_at = time.time()
+
+    def _take_up_results(self, start: int, changed_at: int) -> None:
+        """Go on with the results up to the iteration to start from; what came after it is done again.
+
+        The training return goes on from `changed_at`: episodes before it were played by other weights.
+        """
+        kept = [record for record in self._store.read_iterations() if record.iteration <= start]
         self._store.keep_iterations(kept)
         for record in kept:
-            self._window.extend(record.episode_returns)
+            if record.iteration > changed_at:
+                self._window.extend(record.episode_returns)
             if record.evaluation_return is not None:
                 self._evaluation_return = record.evaluation_return
         if kept:
             self._last = kept[-1]
-        self._best = _best_of(self._checkpoints)
-        folder: Path | None = None
-        if latest is not None:
-            folder = self.task.sweep_folder / latest.path
-            verify_checkpoint(folder)
-        self._engine.build(self.task, folder)
-        self._started = self._clock() - self._last.time_s
-        self._started_at = time.time()
 
     def advance(self, max_s: float) -> Progress:
         """Train until the next evaluation, the end, or for max_s seconds, whichever comes first.
@@ -131,6 +147,8 @@ class TrialLoop:
 
     def pause(self) -> None:
         """Save a checkpoint of this very iteration, so that the trial can go on elsewhere."""
+        if self._is_copy:
+            return  # nothing was trained since; the copy is on disk, and the last score is of other weights
         if self.iteration and not (self._checkpoints and self._checkpoints[-1].iteration == self.iteration):
             self._checkpoint(self._last.evaluation_return)
 
@@ -143,6 +161,7 @@ class TrialLoop:
             self.pause()
             return self._progress("paused", evaluated=False)
         record = self._record(self._engine.train_iteration())
+        self._is_copy = False
         every = self.task.evaluation.every_iterations
         evaluated = record.iteration % every == 0
         reason = self._stop_reason(record, None)
@@ -184,7 +203,7 @@ class TrialLoop:
         )
 
     def _evaluate(self) -> float | None:
-        episodes = self._evaluator.run(NetworkPolicy(self._engine.policy()))
+        episodes = self._evaluator.run(policy_from_portable(self._engine.policy()))
         return finite_or_none(sum(episodes.returns) / len(episodes.returns))
 
     def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
@@ -195,10 +214,14 @@ class TrialLoop:
             return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
         if _reaches(evaluation_return, stop.evaluation_return):
             return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
-        if record.num_env_steps >= stop.num_env_steps:
-            return f"num_env_steps {record.num_env_steps} >= {stop.num_env_steps}"
-        if record.iteration >= stop.num_iterations:
-            return f"num_iterations {record.iteration} >= {stop.num_iterations}"
+        caps = {
+            "num_episodes": (record.num_episodes, stop.num_episodes),
+            "num_env_steps": (record.num_env_steps, stop.num_env_steps),
+            "num_iterations": (record.iteration, stop.num_iterations),
+        }
+        for name, (count, cap) in caps.items():
+            if cap is not None and count >= cap:
+                return f"{name} {count} >= {cap}"
         if record.time_s >= stop.time_s:
             return f"time_s {record.time_s:.0f} >= {stop.time_s:g}"
         return None
@@ -229,6 +252,8 @@ class TrialLoop:
         self._store.write_checkpoint(record, write)
         self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]
         self._best = _best_of(self._checkpoints)
+        if self.task.changes:
+            remove_copies(self._store)
         self._prune()
 
     def _prune(self) -> None:

@@ -21,7 +21,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from tests.benchmarks import workload
+from tests.benchmarks import dqn, workload
 from tests.benchmarks.measure import Run, run
 
 ROOT = Path(__file__).parents[2]
@@ -88,8 +88,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--env-steps", type=int, default=workload.NUM_ENV_STEPS, help="of each of the 20 trials")
+    parser.add_argument("--dqn-env-steps", type=int, default=dqn.NUM_ENV_STEPS, help="of each DQN trial")
+    parser.add_argument("--only", choices=["ppo", "dqn"], help="these rows alone")
     parser.add_argument("--no-peers", action="store_true")
     options = parser.parse_args()
+    rows = [] if options.only == "dqn" else ppo_rows(options)
+    if options.only != "ppo":
+        rows += dqn.rows(options.repeats, options.dqn_env_steps, peers=not options.no_peers)
+    table = Table(title=f"{machine_name()}, medians of {options.repeats}")
+    for column in ("figure", "measured", "at most / at least"):
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def ppo_rows(options: argparse.Namespace) -> list[tuple[str, str, str]]:
+    """The tutorial's sweep, ours and the peers', and the commands that answer at once."""
     help_s = bench_command(["--help"], 5)
     dry_run_s = bench_command(["launch", "cartpole-ppo", "--dry-run"], 5)
     runs, folders = bench_launch(options.repeats, options.env_steps)
@@ -123,12 +138,7 @@ def main() -> None:
             ("the same work, Ray Tune + RLlib", f"{stock:.1f} s, {stock / ours:.2f} x ours", ""),
             ("the same work, Stable-Baselines3, 2 processes", f"{sb3:.1f} s, {sb3 / ours:.2f} x ours", ""),
         ]
-    table = Table(title=f"{machine_name()}, medians of {options.repeats}")
-    for column in ("figure", "measured", "at most / at least"):
-        table.add_column(column)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+    return rows
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Training reaches the returns it should, over several training seeds.
+"""Training reaches the returns it should, over several training seeds: the quick part; `make learn` runs the presets.
 
 Each policy is the trial's best checkpoint by the sweep's own rule, evaluated on 100 episodes whose seeds no training
 and no selection has used. The median over training seeds is asserted: a single unlucky seed of PPO or DQN is normal.
@@ -71,8 +71,8 @@ def test_dqn_learns_cartpole(ray_session: None, tmp_path: Path) -> None:
             "lr": 1e-3,
             "num_envs": 4,
             "learning_starts": 500,
-            "epsilon_decay_steps": 5_000,
-            "target_network_update_freq": 200,
+            "epsilon_decay": 5_000,
+            "target_update_freq": 200,
         },
         "seeds_per_point": 3,
         "stop": {"num_env_steps": 10_000},

@@ -58,7 +58,8 @@ def test_the_composed_services_run_a_sweep_on_two_workers(image, tmp_path):
         worker = image.begin(services["worker"]["command"], environment=services["worker"]["environment"], log=log)
         image.wait_until_healthy(services["worker"], worker, log)
     # The health check of a worker asks for the head; that both have joined is seen in the cluster's CPUs.
-    image.wait_until(["ray", "status", "--address", "head:6379"], r"/2\.0 CPU", environment=services["head"]["environment"])
+    status = ["ray", "status", "--address", "head:6379"]
+    image.wait_until(status, r"/2\.0 CPU", environment=services["head"]["environment"])
     launcher = services["launcher"]
     # Long enough for the slower worker to start before the other has done all: 10 s a trial, never ended early.
     settings = ["num_samples=1", "stop.num_env_steps=100000", "stop.training_return=null", "evaluation.num_episodes=2"]

@@ -1,80 +1,121 @@
 """The cases of DQN's hyperparameters; see `rllib_cases`."""
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 import torch
 from rllib_cases import (
-    MODULE,
     count_updates,
     env_steps,
     learner_of,
-    loss_config,
     module_of,
     optimizer_of,
     reaches,
 )
 
 
-def sampled_batches(algo, num_iterations=1):
+def sampled_rows(algo, num_iterations=1):
     """What the loss was computed from, update by update."""
-    batches = []
+    rows = []
     learner = learner_of(algo)
-    update = learner._update
+    update = learner.update_from_transitions
 
-    def spied(batch, *args, **kwargs):
-        batches.append({key: value.numpy().copy() for key, value in batch[MODULE].items()})
-        return update(batch, *args, **kwargs)
+    def spied(batch, optimizer):
+        rows.append(batch)
+        return update(batch, optimizer)
 
-    learner._update = spied
+    learner.update_from_transitions = spied
     for _ in range(num_iterations):
         algo.train()
-    return batches
+    return rows
+
+
+def column(rows, name):
+    return np.concatenate([getattr(batch, name) for batch in rows])
+
+
+@reaches("dqn", field="lr_final")
+@reaches("dqn", field="lr_decay_steps")
+def check_lr_schedule(build, _):
+    algo = build("dqn", lr=1e-2, lr_final=2e-3, lr_decay_steps=40)
+    found = []
+    for _ in range(3):
+        algo.train()
+        found += [group["lr"] for group in optimizer_of(algo).param_groups]
+    assert found == pytest.approx([6e-3, 2e-3, 2e-3])
+
+
+@reaches("dqn", field="grad_clip")
+def check_grad_clip(build, _):
+    norms = {}
+    for clip in (None, 1e-3):
+        algo = build("dqn", grad_clip=clip)
+        optimizer = optimizer_of(algo)
+        step, seen = optimizer.step, []
+
+        def spied(*args, optimizer=optimizer, seen=seen, step=step):
+            params = optimizer.param_groups[0]["params"]
+            seen.append(float(torch.sqrt(sum((param.grad**2).sum() for param in params))))
+            return step(*args)
+
+        optimizer.step = spied
+        algo.train()
+        norms[clip] = max(seen)
+    assert norms[None] > 1e-2
+    assert norms[1e-3] == pytest.approx(1e-3, rel=1e-2)
 
 
 @reaches("dqn", field="gamma")
 def check_dqn_gamma(build, _):
-    algo = build("dqn", gamma=0.5, n_step=3)
-    rewards = np.concatenate([batch["rewards"] for batch in sampled_batches(algo, 3)])
-    # CartPole gives 1 a step: three steps of it, discounted; fewer at the end of what was sampled.
+    rows = sampled_rows(build("dqn", gamma=0.5, n_step=3), 3)
+    rewards, discounts = column(rows, "rewards"), column(rows, "discounts")
+    # CartPole gives 1 a step: three steps of it, discounted; fewer at the end of an episode.
     assert set(np.round(rewards, 6)) == {1.0, 1.5, 1.75}
-    assert np.mean(rewards == 1.75) > 0.5
-    assert q_target(algo, next_online=[0.0, 1.0], next_target=[3.0, 2.0], n_step=2) == pytest.approx(0.5**2 * 2.0)
+    assert set(discounts) == {0.0, 0.125}
+    assert np.all(discounts[rewards < 1.75] == 0)
 
 
 @reaches("dqn", field="n_step")
 def check_n_step(build, _):
-    batches = sampled_batches(build("dqn", gamma=1.0, n_step=4), 3)
-    assert set(np.concatenate([batch["n_step"] for batch in batches])) == {4}
-    rewards = np.concatenate([batch["rewards"] for batch in batches])
+    rows = sampled_rows(build("dqn", gamma=1.0, n_step=4), 3)
+    rewards = column(rows, "rewards")
     assert max(rewards) == np.median(rewards) == 4.0
+    observations, following = column(rows, "obs"), column(rows, "next_obs")
+    # Four steps apart: a cart moves by velocity times 0.02 s in one.
+    assert np.median(np.abs(following[:, 0] - observations[:, 0] - 0.08 * observations[:, 1])) < 0.03
 
 
-def q_target(algo, *, next_online, next_target, n_step=1):
-    """What Q(s, a) = 0 is moved to for reward 0, given the next state's Q-values; from the Huber loss beyond 1."""
-    learner = learner_of(algo)
+def target_of(algo, *, next_online, next_target, q=0.0):
+    """(loss, |TD error|) for reward 0, discount 1 and these Q-values of the next state."""
     batch = {
         "actions": torch.zeros(2, dtype=torch.long),
         "rewards": torch.zeros(2),
-        "terminateds": torch.zeros(2),
-        "n_step": torch.full((2,), float(n_step)),
-        "weights": torch.ones(2),
+        "discounts": torch.ones(2),
     }
     out = {
-        "qf_preds": torch.zeros(2, 2),
+        "qf_preds": torch.full((2, 2), q),
         "qf_next_preds": torch.tensor([next_online] * 2),
         "qf_target_next_preds": torch.tensor([next_target] * 2),
     }
-    loss = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=batch, fwd_out=out)
-    loss = float(loss)
-    return (2 * loss) ** 0.5 if loss < 0.5 else loss + 0.5
+    loss, errors, _ = learner_of(algo).loss(batch, out)
+    return float(loss), float(errors[0])
 
 
 @reaches("dqn", field="double_q")
 def check_double_q(build, _):
     for double_q, expected in ((True, 2.0), (False, 6.0)):
-        algo = build("dqn", double_q=double_q, gamma=1.0)
+        algo = build("dqn", double_q=double_q)
         # The online network prefers action 0, the target network action 1.
-        assert q_target(algo, next_online=[1.0, 0.0], next_target=[2.0, 6.0]) == pytest.approx(expected)
+        assert target_of(algo, next_online=[1.0, 0.0], next_target=[2.0, 6.0])[1] == pytest.approx(expected)
+
+
+@reaches("dqn", field="td_loss")
+def check_td_loss(build, _):
+    for loss, expected in (("huber", 2.5), ("mse", 9.0)):
+        algo = build("dqn", td_loss=loss)
+        assert target_of(algo, next_online=[1.0, 0.0], next_target=[3.0, 0.0])[0] == pytest.approx(expected)
 
 
 @reaches("dqn", field="dueling")
@@ -83,18 +124,17 @@ def check_dueling(build, _):
     for dueling in (True, False):
         module = module_of(build("dqn", dueling=dueling))
         assert any(name.startswith("vf.") for name in module.state_dict()) == dueling
-        raw = module.af(module.encoder({"obs": obs})["encoder_out"])
-        q_values = module.compute_q_values({"obs": obs})["qf_preds"]
+        encoded = module.encoder(obs)
+        raw = module.af(encoded)
         if dueling:
-            value = module.vf(module.encoder({"obs": obs})["encoder_out"])
-            raw = value + raw - raw.mean(dim=1, keepdim=True)
-        torch.testing.assert_close(q_values, raw)
+            raw = module.vf(encoded) + raw - raw.mean(dim=1, keepdim=True)
+        torch.testing.assert_close(module.compute_q_values({"obs": obs})["qf_preds"], raw)
 
 
 @reaches("dqn", field="train_batch_size")
 def check_dqn_train_batch_size(build, _):
-    batches = sampled_batches(build("dqn", train_batch_size=13))
-    assert {len(batch["obs"]) for batch in batches} == {13}
+    rows = sampled_rows(build("dqn", train_batch_size=13))
+    assert {len(batch.obs) for batch in rows} == {13}
 
 
 @reaches("dqn", field="env_steps_per_iteration")
@@ -103,58 +143,198 @@ def check_env_steps_per_iteration(build, _):
     assert [env_steps(algo.train()) for _ in range(2)] == [37, 74]
 
 
-@reaches("dqn", field="training_intensity")
-def check_training_intensity(build, _):
-    # (intensity, sub-environments): updates for 48 env steps, 8 transitions an update
-    for intensity, num_envs, expected in ((None, 1, 48), (None, 4, 12), (2.0, 1, 12), (16.0, 4, 96)):
-        algo = build("dqn", training_intensity=intensity, env_steps_per_iteration=48, num_envs=num_envs)
+@reaches("dqn", field="train_freq")
+def check_train_freq(build, _):
+    algo = build("dqn", train_freq=5, train_batch_size=1)
+    phases, update = [], learner_of(algo).update_from_replay
+
+    def spied(replay, num_updates, **counts):
+        phases.append((num_updates, counts["num_env_steps"]))
+        return update(replay, num_updates, **counts)
+
+    learner_of(algo).update_from_replay = spied
+    algo.train()
+    assert phases == [(5, 5), (5, 10), (5, 15), (5, 20)]
+
+
+@reaches("dqn", field="updates_per_env_step")
+def check_updates_per_env_step(build, _):
+    # (updates a step, sub-environments): updates for 48 env steps
+    for rate, num_envs, expected in ((1.0, 1, 48), (1.0, 4, 48), (0.25, 1, 12), (0.3, 4, 14), (3.0, 2, 144)):
+        algo = build(
+            "dqn", updates_per_env_step=rate, env_steps_per_iteration=48, num_envs=num_envs, train_batch_size=1
+        )
         sizes = count_updates(algo)
         steps = env_steps(algo.train())
-        assert abs(len(sizes) - expected * steps / 48) <= 1 + 0.1 * expected, (intensity, num_envs, len(sizes), steps)
+        assert abs(len(sizes) - expected * steps / 48) < 1 + rate, (rate, num_envs, len(sizes), steps)
 
 
-@reaches("dqn", field="adam_epsilon")
-def check_adam_epsilon(build, _):
-    algo = build("dqn", adam_epsilon=1e-4)
-    assert [group["eps"] for group in optimizer_of(algo).param_groups] == [1e-4]
+@reaches("dqn", field="optimizer")
+def check_optimizer(build, _):
+    for name, kind in (("adam", torch.optim.Adam), ("rmsprop", torch.optim.RMSprop)):
+        algo = build("dqn", optimizer=name)
+        assert type(optimizer_of(algo)) is kind
+        before = module_of(algo).af.weight.detach().clone()
+        algo.train()
+        assert not torch.equal(before, module_of(algo).af.weight)
 
 
-def target_update(algo, num_env_steps):
-    """(online, target before, target after) of one weight, when an update ends at so many env steps."""
+def check_optimizer_argument(build, field, value, *, key, optimizer, expected=None):
+    algo = build("dqn", optimizer=optimizer, **{field: value})
+    algo.train()
+    assert [group[key] for group in optimizer_of(algo).param_groups] == [value if expected is None else expected]
+
+
+@reaches("dqn", field="optimizer_epsilon")
+def check_optimizer_epsilon(build, _):
+    for optimizer in ("adam", "rmsprop"):
+        check_optimizer_argument(build, "optimizer_epsilon", 1e-4, key="eps", optimizer=optimizer)
+
+
+@reaches("dqn", field="adam_beta1")
+def check_adam_beta1(build, _):
+    check_optimizer_argument(build, "adam_beta1", 0.5, key="betas", optimizer="adam", expected=(0.5, 0.999))
+
+
+@reaches("dqn", field="adam_beta2")
+def check_adam_beta2(build, _):
+    check_optimizer_argument(build, "adam_beta2", 0.5, key="betas", optimizer="adam", expected=(0.9, 0.5))
+
+
+@reaches("dqn", field="rmsprop_rho")
+def check_rmsprop_rho(build, _):
+    check_optimizer_argument(build, "rmsprop_rho", 0.5, key="alpha", optimizer="rmsprop")
+
+
+@reaches("dqn", field="rmsprop_momentum")
+def check_rmsprop_momentum(build, _):
+    check_optimizer_argument(build, "rmsprop_momentum", 0.5, key="momentum", optimizer="rmsprop")
+
+
+def next_values(algo):
+    """(online, target) Q-values of the same next observations, after the online weights moved."""
     module = module_of(algo)
-    online, target = module.af.net.mlp[0].weight, module._target_af.net.mlp[0].weight
     with torch.no_grad():
-        online += 1.0
-    before = target.clone()
-    learner_of(algo).after_gradient_based_update(timesteps={"num_env_steps_sampled_lifetime": num_env_steps})
-    return online, before, target
+        module.af.weight[0] += 1.0  # of one action: dueling heads take out what all have in common
+    obs = torch.ones(3, 4)
+    out = module._forward_train({"obs": obs, "new_obs": obs})
+    return out["qf_preds"].detach(), out["qf_target_next_preds"]
 
 
-@reaches("dqn", field="target_network_update_freq")
-def check_target_network_update_freq(build, _):
-    algo = build("dqn", target_network_update_freq=70)
-    changed = {}
-    for num_env_steps in (60, 69, 70, 100, 139, 140):
-        _, before, after = target_update(algo, num_env_steps)
-        changed[num_env_steps] = not torch.equal(before, after)
-    assert changed == {60: False, 69: False, 70: True, 100: False, 139: False, 140: True}
+@reaches("dqn", field="target_network")
+def check_target_network(build, _):
+    online, target = next_values(build("dqn", target_network=True, double_q=False))
+    assert not torch.allclose(online, target)
+    algo = build("dqn", target_network=False, double_q=False)
+    online, target = next_values(algo)
+    torch.testing.assert_close(online, target)
+    assert not target.requires_grad
+    assert not any("target" in name for name in module_of(algo).state_dict())
+    algo.train()
+    assert learner_of(algo).num_target_updates == 0
+
+
+def target_updates(algo, num_iterations):
+    """How often the target network really changed, iteration by iteration."""
+    learner, counts = learner_of(algo), []
+    update, target = learner.update_target, module_of(algo)._target_af.weight
+    changes = []
+
+    def spied():
+        before = target.clone()
+        update()
+        changes.append(not torch.equal(before, target))
+
+    learner.update_target = spied
+    for _ in range(num_iterations):
+        algo.train()
+        counts.append(sum(changes))
+    return counts
+
+
+@reaches("dqn", field="target_update_freq")
+def check_target_update_freq(build, _):
+    # At 7, 14, 21, 28, 35, ... env steps.
+    assert target_updates(build("dqn", target_update_freq=7, train_batch_size=1), 3) == [2, 5, 8]
+    # The updates of a training phase are spread over the env steps before it.
+    assert target_updates(build("dqn", target_update_freq=5, train_freq=20, train_batch_size=1), 2) == [4, 8]
+    # Null: every 500 env steps if hard, every update if soft.
+    assert target_updates(build("dqn", env_steps_per_iteration=499, train_batch_size=1), 2) == [0, 1]
+    assert target_updates(build("dqn", tau=0.1, train_batch_size=1), 2) == [20, 40]
+
+
+@reaches("dqn", field="target_update_unit")
+def check_target_update_unit(build, _):
+    algo = build("dqn", target_update_freq=2, target_update_unit="episode", env_steps_per_iteration=150)
+    counts = target_updates(algo, 2)
+    assert counts[-1] == algo.num_episodes // 2
+    assert counts[-1] > 2
 
 
 @reaches("dqn", field="tau")
 def check_tau(build, _):
     for tau in (0.25, 1.0):
-        online, before, after = target_update(build("dqn", tau=tau, target_network_update_freq=1), 10)
-        torch.testing.assert_close(after, tau * online + (1 - tau) * before)
-        assert not torch.equal(before, after)
+        algo = build("dqn", tau=tau)
+        module = module_of(algo)
+        online, target = module.af.weight, module._target_af.weight
+        with torch.no_grad():
+            online += 1.0
+        before = target.clone()
+        learner_of(algo).update_target()
+        torch.testing.assert_close(target, tau * online + (1 - tau) * before)
+        assert not torch.equal(before, target)
+
+
+@reaches("dqn", field="replay")
+def check_replay(build, _):
+    uniform = sampled_rows(build("dqn", replay="uniform"), 2)
+    assert all(rows.weights is None for rows in uniform)
+    prioritized = sampled_rows(build("dqn", replay="prioritized"), 2)
+    assert np.ptp(column(prioritized, "weights")) > 0.01
+    last = sampled_rows(build("dqn", replay="none", train_batch_size=3), 2)
+    # The next batch is this one without its oldest transition, and one more.
+    for earlier, later in itertools.pairwise(last):
+        np.testing.assert_array_equal(earlier.obs[1:], later.obs[:-1])
+        assert not np.array_equal(earlier.obs[-1], later.obs[-1])
 
 
 @reaches("dqn", field="replay_capacity")
 def check_replay_capacity(build, _):
-    algo = build("dqn", replay_capacity=60, env_steps_per_iteration=400)
-    assert algo.local_replay_buffer.capacity == 60
+    algo = build("dqn", replay_capacity=60, env_steps_per_iteration=200)
     algo.train()
-    # It drops whole episodes and never the one being added to, so it may be over by one.
-    assert algo.local_replay_buffer.get_num_timesteps() < 400 / 2
+    assert len(algo.replay) == algo.replay.capacity == 60
+
+
+@reaches("dqn", field="prioritized_alpha")
+def check_prioritized_alpha(build, _):
+    """With alpha 0 all rows are as likely, whatever their TD errors."""
+    for alpha, expected in ((0.0, 1.0), (1.0, 100.0)):
+        replay = build("dqn", replay="prioritized", prioritized_alpha=alpha).replay
+        assert priority_ratio(replay, 100.0) == pytest.approx(expected, rel=1e-3)
+
+
+def priority_ratio(replay, td_error):
+    rows = sampled_like(replay, 2)
+    where = replay.add(rows)
+    replay.set_priorities(where, np.array([1.0, td_error], dtype=np.float32))
+    leaves = replay._sums[replay._num_leaves + where]
+    return leaves[1] / leaves[0]
+
+
+def sampled_like(replay, count):
+    from policies.replay import Transitions
+
+    numbers = np.arange(count, dtype=np.float32)
+    obs = np.repeat(numbers[:, None], 4, axis=1)
+    return Transitions(obs, numbers.astype(np.int64), numbers, obs, numbers)
+
+
+@reaches("dqn", field="prioritized_beta")
+def check_prioritized_beta(build, _):
+    for beta, flat in ((0.0, True), (1.0, False)):
+        algo = build("dqn", replay="prioritized", prioritized_beta=beta)
+        weights = column(sampled_rows(algo, 3), "weights")
+        assert (np.ptp(weights) < 1e-6) == flat
 
 
 @reaches("dqn", field="learning_starts")
@@ -168,42 +348,51 @@ def check_learning_starts(build, _):
     assert counts == [0, 0, 11, 31]
 
 
-@reaches("dqn", field="prioritized_replay")
-def check_prioritized_replay(build, _):
-    from ray.rllib.utils.replay_buffers import EpisodeReplayBuffer, PrioritizedEpisodeReplayBuffer
+def epsilons(build, num_iterations, **values):
+    """(t, epsilon) of each step that the env runner explored."""
+    algo = build("dqn", **values)
+    module = algo.env_runner.module
+    explore, used = module._forward_exploration, []
 
-    for prioritized, kind in ((False, EpisodeReplayBuffer), (True, PrioritizedEpisodeReplayBuffer)):
-        algo = build("dqn", prioritized_replay=prioritized)
-        assert type(algo.local_replay_buffer) is kind
-        batches = sampled_batches(algo, 2)
-        weights = np.concatenate([batch["weights"] for batch in batches]) if "weights" in batches[0] else np.ones(1)
-        assert bool(np.ptp(weights)) == prioritized
+    def spied(batch, t):
+        used.append((t, module.exploration_schedule.at(t)))
+        return explore(batch, t=t)
 
-
-def epsilon_at(algo, num_env_steps):
-    schedule = algo.env_runner.module.epsilon_schedule
-    schedule.update(num_env_steps)
-    return float(schedule.get_current_value())
+    module._forward_exploration = spied
+    for _ in range(num_iterations):
+        algo.train()
+    return algo, used
 
 
 @reaches("dqn", field="epsilon_initial")
-def check_epsilon_initial(build, _):
-    assert epsilon_at(build("dqn", epsilon_initial=0.7), 0) == pytest.approx(0.7)
-
-
 @reaches("dqn", field="epsilon_final")
-def check_epsilon_final(build, _):
-    algo = build("dqn", epsilon_final=0.2)
-    assert [epsilon_at(algo, steps) for steps in (10_000, 50_000)] == pytest.approx([0.2, 0.2])
+@reaches("dqn", field="epsilon_decay")
+def check_epsilon(build, _):
+    _, used = epsilons(build, 3, epsilon_initial=0.8, epsilon_final=0.2, epsilon_decay=30)
+    # As a mapping: a vector env's step that only resets is no env step, and acts with the epsilon of the next one.
+    assert dict(used) == {t: pytest.approx(max(0.2, 0.8 - 0.02 * t)) for t in range(60)}
 
 
-@reaches("dqn", field="epsilon_decay_steps")
-def check_epsilon_decay_steps(build, _):
-    algo = build("dqn", epsilon_initial=0.9, epsilon_final=0.1, epsilon_decay_steps=80)
-    assert epsilon_at(algo, 40) == pytest.approx(0.5)
-    # And it moves on with the env steps of the trial, from one iteration to the next.
-    seen = []
-    for _ in range(3):
-        algo.train()
-        seen.append(float(algo.env_runner.module.epsilon_schedule.get_current_value()))
-    assert seen == pytest.approx([0.9 - 0.01 * steps for steps in (19, 39, 59)], abs=0.011)
+@reaches("dqn", field="epsilon_start")
+def check_epsilon_start(build, _):
+    _, used = epsilons(build, 2, epsilon_initial=1.0, epsilon_final=0.0, epsilon_decay=10, epsilon_start=15)
+    assert dict(used) == {t: pytest.approx(min(1.0, max(0.0, 2.5 - 0.1 * t))) for t in range(40)}
+
+
+@reaches("dqn", field="epsilon_schedule")
+def check_epsilon_schedule(build, _):
+    values = {"epsilon_initial": 0.9, "epsilon_final": 0.1, "epsilon_decay": 10}
+    _, used = epsilons(build, 2, epsilon_schedule="exponential", **values)
+    assert dict(used) == {t: pytest.approx(0.1 + 0.8 * math.exp(-t / 10)) for t in range(40)}
+    _, used = epsilons(build, 2, epsilon_schedule="geometric", **values)
+    assert dict(used) == {t: pytest.approx(max(0.1, 0.9 * math.exp(-t / 10))) for t in range(40)}
+
+
+@reaches("dqn", field="epsilon_unit")
+def check_epsilon_unit(build, _):
+    # Episodes that end within a training phase count at once.
+    algo, used = epsilons(build, 2, epsilon_unit="episode", env_steps_per_iteration=150, train_freq=75)
+    episodes = [t for t, _ in used]
+    assert episodes == sorted(episodes)
+    assert set(range(algo.num_episodes)) <= set(episodes) <= set(range(algo.num_episodes + 1))
+    assert algo.num_episodes > 5

@@ -183,3 +183,82 @@ def check_num_epochs(build, _):
     assert 64 <= counts[1] < 64 + 64
     assert 4 * 64 <= counts[4] < 4 * (64 + 32)
     assert counts[4] > 3 * counts[1] - 32
+
+
+# -- schedules
+
+
+def entropy_weight(algo):
+    """What the loss multiplies the entropy by: the loss of rows without anything else to gain."""
+    learner, module = learner_of(algo), module_of(algo)
+    rows = {
+        "obs": torch.zeros(4, 4),
+        "actions": torch.zeros(4, dtype=torch.int64),
+        "action_logp": torch.zeros(4),
+        "action_dist_inputs": torch.zeros(4, 2),
+        # No advantage, and the value is the target: only the entropy is left.
+        "advantages": torch.zeros(4),
+    }
+    with torch.no_grad():
+        rows["value_targets"] = module.compute_values(rows)
+        out = module.forward_train(rows)
+        loss = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=rows, fwd_out=out)
+        entropy = torch.distributions.Categorical(logits=out["action_dist_inputs"]).entropy().mean()
+    return float(-loss / entropy)
+
+
+def in_first_updates(algo, read):
+    """(env steps, what `read` gives in the phase's first update), for three iterations."""
+    learner = learner_of(algo)
+    update, seen = learner._update, []
+
+    def reading(batch, *args, **kwargs):
+        seen.append(read())
+        return update(batch, *args, **kwargs)
+
+    learner._update = reading
+    found = []
+    for _ in range(3):
+        seen.clear()
+        found.append((env_steps(algo.train()), seen[0]))
+        assert seen[-1] == pytest.approx(seen[0], rel=1e-4)
+    return found
+
+
+def check_schedule(build, read, values):
+    """A value moves from the first update on, along the line that the three hyperparameters draw, and then stays."""
+    first, final, decay_steps = values.values()
+    algo = build("ppo", **values)
+    for num_env_steps, value in in_first_updates(algo, lambda: read(algo)):
+        share = min(1.0, num_env_steps / decay_steps)
+        assert value == pytest.approx(first + share * (final - first), rel=1e-4, abs=1e-9)
+    assert share == 1.0
+
+
+def current_lr(algo):
+    (group,) = learner_of(algo).get_optimizer(MODULE).param_groups
+    return group["lr"]
+
+
+@reaches("ppo", field="lr_final")
+def check_lr_final(build, _):
+    check_schedule(build, current_lr, {"lr": 4e-3, "lr_final": 1e-3, "lr_decay_steps": 150})
+
+
+@reaches("ppo", field="lr_decay_steps")
+def check_lr_decay_steps(build, _):
+    check_schedule(build, current_lr, {"lr": 4e-3, "lr_final": 0.0, "lr_decay_steps": 100})
+
+
+@reaches("ppo", field="entropy_coeff_final")
+def check_entropy_coeff_final(build, _):
+    check_schedule(
+        build, entropy_weight, {"entropy_coeff": 0.2, "entropy_coeff_final": 0.05, "entropy_decay_steps": 150}
+    )
+
+
+@reaches("ppo", field="entropy_decay_steps")
+def check_entropy_decay_steps(build, _):
+    check_schedule(
+        build, entropy_weight, {"entropy_coeff": 0.2, "entropy_coeff_final": 0.0, "entropy_decay_steps": 100}
+    )

@@ -192,9 +192,9 @@ def spread_actions(algo, obs):
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.mul_(3.0)
-        head = (module.pi if hasattr(module, "pi") else module.af).net.mlp[0]
-        features = module.encoder({"obs": torch.from_numpy(obs)})["encoder_out"]
-        outputs = head(features["actor"] if isinstance(features, dict) else features)
+        head = module.pi if hasattr(module, "pi") else module.af
+        encoder = module._actor if hasattr(module, "pi") else module.encoder
+        outputs = head(encoder(module.prepare(torch.from_numpy(obs))))
         head.weight.div_(outputs.std(dim=0)[:, None])
         head.bias.sub_(outputs.mean(dim=0)).div_(outputs.std(dim=0))
     algo.env_runner.module.set_state(module.get_state(inference_only=True))
@@ -251,7 +251,7 @@ def test_a_network_other_than_the_hyperparameters_say_is_an_error(trained):
     from policies.restore import portable_policy
 
     _, saved = trained
-    algorithm = "dqn" if type(saved).__name__ == "DQN" else "ppo"
+    algorithm = "dqn" if "DQN" in type(saved).__name__ else "ppo"
     for values, what in (
         ({"hidden_sizes": (8, 8)}, "no weights"),
         ({"hidden_sizes": (9,)}, "hidden layers"),

@@ -100,8 +100,8 @@ def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
     assert same(runner_weights, {name: weights[name] for name in runner_weights})
     assert after.algorithm.iteration == 3
     before, now = stats[-1].num_env_steps, after.train_iteration().num_env_steps
-    # On from there. What DQN sampled to fill its replay buffer again counts as part of the iteration.
-    iteration = {"ppo": 128, "dqn": 60}[algorithm]
+    # On from there. What DQN sampled to fill its replay buffer again counts.
+    iteration = {"ppo": 128, "dqn": 60 + 30}[algorithm]
     assert iteration <= now - before < iteration + 4
     assert not same(learner_weights(after.algorithm), weights)
     assert after.policy().training["iteration"] == 4
@@ -145,23 +145,37 @@ def test_a_restored_trial_does_not_see_its_first_episodes_again(engine, tmp_path
 
 @pytest.mark.parametrize("num_env_runners", [0, 1])
 def test_dqn_fills_its_replay_buffer_again(engine, tmp_path, num_env_runners):
-    """Ray does not save it; training on a handful of transitions would undo what was learned."""
+    """It is not in checkpoints; training on a handful of transitions would undo what was learned."""
     task = make_task(tmp_path, "dqn", learning_starts=50, num_env_runners=num_env_runners)
     weights_after(engine, task, 2)
-    sampled_before = engine.algorithm.local_replay_buffer.get_num_timesteps()
-    assert sampled_before == 120
+    before = engine.algorithm
+    assert len(before.replay) == before.num_env_steps == 120
+    counts = before.num_updates, before.num_episodes, before.learner.target_updates_at
     folder = save(engine, tmp_path / "000002")
     engine.build(task, folder)
-    buffer = engine.algorithm.local_replay_buffer
-    assert 50 <= buffer.get_num_timesteps() <= 60
-    batch = buffer.sample(num_items=16, n_step=1, gamma=0.9, batch_length_T=0, sample_episodes=True)
-    assert len(batch) == 16
+    after = engine.algorithm
+    assert len(after.replay) == 50
+    # What was sampled for it counts: an env step is an env step.
+    assert after.num_env_steps == 120 + 50
+    assert (after.num_updates, after.num_episodes, after.learner.target_updates_at) >= counts
+    assert after.num_updates == counts[0] == 71
     stats = engine.train_iteration()
-    # What was sampled for it counts: an env step is an env step. So this iteration had only a few left to do.
-    assert stats.num_env_steps == sampled_before + buffer.get_num_timesteps() == 180
-    assert "qf_loss" in stats.learner
+    assert stats.num_env_steps == 170 + 60
+    assert after.num_updates == 71 + 60
+    assert "total_loss" in stats.learner
+    assert len(after.replay) == 110
+
+
+def test_dqn_with_env_runners_sends_them_its_weights(engine, tmp_path):
+    engine.build(make_task(tmp_path, "dqn", num_env_runners=1), None)
     engine.train_iteration()
-    assert buffer.get_num_timesteps() == 120
+    engine.train_iteration()
+    algorithm = engine.algorithm
+    (theirs,) = algorithm.env_runner_group.foreach_env_runner(
+        lambda runner: runner.module.get_state(), local_env_runner=False
+    )
+    ours = algorithm.learner_group.get_weights()["default_policy"]
+    assert same(theirs, {name: ours[name] for name in theirs})
 
 
 def test_a_damaged_checkpoint_is_never_a_fresh_start(engine, tmp_path):
@@ -193,7 +207,7 @@ def test_the_policy_is_the_one_that_trains(engine, tmp_path):
     weights_after(engine, task, 1)
     policy = engine.policy()
     weights = learner_weights(engine.algorithm)
-    np.testing.assert_array_equal(policy.network.layers[0].weight, weights["encoder.actor_encoder.net.mlp.0.weight"])
+    np.testing.assert_array_equal(policy.network.layers[0].weight, weights["encoder.actor_encoder.mlp.0.weight"])
     assert policy.training == {
         "trial_id": "t0000",
         "seed": TRIAL_SEED,

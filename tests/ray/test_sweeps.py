@@ -151,11 +151,11 @@ def test_the_best_restores_as_an_algorithm_by_the_sweeps_name(cartpole):
     algo = sweeps.restore("cartpole", storage=storage)
     layers = read_policy(result.artifacts["policy"]).network.layers
     weights = learner_weights(algo)
-    np.testing.assert_array_equal(weights["pi.net.mlp.0.weight"], layers[-1].weight)
+    np.testing.assert_array_equal(weights["pi.weight"], layers[-1].weight)
     iteration = algo.iteration
     algo.train()
     assert algo.iteration == iteration + 1
-    assert not np.array_equal(learner_weights(algo)["pi.net.mlp.0.weight"], layers[-1].weight)
+    assert not np.array_equal(learner_weights(algo)["pi.weight"], layers[-1].weight)
     algo.stop()
     other = sweeps.restore("cartpole/t0001", storage=storage)
     assert other.iteration == result.trials[1].best_iteration

@@ -9,7 +9,14 @@ from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
 TRIAL_SEED = 9 * 1024
 SMALL = {
     "ppo": {"hidden_sizes": (8,), "train_batch_size": 128, "minibatch_size": 64, "num_epochs": 2, "num_envs": 4},
-    "dqn": {"hidden_sizes": (8,), "env_steps_per_iteration": 60, "learning_starts": 30, "train_batch_size": 16},
+    "dqn": {
+        "hidden_sizes": (8,),
+        "env_steps_per_iteration": 60,
+        "learning_starts": 30,
+        "train_batch_size": 16,
+        "train_freq": 1,
+        "updates_per_env_step": 1.0,
+    },
 }
 
 

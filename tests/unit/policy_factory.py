@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from typing import Any
 
@@ -10,7 +11,15 @@ import numpy as np
 
 from policies.envs import check_env
 from policies.policy import NetworkPolicy
-from policies.portable import Layer, PolicyNetwork, PortablePolicy, describe_space
+from policies.portable import (
+    ConvLayer,
+    Layer,
+    ModuleWeights,
+    Normalization,
+    PolicyNetwork,
+    PortablePolicy,
+    describe_space,
+)
 
 
 def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algorithm="ppo", **env_args: Any):
@@ -42,6 +51,55 @@ def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algor
 def make_policy(env_id: str, **kwargs: Any) -> NetworkPolicy:
     """A random network as a policy."""
     return NetworkPolicy(make_portable(env_id, **kwargs))
+
+
+IMAGES = gym.spaces.Box(0, 255, (13, 10, 2), np.uint8)
+CONV = ((5, 4, 2), (3, 2, 1))
+"""(channels, kernel, stride); they make 4 x 3 pixels of such an image."""
+
+
+def make_image_policy(activation="relu", seed=0, *, normalize=True, num_actions=3) -> PortablePolicy:
+    """A convolutional network with random weights for `IMAGES`."""
+    rng = np.random.default_rng(seed)
+
+    def weights(*shape):
+        return (rng.normal(size=shape) / np.sqrt(np.prod(shape[1:]))).astype(np.float32)
+
+    conv, channels = [], IMAGES.shape[2]
+    for out_channels, kernel, stride in CONV:
+        weight = weights(out_channels, channels, kernel, kernel)
+        conv.append(ConvLayer(weight, weights(out_channels, 1)[:, 0], stride, activation))
+        channels = out_channels
+    sizes = [4 * 3 * channels, 16, num_actions]
+    layers = [
+        Layer(weights(num_out, num_in), weights(num_out, 1)[:, 0], "linear" if last else activation)
+        for (num_in, num_out), last in zip(itertools.pairwise(sizes), (False, True), strict=True)
+    ]
+    mean, std = rng.uniform(0.3, 0.7, IMAGES.shape), rng.uniform(0.05, 0.5, IMAGES.shape)
+    normalization = Normalization(mean.astype(np.float32), std.astype(np.float32), 4.0)
+    network = PolicyNetwork(
+        "q_values",
+        tuple(layers),
+        conv=tuple(conv),
+        normalization=normalization if normalize else None,
+        scale=1 / 255,
+    )
+    return PortablePolicy(
+        network=network,
+        algorithm="dqn",
+        env_id="TestImages-v0",
+        env_args={},
+        observation_space=describe_space(IMAGES),
+        action_space=describe_space(gym.spaces.Discrete(num_actions)),
+    )
+
+
+def make_module_portable() -> PortablePolicy:
+    """A policy whose network is a class of the user's own; nothing of that name exists."""
+    tensors = {"trunk.weight": np.arange(8, dtype=np.float32).reshape(2, 4), "count": np.array(3, dtype=np.int64)}
+    base = make_portable("CartPole-v1")
+    module = ModuleWeights("no_such_package.networks:Mine", {"fcnet_hiddens": [2], "rate": 0.5}, tensors)
+    return dataclasses.replace(base, network=PolicyNetwork("module", (), module=module))
 
 
 # Weights on CartPole's position, velocity, angle and angular velocity, and how long they keep the pole up.

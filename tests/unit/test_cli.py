@@ -23,8 +23,8 @@ def options(**given):
 
 
 LAUNCHED = {"overrides": ("a.b=1", "c=2"), "name": "n"}
-EVALUATED = {"storage": None, "num_episodes": 100, "first_seed": None, "env_id": None}
-FILMED = {"storage": None, "output": None, "seed": None, "env_id": None}
+EVALUATED = {"storage": None, "num_episodes": 100, "first_seed": None, "env_id": None, "action": None}
+FILMED = {"storage": None, "output": None, "seed": None, "env_id": None, "action": None}
 COMMANDS = [
     (
         "launch x.yaml --set a.b=1 --set c=2 --name n --address auto --no-finish",
@@ -47,6 +47,14 @@ COMMANDS = [
         ("evaluate", ("mine/t0001",), {**EVALUATED, "num_episodes": 7, "first_seed": 0}),
     ),
     ("evaluate random --env CartPole-v1", ("evaluate", ("random",), {**EVALUATED, "env_id": "CartPole-v1"})),
+    (
+        "evaluate constant --env CartPole-v1 --action 1",
+        ("evaluate", ("constant",), {**EVALUATED, "env_id": "CartPole-v1", "action": 1}),
+    ),
+    (
+        "video constant --env Pendulum-v1 --action [-0.5]",
+        ("video", ("constant",), {**FILMED, "env_id": "Pendulum-v1", "action": (-0.5,)}),
+    ),
     ("video mine", ("video", ("mine",), FILMED)),
     ("video mine --output out --seed 0", ("video", ("mine",), {**FILMED, "output": Path("out"), "seed": 0})),
     ("report mine", ("report", ("mine",), {"storage": None})),
@@ -204,6 +212,8 @@ def test_debug_shows_the_traceback(tmp_path, sweeps):
         ["evaluate", "p", "--first-seed", "-1"],
         ["evaluate", "random"],
         ["video", "random"],
+        ["video", "constant"],
+        ["evaluate", "constant", "--env", "CartPole-v1", "--action", "left"],
     ],
 )
 def test_wrong_arguments_are_exit_code_2(run, sweeps, arguments):

@@ -124,8 +124,16 @@ def test_bad_input_is_one_clear_message_and_nothing_is_written(run, tmp_path, ca
 
 
 def test_presets_are_listed_and_printed(run, tmp_path):
-    assert "cartpole-ppo" in run("presets").stdout
-    assert "cartpole-ppo" in {preset["name"] for preset in json.loads(run("presets", "--json").stdout)}
+    listed = run("presets").stdout
+    for word in ("preset", "expected", "env steps", "time on 2 cores"):
+        assert word in listed
+    row = next(line for line in listed.splitlines() if "cartpole-random" in line)
+    assert "Random play" in row
+    assert "3,400" in row
+    presets = {preset["name"]: preset for preset in json.loads(run("presets", "--json").stdout)}
+    assert set(presets["cartpole-ppo"]) == {
+        "name", "title", "source", "shows", "expected", "env_steps", "time", "description", "text",
+    }  # fmt: skip
     (tmp_path / "own.yaml").write_text(run("presets", "cartpole-ppo").stdout)
     assert run("launch", "own.yaml", "--dry-run").exit_code == 0
     missing = run("presets", "cartpole-pp")

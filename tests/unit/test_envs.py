@@ -84,9 +84,11 @@ def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp
     (tmp_path / "evil_module.py").write_text("print('ran')")
     code = (
         "from policies.envs import *\n"
+        "from policies.errors import EnvError\n"
         "for use in (check_env, make_env, lambda i, a: make_vector_env(i, a, 2)):\n"
         "    try: use('evil_module:CartPole-v1', None)\n"
-        "    except EnvError as error: assert 'colon' in error.message\n"
+        "    except EnvError as error:\n"
+        "        assert 'colon' in error.message and '--allow-module evil_module' in error.hint, error\n"
         "    else: raise SystemExit('not refused')\n"
     )
     done = subprocess.run(
@@ -125,8 +127,10 @@ def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error():
 @pytest.mark.parametrize(
     ("spaces", "words"),
     [
-        ({"observation_space": gym.spaces.Discrete(4)}, "observations of kind Discrete.*1-D Box"),
-        ({"observation_space": gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)}, r"shape \(8, 8, 3\)"),
+        ({"observation_space": gym.spaces.Discrete(4)}, "observations of kind Discrete.*only Box"),
+        ({"observation_space": gym.spaces.Box(0, 255, (8, 8), np.uint8)}, r"shape \(8, 8\)"),
+        ({"observation_space": gym.spaces.Box(0, 255, (8, 0, 3), np.uint8)}, r"shape \(8, 0, 3\)"),
+        ({"observation_space": gym.spaces.Box(0, 255, (8, 8, 3), np.int64)}, "images of dtype int64.*uint8"),
         ({"observation_space": gym.spaces.Box(-1, 1, ())}, r"shape \(\)"),
         ({"observation_space": gym.spaces.Box(0, 255, (4,), np.uint8)}, "dtype uint8"),
         ({"observation_space": gym.spaces.Dict(a=gym.spaces.Discrete(2))}, "kind Dict"),

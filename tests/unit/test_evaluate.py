@@ -11,7 +11,7 @@ import policies.evaluate
 from policies.envs import make_env
 from policies.errors import EnvError, SpecError
 from policies.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
-from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
+from policies.policy import NetworkPolicy, NonFiniteWeightsError, Policy, RandomPolicy
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
@@ -53,6 +53,22 @@ def test_vectorised_cartpole_has_the_scalar_env_s_other_reward(skill):
     assert set(expected.returns) == ({0.0} if skill == "good" else {-1.0})
     ours = evaluate_policy(policy, env_id="CartPole-v1", env_args={"sutton_barto_reward": True}, seeds=seeds)
     assert ours == expected
+
+
+@pytest.mark.parametrize("args", [{"pixels": True}, {"frame_stack": 3}, {"pixels": True, "frame_stack": 2}])
+def test_cartpole_in_wrappers_is_played_with_them(args):
+    class Parity(Policy):
+        """Acts by the whole observation, whatever its shape."""
+
+        def _act_batch(self, observations):
+            return np.array([int(1000 * abs(observation.sum(dtype=np.float64))) % 2 for observation in observations])
+
+    env, seeds = make_env("CartPole-v1", args), tuple(range(8))
+    policy = Parity(env.observation_space, env.action_space, env_id="CartPole-v1", env_args=args, description="parity")
+    expected = [play_episode(policy, env, seed, max_episode_steps=40) for seed in seeds]
+    assert len(set(expected)) > 1
+    played = evaluate_policy(policy, env_id="CartPole-v1", env_args=args, seeds=seeds, max_episode_steps=40)
+    assert list(zip(played.returns, played.lengths, strict=True)) == expected
 
 
 def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit():

@@ -6,7 +6,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from policy_factory import make_policy, make_portable, register_test_envs
+from policy_factory import IMAGES, make_image_policy, make_policy, make_portable, register_test_envs
 
 from policies.errors import TuneJobsError
 from policies.hyperparams import ACTIVATIONS
@@ -49,6 +49,48 @@ def test_the_network_computes_what_torch_computes(activation):
     assert outputs.dtype == np.float32
     np.testing.assert_allclose(outputs, expected, rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(policy.act(observations), expected.argmax(axis=1))
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_convolutions_compute_what_torch_computes(activation, normalize):
+    torch = pytest.importorskip("torch")
+    portable = make_image_policy(activation, normalize=normalize)
+    network = portable.network
+    function = {"linear": torch.nn.Identity(), "gelu": torch.nn.GELU()}.get(activation)
+    function = function or getattr(torch.nn.functional, activation, None) or getattr(torch, activation)
+    images = np.random.default_rng(0).integers(0, 256, (1000, *IMAGES.shape), dtype=np.uint8)
+    # Around 0, so that each action is the best one somewhere.
+    network.layers[-1].bias[:] -= NetworkPolicy(portable).outputs(images).mean(axis=0)
+    x = torch.from_numpy(images).float() / 255
+    if normalize:
+        mean, std = (torch.from_numpy(getattr(network.normalization, name)) for name in ("mean", "std"))
+        x = ((x - mean) / std).clamp(-4, 4)
+        assert (x.abs() == 4).any()
+    x = x.permute(0, 3, 1, 2)
+    for layer in network.conv:
+        weight, bias = torch.from_numpy(layer.weight), torch.from_numpy(layer.bias)
+        x = function(torch.nn.functional.conv2d(x, weight, bias, stride=layer.stride))
+    x = x.flatten(1)
+    for layer in network.layers:
+        x = torch.nn.functional.linear(x, torch.from_numpy(layer.weight), torch.from_numpy(layer.bias))
+        x = x if layer.activation == "linear" else function(x)
+    policy = NetworkPolicy(portable)
+    np.testing.assert_allclose(policy.outputs(images), x.numpy(), rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(policy.act(images), x.numpy().argmax(axis=1))
+    assert set(policy.act(images)) == {0, 1, 2}
+
+
+def test_an_action_for_an_image_does_not_depend_on_its_batch_to_the_last_bit():
+    policy = NetworkPolicy(make_image_policy("tanh"))
+    images = np.random.default_rng(0).integers(0, 256, (70, *IMAGES.shape), dtype=np.uint8)
+    outputs = policy.outputs(images)
+    for first, last in ((0, 1), (3, 40), (69, 70)):
+        np.testing.assert_array_equal(policy.outputs(images[first:last]), outputs[first:last])
+    assert type(policy.act(images[0])) is int
+    assert policy.act(images[:0]).shape == (0,)
+    with pytest.raises(ObservationError, match=r"shape \(13, 10, 2\)"):
+        policy.act(images[0, :, :, 0])
 
 
 @pytest.mark.parametrize("env_id", ENVS)
@@ -147,6 +189,23 @@ def test_weights_that_are_not_finite_are_named(value):
     with pytest.raises(NonFiniteWeightsError, match=r"1 weights .* in layer 1") as caught:
         NetworkPolicy(portable).check_finite()
     assert pickle.loads(pickle.dumps(caught.value)).message == caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [
+        ("convolution 1", lambda network: network.conv[1].weight),
+        ("convolution 0", lambda network: network.conv[0].bias),
+        ("the observation statistics", lambda network: network.normalization.mean),
+        ("the observation statistics", lambda network: network.normalization.std),
+    ],
+)
+def test_all_parts_are_checked_for_numbers_that_are_not_finite(place, change):
+    policy = NetworkPolicy(make_image_policy())
+    policy.check_finite()
+    change(policy.portable.network).flat[0] = np.nan
+    with pytest.raises(NonFiniteWeightsError, match=f"1 weights .* in {place}"):
+        policy.check_finite()
 
 
 def test_random_actions_follow_the_seed_alone():

@@ -11,9 +11,16 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from policy_factory import make_portable, register_test_envs
+from policy_factory import (
+    IMAGES,
+    make_image_policy,
+    make_module_portable,
+    make_portable,
+    register_test_envs,
+)
 
-from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
+from policies.policy import load_policy
 from policies.portable import (
     Layer,
     PolicyNetwork,
@@ -46,6 +53,87 @@ def test_what_is_saved_is_what_is_read(env_id, tmp_path):
                 np.testing.assert_array_equal(array, getattr(theirs, name))
 
 
+@pytest.mark.parametrize("make", [make_image_policy, make_module_portable])
+def test_all_parts_of_a_network_are_read_as_they_were_saved(make, tmp_path):
+    saved = make()
+    save_policy(saved, tmp_path)
+    read = read_policy(tmp_path)
+    assert read.observation_space == saved.observation_space
+    ours, theirs = read.network.parts(), saved.network.parts()
+    assert list(ours) == sorted(theirs) if make is make_module_portable else list(ours) == list(theirs)
+    for place, arrays in theirs.items():
+        for one, other in zip(ours[place], arrays, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+    assert read.network.scale == saved.network.scale
+    for one, other in zip(read.network.conv, saved.network.conv, strict=True):
+        assert (one.stride, one.activation) == (other.stride, other.activation)
+    if saved.network.module is not None:
+        assert read.network.module.class_path == saved.network.module.class_path
+        assert read.network.module.model_config == saved.network.module.model_config
+    else:
+        assert read.network.normalization.clip == saved.network.normalization.clip
+
+
+def test_files_of_format_1_act_as_they_did():
+    """Written before there were convolutions and statistics."""
+    policy = load_policy(Path(__file__).parent / "samples" / "policy_format_1")
+    observations = np.array([[0.1, -0.2, 0.03, 0.4], [-1.0, 0.5, -0.2, -0.7]])
+    expected = [[0.17224079370498657, 0.17183804512023926], [-0.18863928318023682, 0.07189814746379852]]
+    np.testing.assert_allclose(policy.outputs(observations), expected, rtol=1e-5)
+    np.testing.assert_array_equal(policy.act(observations), [0, 1])
+    assert policy.observation_space == gym.make("CartPole-v1").observation_space
+
+
+def test_equal_bounds_are_one_number():
+    description = describe_space(IMAGES)
+    assert (description["low"], description["high"]) == (0, 255)
+    assert len(json.dumps(description)) < 100
+    assert describe_space(gym.spaces.Box(-np.inf, np.inf, (3,)))["low"] == "-inf"
+
+
+def _network(**changes):
+    policy = make_image_policy()
+    return dataclasses.replace(policy, network=dataclasses.replace(policy.network, **changes))
+
+
+def _conv(**changes):
+    first, second = make_image_policy().network.conv
+    return {"conv": (first, dataclasses.replace(second, **changes))}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"conv": make_image_policy().network.conv[:1]}, "its input has 100 numbers"),
+        ({"conv": make_image_policy().network.conv[::-1]}, "convolution 0 has weights"),
+        (_conv(stride=0), "convolution 1 .* stride 0"),
+        (_conv(activation="exec"), "activation 'exec'"),
+        (_conv(bias=np.zeros(4, np.float32)), "convolution 1 has a bias"),
+        (_conv(weight=np.zeros((3, 5, 6, 6), np.float32)), "kernels of 6 x 6, but its input has only 5 x 4"),
+        ({"conv": ()}, "its input has 260 numbers"),
+        (
+            {"normalization": dataclasses.replace(make_image_policy().network.normalization, std=np.ones(3))},
+            r"a std of shape \(3,\)",
+        ),
+        ({"kind": "module"}, "no module"),
+        ({"module": make_module_portable().network.module}, "has a module"),
+        ({"kind": "module", "module": make_module_portable().network.module}, "2 layers, but takes none"),
+    ],
+)
+def test_parts_that_form_no_network_are_not_saved(changes, words, tmp_path):
+    with pytest.raises(CheckpointError, match=words):
+        save_policy(_network(**changes), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_policy_of_a_class_that_is_not_allowed_is_read_but_does_not_act(tmp_path):
+    pytest.importorskip("ray")
+    save_policy(make_module_portable(), tmp_path)
+    with pytest.raises(SpecError, match="no_such_package"):
+        load_policy(tmp_path)
+
+
 def test_transposed_weights_are_saved_as_what_they_are(tmp_path):
     policy = make_portable("CartPole-v1", hidden=())
     weight = np.asfortranarray(policy.network.layers[0].weight)
@@ -59,6 +147,9 @@ def test_transposed_weights_are_saved_as_what_they_are(tmp_path):
     [
         gym.spaces.Box(np.array([-4.8, -np.inf], np.float32), np.array([np.inf, 0.1], np.float32)),
         gym.spaces.Box(-1e-300, 1e300, (3,), np.float64),
+        gym.spaces.Box(-np.inf, np.inf, (3,), np.float32),
+        gym.spaces.Box(0, 255, (4, 5, 3), np.uint8),
+        gym.spaces.Box(np.array([[0, 0], [0, 1]], np.uint8), np.full((2, 2), 9, np.uint8), (2, 2), np.uint8),
         gym.spaces.Discrete(5),
         gym.spaces.Discrete(3, start=-2),
     ],
@@ -144,7 +235,7 @@ def test_a_changed_or_cut_weights_file_fails_its_hash(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"format_version": 2}, "format version 2"),
+        ({"format_version": 3}, "format version 3"),
         (
             {"network": {"kind": "categorical", "activations": ["tanh", "tanh"]}},
             "does not describe the tensors",

@@ -152,6 +152,7 @@ def test_tables_and_figures_lie_beside(typical):
     assert all((path.parent / "figures" / name).read_bytes()[:4] == b"\x89PNG" for name in figures)
     assert html.count("<svg ") == 2 * len(figures)
     assert len(pd.read_csv(path.parent / "trials.csv")) == 20
+    assert len(pd.read_csv(path.parent / "steps_to_solve.csv")) == 20
     assert len(pd.read_csv(path.parent / "iterations.csv")) == sum(map(len, synthetic.results.values()))
 
 
@@ -203,6 +204,61 @@ def test_several_seeds_a_point_show_their_points_and_lost_seeds(tmp_path):
     assert "3 seeds: the interval is too narrow" in page.words
     assert "2 of 3" in page.words
     assert "seeds missing: ranked after complete points" in page.words
+
+
+def test_the_page_says_what_solves_in_the_fewest_env_steps(typical):
+    _, path, _, page = typical
+    first = pd.read_csv(path.parent / "steps_to_solve.csv").iloc[0]
+    steps = f"{int(first['median_num_env_steps']):,}"
+    assert (
+        f"hidden_sizes {first['hidden_sizes']}, activation {first['activation']}, lr {first['lr']:.4g} reaches a mean "
+        f"training return of 195 over 100 episodes in the fewest env steps: {steps} (one seed)."
+    ) in page.words
+    header = page.rows.index([
+        "hidden_sizes", "activation", "lr", "seeds that solve", "median env steps", "env steps of each seed",
+    ])  # fmt: skip
+    assert page.rows[header + 1][3:] == ["1 of 1", steps, steps]
+    assert all("0 of" not in row[3] for row in page.rows[header + 1 : header + 8])
+
+
+def test_steps_to_solve_are_told_seed_by_seed(tmp_path):
+    synthetic = make_sweep(points=[{"lr": 3e-3}, {"lr": 1e-7}], seeds_per_point=3, failed={1})
+    _, _, page = report(tmp_path, synthetic)
+    (row,) = [row for row in page.rows if "not solved" in row[-1]]
+    assert row[1] == "2 of 3"
+    one, _, other = row[3].split(", ")
+    assert row[3] == f"{one}, not solved, {other}"
+    assert "(the median of 3 seeds)" in page.words
+
+
+@pytest.mark.parametrize(
+    ("points", "threshold", "sentence"),
+    [
+        ([{"lr": 1e-7}], 195.0, "No trial reached a mean training return of 195 over 100 episodes."),
+        ([{"lr": 3e-3}], None, None),
+        ([{}], 195.0, "The sweep's one point reaches"),
+    ],
+)
+def test_the_sentence_suits_the_sweep(tmp_path, points, threshold, sentence):
+    env_id = "CartPole-v0" if threshold else "Own-v0"
+    synthetic = make_sweep(points=points, threshold=threshold, env_id=env_id)
+    if threshold is None:
+        synthetic.sweep = synthetic.sweep.model_copy(update={"spec": synthetic.sweep.spec | {"stop": {}}})
+    _, _, page = report(tmp_path, synthetic)
+    assert ("Env steps to solve" in page.words) == (sentence is not None)
+    assert sentence is None or sentence in page.words
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "heading"), [("random", "Random play on"), ("constant", "A constant action on"), ("dqn", "DQN on")]
+)
+def test_a_baseline_has_no_before_and_after(tmp_path, algorithm, heading):
+    synthetic = make_sweep(points=[{}], algorithm=algorithm)
+    (tmp_path / "v.mp4").write_bytes(b"v")
+    _, _, page = report(tmp_path, synthetic, {"before": tmp_path / "v.mp4", "after": tmp_path / "v.mp4"})
+    assert f"{heading} CartPole-v0" in page.words
+    assert ("After training" in page.words) == (algorithm == "dqn")
+    assert ("Before and after" in page.words) == (algorithm == "dqn")
 
 
 def test_hostile_text_is_never_html(tmp_path):

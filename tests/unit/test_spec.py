@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from policies.errors import SpecError
 from policies.hyperparams import ACTIVATIONS
 from tune_jobs.search_space import Grid, Uniform
 from tune_jobs.spec import SweepSpec, check_sweep_name
-from tune_jobs.spec_file import find_preset, list_presets, load_spec
+from tune_jobs.spec_file import find_preset, list_presets, load_spec, read_preset
 
 # -- what is read
 
@@ -95,12 +96,29 @@ def test_a_spec_cannot_be_changed():
 # -- presets
 
 
-def test_every_preset_loads_has_a_description_and_no_name():
+def test_every_preset_loads_says_what_it_is_and_has_no_name():
     presets = list_presets()
-    assert "cartpole-ppo" in {preset.name for preset in presets}
+    assert {"cartpole-ppo", "cartpole-random"} <= {preset.name for preset in presets}
     for preset in presets:
         assert load_spec(preset.name).name is None
-        assert len(preset.description) > 20
+        for label in ("title", "source", "shows", "expected", "env_steps", "time"):
+            assert getattr(preset, label), f"{preset.name} lacks {label}"
+        assert not preset.title.startswith(("Source:", "Shows:")), preset.name
+        assert preset.time.endswith(" on 2 cores"), preset.name
+        assert re.match(r"-?[\d.,]+ \(", preset.expected), f"{preset.name}: {preset.expected!r}"
+
+
+def test_a_presets_header_is_read_label_by_label():
+    text = (
+        "# Plain title: with a colon\n# Source: a book: chapter 2\n# Shows: what happens\n# Expected: 195 (x)\n"
+        "# Env steps: 3,000\n# Time: 2 s on 2 cores\n# Free words,\n# Time: more of them\nenv: CartPole-v1\n# no more\n"
+    )
+    preset = read_preset("mine", text)
+    assert preset == (
+        "mine", "Plain title: with a colon", "a book: chapter 2", "what happens", "195 (x)", "3,000",
+        "2 s on 2 cores", "Free words, Time: more of them", text,
+    )  # fmt: skip
+    assert read_preset("bare", "env: x\n")[1:-1] == ("",) * 7
 
 
 def test_the_cartpole_preset_is_the_tutorials_sweep():
@@ -225,7 +243,7 @@ def test_every_problem_is_told_at_once():
         algorithm="dqn",
         num_samples="x",
         hyperparams={"num_epochs": 3, "lr": -1},
-        space={"gamma": {"grid": []}, "taau": {"uniform": [0, 1]}, "tau": {"uniform": [0, 2]}},
+        space={"gamma": {"grid": []}, "taau": {"uniform": [0, 1]}, "tau": {"uniform": [0.5, 2]}},
     )
     assert message.startswith("sweep: 7 problems:\n  ")
     for part in (

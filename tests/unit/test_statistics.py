@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.statistics import iqm, mean_with_ci, paired_difference, small_sample_note
+from analysis.statistics import iqm, mean_with_ci, median_steps, paired_difference, small_sample_note
 
 finite = st.floats(-1e6, 1e6)
 
@@ -84,3 +84,14 @@ def test_too_few_seeds_are_said():
     assert "one seed" in small_sample_note(1)
     assert "3 seeds" in small_sample_note(3)
     assert small_sample_note(5) == ""
+
+
+def test_the_median_of_steps_counts_never_as_last():
+    assert median_steps([3000]) == 3000
+    assert median_steps([5000, 1000, None]) == 5000
+    assert median_steps([1000, 2000]) == 1500
+    assert median_steps([1000, None, None]) is None
+    assert median_steps([1000, None]) is None
+    assert median_steps([None]) is None
+    with pytest.raises(ValueError, match="no seeds"):
+        median_steps([])

@@ -8,7 +8,15 @@ from synthetic_sweep import make_sweep
 
 from analysis.records import IterationRecord
 from analysis.selection import score_trial
-from analysis.tables import env_steps_to, format_value, groups_frame, iterations_frame, trials_frame, write_csv
+from analysis.tables import (
+    env_steps_to,
+    format_value,
+    groups_frame,
+    iterations_frame,
+    steps_to_solve_frame,
+    trials_frame,
+    write_csv,
+)
 from policies.errors import CannotRunError
 
 
@@ -110,6 +118,68 @@ def test_groups_count_who_solved_and_how_fast(synthetic):
     unsolved = groups_frame(synthetic.trials, synthetic.results, ["activation"], threshold=None)
     assert unsolved["num_solved"].tolist() == [0, 0]
     assert unsolved["best_score"].is_monotonic_decreasing
+
+
+def points_that_solve_at(*points, unfinished=()):
+    """Trials whose seeds solve (training return 195) at these iterations, 1,000 env steps each; None: never."""
+    seeds_per_point = len(points[0])
+    points_of_lr = [{"lr": 10.0 ** -(index + 1)} for index in range(len(points))]
+    synthetic = make_sweep(points=points_of_lr, seeds_per_point=seeds_per_point)
+    at = [number for point in points for number in point]
+    trials = [
+        trial.model_copy(update={"status": "running" if trial.index in unfinished else "completed"})
+        for trial in synthetic.trials
+    ]
+    results = {
+        trial.trial_id: [
+            iteration(number, episodes=200, training=195.0 if at[trial.index] == number else 20.0)
+            for number in range(1, 11)
+        ]
+        for trial in trials
+    }
+    return trials, results
+
+
+def test_steps_to_solve_are_medians_over_the_seeds_of_a_point():
+    trials, results = points_that_solve_at((9, 2, 4), (5, None, 3), (None, 1, None), (None, None, None))
+    frame = steps_to_solve_frame(trials, results, threshold=195.0)
+    # Of three seeds one that never solves is the slowest: the median is the slower of the two others.
+    assert frame["lr"].tolist() == [0.1, 0.01, 0.001, 0.0001]
+    assert frame["median_num_env_steps"].tolist()[:2] == [4000, 5000]
+    assert frame["median_num_env_steps"].isna().tolist() == [False, False, True, True]
+    assert frame["num_solved"].tolist() == [3, 2, 1, 0]
+    assert frame["num_seeds"].tolist() == [3, 3, 3, 3]
+    seeds = frame[["num_env_steps_seed_0", "num_env_steps_seed_1", "num_env_steps_seed_2"]]
+    assert seeds.iloc[0].tolist() == [9000, 2000, 4000]
+    assert seeds.iloc[1].tolist() == [5000, pd.NA, 3000]
+
+
+def test_the_fewest_median_steps_come_first_not_the_luckiest_seed():
+    trials, results = points_that_solve_at((1, 9), (3, 4))
+    frame = steps_to_solve_frame(trials, results, threshold=195.0)
+    assert frame["point_index"].tolist() == [1, 0]
+    assert frame["median_num_env_steps"].tolist() == [3500, 5000]
+
+
+def test_a_seed_that_still_runs_may_solve_yet():
+    trials, results = points_that_solve_at((2, None), unfinished=(1,))
+    (row,) = steps_to_solve_frame(trials, results, threshold=195.0).to_dict("records")
+    assert (row["num_seeds"], row["num_solved"], row["median_num_env_steps"]) == (1, 1, 2000)
+
+
+def test_without_a_threshold_or_trials_nothing_is_solved(synthetic):
+    frame = steps_to_solve_frame(synthetic.trials, synthetic.results, threshold=None)
+    assert len(frame) == 20
+    assert frame["num_solved"].sum() == 0
+    assert steps_to_solve_frame([], {}, threshold=195.0).empty
+
+
+def test_steps_to_solve_agree_with_the_table_of_trials(synthetic, tmp_path):
+    frame = steps_to_solve_frame(synthetic.trials, synthetic.results, threshold=195.0)
+    trials = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
+    assert sorted(frame["median_num_env_steps"].dropna()) == sorted(trials["num_env_steps_to_solve"].dropna())
+    write_csv(tmp_path / "s.csv", frame)
+    assert len(pd.read_csv(tmp_path / "s.csv")) == 20
 
 
 def test_csv_reads_back(synthetic, tmp_path):

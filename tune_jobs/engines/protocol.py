@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from analysis.records import ChangeRecord
 from policies.portable import PortablePolicy
 from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
 
@@ -25,6 +26,7 @@ class TrialTask:
     hyperparams: dict[str, Any]
     env_id: str
     env_args: dict[str, Any]
+    """With `frame_stack` and `pixels`, if the spec sets them: evaluation and videos need them too."""
     stop: StopSpec
     evaluation: EvaluationSpec
     checkpoints: CheckpointSpec
@@ -32,6 +34,16 @@ class TrialTask:
     num_env_runners: int = 0
     num_gpus: float = 0.0
     iteration_timeout_s: float = 600.0
+    failure_penalty: float | None = None
+    """For training only; see `EnvSpec`."""
+    rl_module: str | None = None
+    """`module:Class` of a user's own RLModule."""
+    changes: tuple[ChangeRecord, ...] = ()
+    """What population based training changed, oldest first."""
+    num_env_steps: int = 0
+    """Env steps the trial has done when it is built; the checkpoint it is built from may count another trial's."""
+    num_iterations: int = 0
+    """The same for iterations."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,9 @@ class TrainingEngine(Protocol):
 
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Make the networks and environments of a trial, fresh or exactly as a checkpoint folder holds them.
+
+        The checkpoint may be of another trial or other hyperparameters (population based training): then the task's
+        hyperparameters act, on the weights, optimizer state and target networks of the checkpoint.
 
         Raises:
             CheckpointError: The checkpoint cannot be restored. Never starts afresh instead.

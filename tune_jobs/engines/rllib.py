@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any, cast
@@ -11,11 +12,12 @@ import torch
 from ray.rllib.algorithms.algorithm import Algorithm as RLlibAlgorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
 
+from policies.dqn_algorithm import ReplayDQN
 from policies.env_runner import ArrayEnvRunner
 from policies.errors import CannotRunError
-from policies.hyperparams import Algorithm, DQNHyperparams, Hyperparams, make_hyperparams
+from policies.hyperparams import Algorithm, DQNHyperparams, TrainedHyperparams, make_hyperparams
 from policies.portable import PortablePolicy, read_policy
-from policies.restore import portable_policy, restore_algorithm
+from policies.restore import portable_policy, restore_algorithm, take_over_state
 from policies.rllib_config import build_algorithm_config
 from tune_jobs.engines.protocol import IterationStats, TrialTask
 
@@ -28,8 +30,9 @@ _LEARNER_STATS = {
     "vf_loss": "vf_loss",
     "entropy": "entropy",
     "mean_kl_loss": "kl",
-    "qf_loss": "qf_loss",
     "qf_mean": "q_mean",
+    "gradient_norm": "gradient_norm",
+    "lr": "lr",
     "gradients_default_optimizer_global_norm": "gradient_norm",
     "default_optimizer_learning_rate": "lr",
 }
@@ -41,7 +44,9 @@ class RLlibEngine:
     def __init__(self) -> None:
         self._algorithm: RLlibAlgorithm | None = None
         self._task: TrialTask | None = None
-        self._hyperparams: Hyperparams | None = None
+        self._hyperparams: TrainedHyperparams | None = None
+        # Env steps and iterations of the trial that the Algorithm does not count; negative if it counts others.
+        self._before = (0, 0)
 
     @property
     def algorithm(self) -> RLlibAlgorithm:
@@ -60,13 +65,23 @@ class RLlibEngine:
         # Small networks run up to several times slower on more than one thread, and trials share the cores.
         torch.set_num_threads(1)
         # Validated where the values came from, the sweep file; this turns JSON back into the typed object.
-        hyperparams = make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams)
+        # A baseline has an engine of its own.
+        hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
         self._task, self._hyperparams = task, hyperparams
-        if checkpoint is not None:
-            saved = read_policy(checkpoint)
+        self._before = (0, 0)
+        saved = None if checkpoint is None else read_policy(checkpoint)
+        if checkpoint is not None and saved is not None and _is_of(task, saved):
             self._algorithm = restore_algorithm(checkpoint / RLLIB_FOLDER, saved.network)
+        else:
+            self._algorithm = self._new_algorithm(task, hyperparams)
+            if checkpoint is not None and saved is not None:
+                take_over_state(self._algorithm, checkpoint / RLLIB_FOLDER, saved.network)
+        if task.changes:
+            self._before = (task.num_env_steps - self._num_env_steps(), task.num_iterations - self._algorithm.iteration)
+        if checkpoint is not None:
             self._continue_streams(checkpoint)
-            return
+
+    def _new_algorithm(self, task: TrialTask, hyperparams: TrainedHyperparams) -> RLlibAlgorithm:
         config = build_algorithm_config(
             hyperparams,
             env_id=task.env_id,
@@ -74,28 +89,30 @@ class RLlibEngine:
             seed=task.seed,
             num_env_runners=task.num_env_runners,
             num_gpus=task.num_gpus,
+            failure_penalty=task.failure_penalty,
+            rl_module=task.rl_module,
         )
         # The learner's weights are drawn from these; a warm process has drawn other numbers before.
         torch.manual_seed(task.seed)
-        self._algorithm = config.build_algo()
-        self._seed_replay(task.seed)
+        return config.build_algo()
 
-    def _seed_replay(self, seed: int) -> None:
-        """Let DQN draw its batches from the trial's seed; RLlib's buffers use a generator without one (2.60)."""
-        if isinstance(self._hyperparams, DQNHyperparams):
-            self.algorithm.local_replay_buffer.rng = np.random.default_rng(seed)
+    def _num_env_steps(self) -> int:
+        """Env steps as the Algorithm counts them: those before a copied checkpoint are another trial's."""
+        algorithm = self.algorithm
+        if isinstance(algorithm, ReplayDQN):
+            return algorithm.num_env_steps
+        return int(algorithm.metrics.peek(_LIFETIME_STEPS, default=0))
 
     def _continue_streams(self, checkpoint: Path) -> None:
         """After a restore: other random numbers than at the trial's start, and a replay buffer with something in it.
 
-        RLlib saves neither the state of the random generators nor the replay buffer (2.60).
+        RLlib saves no state of the random generators (2.60), and the replay memory is not in checkpoints.
         """
         assert self._task is not None
         iteration = int(checkpoint.name) if checkpoint.name.isdigit() else 0
         words = np.random.SeedSequence([self._task.seed, iteration]).generate_state(2)
         torch.manual_seed(int(words[0]))
-        np.random.seed(int(words[0]))  # noqa: NPY002 (RLlib's replay buffers and connectors draw from the global one)
-        self._seed_replay(int(words[0]))
+        np.random.seed(int(words[0]))  # noqa: NPY002 (RLlib's connectors draw from the global one)
         seed = int(words[1])
 
         def reseed(runner: ArrayEnvRunner) -> None:
@@ -103,14 +120,11 @@ class RLlibEngine:
 
         self.algorithm.env_runner_group.foreach_env_runner(reseed)
         if isinstance(self._hyperparams, DQNHyperparams):
+            self.algorithm.seed_replay(int(words[0]))
+            # As much as it had when learning began; with no replay, the next steps fill it.
             num_steps = max(self._hyperparams.learning_starts, self._hyperparams.train_batch_size)
-            share = math.ceil(num_steps / max(1, self._task.num_env_runners))
-            # Where env runners of their own sample, the main process has one without environments.
-            episodes = self.algorithm.env_runner_group.foreach_env_runner(
-                lambda runner: runner.sample(num_timesteps=share) if runner.env is not None else []
-            )
-            for chunk in episodes:
-                self.algorithm.local_replay_buffer.add(chunk)
+            if self._hyperparams.replay != "none" and self.algorithm.num_updates:
+                self.algorithm.refill(num_steps)
 
     def train_iteration(self) -> IterationStats:
         """See `TrainingEngine.train_iteration`.
@@ -128,7 +142,7 @@ class RLlibEngine:
                 "See the trial's log; the trial goes on from its latest checkpoint when it is retried.",
             )
         return IterationStats(
-            num_env_steps=int(_at(result, _LIFETIME_STEPS)),
+            num_env_steps=self._before[0] + self._num_env_steps(),
             episodes=tuple(episode for runner in finished for episode in (runner or ())),
             learner=_learner_stats(result),
         )
@@ -142,7 +156,7 @@ class RLlibEngine:
             "trial_id": task.trial_id,
             "seed": task.seed,
             "hyperparams": task.hyperparams,
-            "iteration": self.algorithm.iteration,
+            "iteration": self._before[1] + self.algorithm.iteration,
         }
         return portable_policy(
             self.algorithm, self._hyperparams, env_id=task.env_id, env_args=task.env_args, training=training
@@ -159,11 +173,11 @@ class RLlibEngine:
             self._algorithm = None
 
 
-def _at(result: dict[str, Any], path: tuple[str, ...]) -> Any:
-    value: Any = result
-    for key in path:
-        value = value[key]
-    return value
+def _is_of(task: TrialTask, saved: PortablePolicy) -> bool:
+    """Whether a checkpoint is of this very trial, with the hyperparameters it has now."""
+    # Only population based training changes them, or copies checkpoints.
+    own = json.loads(json.dumps({"trial_id": task.trial_id, "hyperparams": task.hyperparams}))
+    return not task.changes or {name: saved.training.get(name) for name in own} == own
 
 
 def _learner_stats(result: dict[str, Any]) -> dict[str, float]:

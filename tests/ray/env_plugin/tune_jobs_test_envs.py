@@ -99,11 +99,51 @@ class Trouble(gym.Env):
         raise TimeoutError("nothing ended the process")
 
 
+class Shades(gym.Env):
+    """Images of noise, higher than they are wide; the right action tells in which half the noise is brighter.
+
+    Args:
+        as_bytes: Whether pixels are bytes, or numbers from 0 to 1.
+        shape: (height, width, channels).
+        num_pushes: For continuous actions of so many components, which are never right; None: two discrete ones.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, *, as_bytes=True, shape=(12, 9, 2), num_pushes=None):
+        kind = (0, 255, np.uint8) if as_bytes else (0.0, 1.0, np.float32)
+        self.observation_space = gym.spaces.Box(kind[0], kind[1], tuple(shape), kind[2])
+        self.action_space = (
+            gym.spaces.Discrete(2) if num_pushes is None else gym.spaces.Box(-2.0, 2.0, (num_pushes,), np.float32)
+        )
+        self.right, self.ticks = 0, 0
+
+    def _observation(self):
+        self.right = int(self.np_random.integers(2))
+        image = self.np_random.uniform(0.0, 0.5, self.observation_space.shape)
+        half = image.shape[0] // 2
+        image[half * self.right : half * (self.right + 1)] += 0.5
+        if self.observation_space.dtype == np.uint8:
+            image *= 255
+        return image.astype(self.observation_space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.ticks = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        self.ticks += 1
+        reward = float(isinstance(self.action_space, gym.spaces.Discrete) and action == self.right)
+        return self._observation(), reward, self.ticks >= 10, False, {}
+
+
 def register():
     """What the entry point names; more than once does no harm."""
     for env_id, entry_point, limit in (
         ("TestTicks-v0", Ticks, 7),
         ("TestTrouble-v0", Trouble, None),
+        ("TestShades-v0", Shades, None),
     ):
         if env_id not in gym.registry:
             gym.register(env_id, entry_point, max_episode_steps=limit)

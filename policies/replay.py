@@ -1,0 +1,238 @@
+"""Replay memories of arrays, for DQN: uniform, prioritized, or none at all.
+
+Words: a *transition* is (observation, action, reward, next observation, discount); its reward is the discounted sum of
+the rewards of n steps, and its *discount* is what the value of the next observation counts: gamma^n, or 0 where the
+episode terminated. A truncated episode is bootstrapped. Array shapes: T vector steps, N sub-environments, B rows.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.hyperparams import DQNHyperparams
+
+_MAX_GATHER_BYTES = 64 * 2**20
+_MIN_PRIORITY = 1e-6
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """Rows of equal length; the first axis is (B,) or, of several batches at once, (batches, B)."""
+
+    obs: NDArray[Any]
+    actions: NDArray[np.int64]
+    rewards: NDArray[np.float32]
+    next_obs: NDArray[Any]
+    discounts: NDArray[np.float32]
+    weights: NDArray[np.float32] | None = None
+    """Importance weights; None: all 1."""
+    indices: NDArray[np.int64] | None = None
+    """Where prioritized rows lie, to set their priorities."""
+
+
+class NStep:
+    """Turns steps of N streams into n-step transitions, over fragment boundaries.
+
+    The last steps of an episode have fewer rewards, and say so in their discount.
+
+    Args:
+        num_envs: N.
+        n_step: Steps of reward before bootstrapping.
+        gamma: Discount a step.
+    """
+
+    def __init__(self, num_envs: int, n_step: int, gamma: float) -> None:
+        self._n_step, self._gamma = n_step, gamma
+        self._pending: list[deque[list[Any]]] = [deque() for _ in range(num_envs)]
+
+    def forget(self) -> None:
+        """The streams begin anew: what waits for further rewards will not get them."""
+        for pending in self._pending:
+            pending.clear()
+
+    def transitions(self, columns: Columns) -> Transitions:
+        """Those that are complete after these steps, oldest first.
+
+        Args:
+            columns: As `ArrayEnvRunner.sample_columns` gives them: obs (T + 1, N, ...), the others (T, N).
+        """
+        if self._n_step == 1:
+            mask = columns["stepped"]
+            return Transitions(
+                obs=columns["obs"][:-1][mask],
+                actions=columns["actions"][mask].astype(np.int64),
+                rewards=columns["rewards"][mask].astype(np.float32),
+                next_obs=columns["obs"][1:][mask],
+                discounts=np.where(columns["terminated"][mask], 0.0, self._gamma).astype(np.float32),
+            )
+        rows = [row for step in range(len(columns["stepped"])) for row in self._step(columns, step)]
+        obs = columns["obs"]
+        return Transitions(
+            obs=np.array([row[0] for row in rows], dtype=obs.dtype).reshape(-1, *obs.shape[2:]),
+            actions=np.array([row[1] for row in rows], dtype=np.int64),
+            rewards=np.array([row[2] for row in rows], dtype=np.float32),
+            next_obs=np.array([row[4] for row in rows], dtype=obs.dtype).reshape(-1, *obs.shape[2:]),
+            discounts=np.array([row[5] for row in rows], dtype=np.float32),
+        )
+
+    def _step(self, columns: Columns, step: int) -> Iterator[tuple[Any, ...]]:
+        for index in np.flatnonzero(columns["stepped"][step]):
+            pending = self._pending[index]
+            reward, terminated = float(columns["rewards"][step, index]), bool(columns["terminated"][step, index])
+            for row in pending:
+                row[2] += self._gamma ** row[3] * reward
+                row[3] += 1
+            pending.append([columns["obs"][step, index], columns["actions"][step, index], reward, 1])
+            ended = terminated or bool(columns["truncated"][step, index])
+            while pending and (ended or len(pending) == self._n_step):
+                row = pending.popleft()
+                discount = 0.0 if terminated else self._gamma ** row[3]
+                yield (*row, columns["obs"][step + 1, index], discount)
+
+
+class ReplayBuffer:
+    """A ring of transitions, drawn from uniformly and with replacement.
+
+    Args:
+        capacity: Transitions it holds; the oldest go first.
+        rng: Draws the batches.
+    """
+
+    def __init__(self, capacity: int, rng: np.random.Generator) -> None:
+        self.capacity = capacity
+        self.rng = rng
+        self._columns: dict[str, NDArray[Any]] = {}
+        self._next = 0
+        self._size = 0
+
+    def __len__(self) -> int:
+        """Transitions in it."""
+        return self._size
+
+    def add(self, transitions: Transitions) -> NDArray[np.int64]:
+        """Append transitions, shape (B, ...); of more than fit, the newest stay.
+
+        Returns:
+            Where they lie now.
+        """
+        rows = {name: getattr(transitions, name) for name in ("obs", "actions", "rewards", "next_obs", "discounts")}
+        if not self._columns:
+            self._columns = {
+                name: np.empty((self.capacity, *values.shape[1:]), values.dtype) for name, values in rows.items()
+            }
+        num_rows = min(len(rows["actions"]), self.capacity)
+        where = (self._next + np.arange(num_rows)) % self.capacity
+        for name, values in rows.items():
+            self._columns[name][where] = values[len(values) - num_rows :]
+        self._next = (self._next + num_rows) % self.capacity
+        self._size = min(self.capacity, self._size + num_rows)
+        return where
+
+    def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
+        """Draw batches of shape (B, ...), one after another."""
+        if not self._size or not num_batches:
+            return
+        row_bytes = 2 * self._columns["obs"][0].nbytes + 24
+        # Gathered many at once: one fancy index a batch costs more than the rows of a small batch.
+        at_once = max(1, min(num_batches, _MAX_GATHER_BYTES // (row_bytes * batch_size)))
+        for first in range(0, num_batches, at_once):
+            shape = (min(at_once, num_batches - first), batch_size)
+            indices = self.rng.integers(0, self._size, shape)
+            drawn = {name: values[indices] for name, values in self._columns.items()}
+            for number in range(shape[0]):
+                yield Transitions(**{name: values[number] for name, values in drawn.items()})
+
+    def set_priorities(self, indices: NDArray[np.int64], td_errors: NDArray[np.float32]) -> None:
+        """Nothing: all rows are alike."""
+
+
+class LastTransitions(ReplayBuffer):
+    """No replay: every batch is the newest transitions, in order."""
+
+    def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
+        """The newest transitions, each time."""
+        where = (self._next - batch_size + np.arange(batch_size)) % self.capacity
+        for _ in range(num_batches):
+            yield Transitions(**{name: values[where] for name, values in self._columns.items()})
+
+
+class PrioritizedReplayBuffer(ReplayBuffer):
+    """Drawn from in proportion to |TD error|^alpha.
+
+    Source: Schaul et al. 2016, "Prioritized Experience Replay", section 3.3 (proportional variant).
+
+    Args:
+        capacity: As `ReplayBuffer`.
+        rng: As `ReplayBuffer`.
+        alpha: Exponent of the priorities.
+        beta: Exponent of the importance weights, which are divided by the batch's largest.
+    """
+
+    def __init__(self, capacity: int, rng: np.random.Generator, *, alpha: float, beta: float) -> None:
+        super().__init__(capacity, rng)
+        self.alpha, self.beta = alpha, beta
+        # A binary tree in an array: node i has children 2i and 2i + 1, the leaves are the rows, sums above.
+        self._num_leaves = 1 << max(1, (capacity - 1).bit_length())
+        self._sums = np.zeros(2 * self._num_leaves)
+        self._highest = 1.0
+
+    def add(self, transitions: Transitions) -> NDArray[np.int64]:
+        """As `ReplayBuffer.add`; new rows get the highest priority so far, so that each is soon seen."""
+        where = super().add(transitions)
+        self._set(where, np.full(len(where), self._highest))
+        return where
+
+    def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
+        """Draw batches; the priorities set between two of them act on the next."""
+        for _ in range(num_batches):
+            indices = self._find(self.rng.uniform(0.0, self._sums[1], batch_size))
+            shares = self._sums[self._num_leaves + indices] / self._sums[1]
+            weights = (self._size * shares) ** -self.beta
+            rows = {name: values[indices] for name, values in self._columns.items()}
+            weights = (weights / weights.max()).astype(np.float32)
+            yield Transitions(**rows, weights=weights, indices=indices)
+
+    def set_priorities(self, indices: NDArray[np.int64], td_errors: NDArray[np.float32]) -> None:
+        """Set the priorities of rows from their newest TD errors."""
+        priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self.alpha
+        priorities = np.where(np.isfinite(priorities), priorities, self._highest)
+        self._highest = max(self._highest, float(priorities.max()))
+        self._set(indices, priorities)
+
+    def _set(self, indices: NDArray[np.int64], priorities: NDArray[np.float64]) -> None:
+        nodes = self._num_leaves + indices
+        self._sums[nodes] = priorities
+        while nodes[0] > 1:
+            nodes = nodes >> 1
+            self._sums[nodes] = self._sums[2 * nodes] + self._sums[2 * nodes + 1]
+
+    def _find(self, heights: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The rows at these heights of the stack of all priorities."""
+        nodes = np.ones(len(heights), dtype=np.int64)
+        while nodes[0] < self._num_leaves:
+            left = 2 * nodes
+            beyond = heights >= self._sums[left]
+            heights = np.where(beyond, heights - self._sums[left], heights)
+            nodes = left + beyond
+        # Rounding may lead one step beyond the last row.
+        return np.minimum(nodes - self._num_leaves, self._size - 1)
+
+
+def make_replay(hyperparams: DQNHyperparams, seed: int) -> ReplayBuffer:
+    """The replay memory that the hyperparameters name."""
+    rng = np.random.default_rng(seed)
+    if hyperparams.replay == "none":
+        return LastTransitions(hyperparams.train_batch_size, rng)
+    if hyperparams.replay == "prioritized":
+        return PrioritizedReplayBuffer(
+            hyperparams.replay_capacity, rng, alpha=hyperparams.prioritized_alpha, beta=hyperparams.prioritized_beta
+        )
+    return ReplayBuffer(hyperparams.replay_capacity, rng)

@@ -1,0 +1,84 @@
+"""Box and Discrete spaces as JSON objects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.errors import CheckpointError
+
+
+def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
+    """A Box or Discrete space as a JSON object.
+
+    Infinite bounds become the strings "inf" and "-inf"; bounds that are all equal become one number, or an image's
+    would fill pages.
+
+    Raises:
+        CheckpointError: A space of another kind.
+    """
+    if isinstance(space, gym.spaces.Box):
+        return {
+            "type": "box",
+            "shape": [int(size) for size in space.shape],
+            "low": _bounds_to_json(space.low),
+            "high": _bounds_to_json(space.high),
+            "dtype": str(space.dtype),
+        }
+    if isinstance(space, gym.spaces.Discrete):
+        return {"type": "discrete", "n": int(space.n), "start": int(space.start)}
+    raise CheckpointError(
+        f"A policy file cannot describe a space of kind {type(space).__name__}.",
+        "Use Box or Discrete spaces.",
+    )
+
+
+def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | gym.spaces.Discrete[Any]:
+    """The space that `describe_space` described.
+
+    Raises:
+        CheckpointError: The description is incomplete or contradicts itself.
+    """
+    try:
+        if description["type"] == "discrete":
+            return gym.spaces.Discrete(int(description["n"]), start=int(description.get("start", 0)))
+        if description["type"] == "box":
+            dtype = np.dtype(description["dtype"])
+            shape = tuple(int(size) for size in description["shape"])
+            low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))
+            return gym.spaces.Box(low, high, shape, dtype.type)
+    except (KeyError, TypeError, ValueError, AssertionError) as error:
+        raise CheckpointError(
+            f"A space is described as {dict(description)!r}, which makes none: {error}.",
+            "Write the policy file again from its checkpoint.",
+        ) from error
+    raise CheckpointError(
+        f"A space is described as of type {description['type']!r}; known are 'box' and 'discrete'.",
+        "Write the policy file again from its checkpoint, or update tune-jobs.",
+    )
+
+
+def _bounds_to_json(bounds: NDArray[Any]) -> Any:
+    if bounds.size > 1 and np.all(bounds == bounds.flat[0]):
+        return _numbers_to_json(bounds.flat[0].item())
+    return _numbers_to_json(bounds.tolist())
+
+
+def _bounds_from_json(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    numbers = np.array(_numbers_from_json(value), dtype=dtype)
+    return np.full(shape, numbers) if numbers.ndim == 0 else numbers.reshape(shape)
+
+
+def _numbers_to_json(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_numbers_to_json(item) for item in value]
+    return str(float(value)) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _numbers_from_json(value: Any) -> Any:
+    return [_numbers_from_json(item) for item in value] if isinstance(value, list) else float(value)

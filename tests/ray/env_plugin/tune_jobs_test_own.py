@@ -1,0 +1,40 @@
+"""A module of a user's own with an environment, which nothing registers but importing it."""
+
+import gymnasium as gym
+import numpy as np
+
+
+class Edge(gym.Env):
+    """Walk on five tiles; falling over the left edge is failure, whoever stays is rewarded with 1 a step.
+
+    Its first observation tells where it is, in [-1, 1].
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "failure": "terminated"}  # noqa: RUF012
+
+    def __init__(self, *, limit=12, render_mode=None):
+        self.limit, self.render_mode = limit, render_mode
+        self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = gym.spaces.Discrete(2)
+        self.tile = self.ticks = 0
+
+    def _observation(self):
+        return np.array([(self.tile - 2) / 3, 1.0], np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.tile, self.ticks = int(self.np_random.integers(5)), 0
+        return self._observation(), {}
+
+    def step(self, action):
+        self.tile, self.ticks = min(4, self.tile + (1 if action else -1)), self.ticks + 1
+        return self._observation(), 1.0, self.tile < 0, self.ticks >= self.limit, {}
+
+    def render(self):
+        picture = np.zeros((32, 80, 3), np.uint8)
+        picture[:, 16 * max(self.tile, 0) : 16 * max(self.tile, 0) + 16] = 255
+        return picture
+
+
+if "TestEdge-v0" not in gym.registry:
+    gym.register("TestEdge-v0", Edge, reward_threshold=11.5)

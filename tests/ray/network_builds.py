@@ -1,0 +1,56 @@
+"""Algorithms with other networks than the default, and what the tests of networks look at."""
+
+import numpy as np
+import pytest
+import torch
+
+from policies.hyperparams import make_hyperparams
+
+SMALL = {
+    "ppo": {"hidden_sizes": (16,), "train_batch_size": 64, "minibatch_size": 32, "num_epochs": 2, "num_envs": 2},
+    "dqn": {"hidden_sizes": (16,), "env_steps_per_iteration": 40, "learning_starts": 10, "train_batch_size": 8},
+}
+
+
+@pytest.fixture
+def build():
+    """(algorithm, env id, env arguments, rl_module, hyperparameters) -> (Algorithm, hyperparameters)"""
+    from policies.rllib_config import build_algorithm_config
+
+    built = []
+
+    def make(algorithm, env_id="CartPole-v1", env_args=None, rl_module=None, **values):
+        hyperparams = make_hyperparams(algorithm, {**SMALL[algorithm], **values})
+        config = build_algorithm_config(hyperparams, env_id=env_id, env_args=env_args, seed=3, rl_module=rl_module)
+        torch.manual_seed(0)
+        built.append(config.build_algo())
+        return built[-1], hyperparams
+
+    yield make
+    for algo in built:
+        algo.stop()
+
+
+def portable(algo, hyperparams, env_args=None):
+    from policies.restore import portable_policy
+
+    return portable_policy(algo, hyperparams, env_id=algo.config.env, env_args=env_args or {})
+
+
+def observations_of(algo, num=1_000, scale=1.0):
+    space = algo.env_runner.env.single_observation_space
+    rng = np.random.default_rng(5)
+    if len(space.shape) == 3:
+        high = 256 if space.dtype == np.uint8 else 1.0
+        return (rng.uniform(0, high, (num, *space.shape))).astype(space.dtype)
+    return (scale * rng.normal(size=(num, *space.shape))).astype(np.float32)
+
+
+def rllib_outputs(algo, obs):
+    """What the acting module gives before actions are chosen."""
+    module = algo.env_runner.module
+    with torch.no_grad():
+        batch = {"obs": torch.from_numpy(obs)}
+        if hasattr(module, "compute_q_values"):
+            return module.compute_q_values(batch)["qf_preds"].numpy()
+        return module.forward_inference(batch)["action_dist_inputs"].numpy()

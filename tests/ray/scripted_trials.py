@@ -1,0 +1,61 @@
+"""Trials whose scores are known beforehand, run by Ray Tune under a sweep's scheduler: no training, a second or two."""
+
+from pathlib import Path
+
+from ray import tune
+
+from tune_jobs.schedulers import build_scheduler, waits_for_others
+
+STEPS = 100
+
+
+def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_every=1):
+    """Run one trial a score, two at a time; returns the env steps that each came to.
+
+    Args:
+        folder: Where everything is written.
+        scheduler: A `SchedulerSpec`.
+        scores: Evaluation return of each trial, at each evaluation; None: not a finite number.
+        max_env_steps: Of a trial; a report is 100.
+        evaluate_every: Reports between two evaluations.
+    """
+    # Defined in here, or the worker processes would look for a module that only this one has.
+    from tune_jobs.schedulers import grace_env_steps
+    from tune_jobs.trainable import TrialTrainable
+    from tune_jobs.trial import Progress
+
+    grace, steps = grace_env_steps(scheduler, max_env_steps), STEPS
+
+    class Scripted(TrialTrainable):
+        def step(self):
+            path = Path(self._trial[0]) / f"{self._trial[1]}.txt"
+            count = 1 + (int(path.read_text()) if path.exists() else 0)
+            path.write_text(str(count))
+            self._grace = grace
+            score = scores[int(self._trial[1])]
+            evaluated = count % evaluate_every == 0
+            progress = Progress(
+                iteration=count, num_env_steps=count * steps, num_episodes=count, time_s=1.0, training_return=None,
+                evaluation_return=score if evaluated else 1e6, best_evaluation_return=score, best_iteration=None,
+                evaluated=evaluated, status="completed" if count * steps >= max_env_steps else "running",
+            )  # fmt: skip
+            return self._report(progress)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    tune.Tuner(
+        tune.with_resources(Scripted, {"CPU": 1}),
+        param_space={
+            "sweep_folder": str(folder),
+            "trial_id": tune.grid_search([str(index) for index in range(len(scores))]),
+        },
+        tune_config=tune.TuneConfig(
+            scheduler=build_scheduler(scheduler, max_env_steps),
+            # As in a sweep, see `waits_for_others`.
+            max_concurrent_trials=None if waits_for_others(scheduler) else 2,
+            reuse_actors=True,
+            trial_name_creator=lambda trial: trial.config["trial_id"],
+            trial_dirname_creator=lambda trial: trial.config["trial_id"],
+        ),
+        run_config=tune.RunConfig(name="run", storage_path=str(folder / "tune"), verbose=0),
+    ).fit()
+    return [int((folder / f"{index}.txt").read_text()) * STEPS for index in range(len(scores))]

@@ -1,0 +1,88 @@
+"""The short path of `DQNLearner` computes what RLlib's own learner computes."""
+
+import pytest
+import torch
+
+from policies.hyperparams import DQNHyperparams
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+MODULE = "default_policy"
+
+
+def make(**values):
+    from policies.rllib_config import build_algorithm_config
+
+    hyperparams = DQNHyperparams(hidden_sizes=(8,), gamma=0.9, **values)
+    return build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=3).build_algo()
+
+
+def random_batch(size, *, seed):
+    generator = torch.Generator().manual_seed(seed)
+    terminated = torch.rand(size, generator=generator) < 0.3
+    n_step = torch.randint(1, 4, (size,), generator=generator).float()
+    batch = {
+        "obs": torch.randn(size, 4, generator=generator),
+        "new_obs": torch.randn(size, 4, generator=generator),
+        "actions": torch.randint(2, (size,), generator=generator),
+        "rewards": 3 * torch.randn(size, generator=generator),
+        "weights": torch.rand(size, generator=generator),
+    }
+    return batch, terminated, n_step
+
+
+def rllib_forward_train(module, batch):
+    """What RLlib's default module gives its learner, from our module's networks."""
+    from ray.rllib.algorithms.dqn.torch.default_dqn_torch_rl_module import DefaultDQNTorchRLModule
+
+    return DefaultDQNTorchRLModule._forward_train(module, batch)
+
+
+@pytest.mark.parametrize("double_q", [True, False])
+@pytest.mark.parametrize("td_loss", ["huber", "mse"])
+@pytest.mark.parametrize("dueling", [True, False])
+def test_loss_and_gradients_are_rllibs(double_q, td_loss, dueling):
+    from ray.rllib.algorithms.dqn.torch.dqn_torch_learner import DQNTorchLearner
+
+    algo = make(double_q=double_q, td_loss=td_loss, dueling=dueling)
+    learner = algo.learner
+    module = learner.module[MODULE]
+    batch, terminated, n_step = random_batch(32, seed=0)
+    with torch.no_grad():
+        for weight in module.encoder.parameters():
+            weight.add_(0.3 * torch.randn(weight.shape))  # or online and target network would be the same
+
+    def gradients(loss):
+        learner.get_optimizer(MODULE).zero_grad()
+        loss.backward()
+        return [param.grad.clone() for param in learner.get_optimizer(MODULE).param_groups[0]["params"]]
+
+    ours, td_errors, _ = learner.loss({**batch, "discounts": 0.9**n_step * ~terminated}, module._forward_train(batch))
+    our_gradients = gradients(ours)
+    config = learner.config.copy(copy_frozen=False)
+    config.td_error_loss_fn = td_loss
+    theirs = DQNTorchLearner.compute_loss_for_module(
+        learner,
+        module_id=MODULE,
+        config=config,
+        batch={**batch, "terminateds": terminated, "n_step": n_step},
+        fwd_out=rllib_forward_train(module, batch),
+    )
+    torch.testing.assert_close(ours, theirs)
+    assert len(our_gradients) == (6 if dueling else 4)
+    for mine, other in zip(our_gradients, gradients(theirs), strict=True):
+        torch.testing.assert_close(mine, other)
+        assert mine.abs().sum() > 0
+    assert td_errors.shape == (32,)
+    algo.stop()
+
+
+def test_a_loss_that_is_no_number_is_not_hidden():
+    """RLlib's learner zeroes NaN gradients and goes on as if nothing was wrong; the trial must fail instead."""
+    algo = make(learning_starts=0, env_steps_per_iteration=40)
+    with torch.no_grad():
+        algo.learner.module[MODULE].af.bias.fill_(float("nan"))
+    algo.train()
+    weights = algo.learner.module[MODULE].encoder.state_dict()
+    assert not all(torch.isfinite(weight).all() for weight in weights.values())
+    algo.stop()

@@ -1,0 +1,126 @@
+"""RLModule classes of a user's own: they train, restore by themselves, act, and are imported only where allowed."""
+
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from network_builds import build, observations_of, portable, rllib_outputs
+from rllib_cases import module_of
+
+from policies.errors import CheckpointError, SpecError
+from policies.hyperparams import make_hyperparams
+from policies.policy import load_policy
+from policies.portable import read_policy, save_policy
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+__all__ = ["build"]
+
+MODULES = "tune_jobs_test_modules"
+
+
+@pytest.fixture
+def allowed(monkeypatch):
+    """The module of test classes may be imported, in this test alone."""
+    monkeypatch.setattr("policies.env_modules._allowed", {MODULES})
+
+
+OWN = {
+    "ppo from scratch": ("ppo", "CartPole-v1", "OwnPPO"),
+    "ppo continuous": ("ppo", "Pendulum-v1", "OwnPPO"),
+    "dqn from ours": ("dqn", "Acrobot-v1", "OwnDQN"),
+    "dqn from rllib": ("dqn", "CartPole-v1", "PlainDQN"),
+}
+
+
+@pytest.mark.parametrize("kind", OWN)
+@pytest.mark.usefixtures("allowed")
+def test_a_module_of_ones_own_trains_restores_and_acts(build, kind, tmp_path):
+    import tune_jobs_test_modules
+    from ray.rllib.utils.spaces.space_utils import unsquash_action
+
+    from policies.restore import restore_algorithm
+
+    algorithm, env_id, name = OWN[kind]
+    own_class = getattr(tune_jobs_test_modules, name)
+    algo, hyperparams = build(algorithm, env_id, rl_module=f"{MODULES}:{name}")
+    assert type(module_of(algo)) is type(algo.env_runner.module) is own_class
+    assert module_of(algo).model_config["fcnet_hiddens"] == [16]
+    before = {key: value.clone() for key, value in module_of(algo).state_dict().items()}
+    algo.train()
+    assert any(not torch.equal(value, before[key]) for key, value in module_of(algo).state_dict().items())
+
+    save_policy(portable(algo, hyperparams), tmp_path / "policy")
+    assert read_policy(tmp_path / "policy").network.module.class_path == f"{MODULES}:{name}"
+    algo.save_to_path(str(tmp_path / "rllib"))
+    restored = restore_algorithm(tmp_path / "rllib", read_policy(tmp_path / "policy").network)
+    assert type(module_of(restored)) is type(restored.env_runner.module) is own_class
+    for key, value in module_of(algo).state_dict().items():
+        assert torch.equal(value, module_of(restored).state_dict()[key])
+    restored.train()
+    restored.stop()
+
+    policy = load_policy(tmp_path / "policy")
+    policy.check_finite()
+    obs = observations_of(algo, num=200, scale=2.0)
+    outputs = rllib_outputs(algo, obs)
+    actions = policy.act(obs)
+    if isinstance(policy.action_space, gym.spaces.Box):
+        expected = unsquash_action(outputs[:, :1], policy.action_space)
+        np.testing.assert_allclose(actions, expected, rtol=1e-5, atol=1e-5)
+    else:
+        np.testing.assert_array_equal(actions, outputs.argmax(axis=1))
+    assert np.array_equal(policy.act(obs[0]), actions[0])
+    assert policy.act(obs[:0]).shape == (0, *policy.action_space.shape)
+
+
+def test_a_module_that_was_not_allowed_is_never_imported(build, allowed, monkeypatch, tmp_path):
+    from policies.restore import restore_algorithm
+
+    algo, hyperparams = build("ppo", rl_module=f"{MODULES}:OwnPPO")
+    save_policy(portable(algo, hyperparams), tmp_path / "policy")
+    algo.save_to_path(str(tmp_path / "rllib"))
+    monkeypatch.setattr("policies.env_modules._allowed", set())
+    monkeypatch.delitem(sys.modules, MODULES)
+    with pytest.raises(SpecError, match="not allowed"):
+        build("ppo", rl_module=f"{MODULES}:OwnPPO")
+    saved = read_policy(tmp_path / "policy")
+    with pytest.raises(SpecError, match="not allowed"):
+        load_policy(tmp_path / "policy")
+    with pytest.raises(SpecError, match="not allowed"):
+        restore_algorithm(tmp_path / "rllib", saved.network)
+    assert MODULES not in sys.modules
+
+
+def test_a_module_that_is_gone_is_an_error(build, allowed, monkeypatch, tmp_path):
+    """RLlib itself only warns, and goes on with another class."""
+    import tune_jobs_test_modules
+
+    from policies.restore import restore_algorithm
+
+    algo, _ = build("ppo", rl_module=f"{MODULES}:OwnPPO")
+    algo.save_to_path(str(tmp_path))
+    monkeypatch.delattr(tune_jobs_test_modules, "OwnPPO")
+    with pytest.raises(CheckpointError, match="cannot restore"):
+        restore_algorithm(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "values", "name", "words"),
+    [
+        ("ppo", {}, "NUMBER", "is 3, which is no RLModule class"),
+        ("ppo", {}, "NoValues", "no ValueFunctionAPI"),
+        ("dqn", {}, "OwnPPO", "no QNetAPI"),
+        ("ppo", {}, "Nothing", "nothing called 'Nothing'"),
+        ("dqn", {"epsilon_schedule": "exponential"}, "PlainDQN", "epsilon_schedule exponential"),
+        ("dqn", {"target_network": False, "double_q": False}, "PlainDQN", "target_network is false"),
+    ],
+)
+@pytest.mark.usefixtures("allowed")
+def test_classes_that_cannot_be_trained_are_refused(algorithm, values, name, words):
+    from policies.networks import module_spec
+
+    with pytest.raises(SpecError, match=words):
+        module_spec(make_hyperparams(algorithm, values), f"{MODULES}:{name}")

@@ -1,0 +1,145 @@
+"""PPO's schedules and KL weight over iterations and restores; observation statistics over env runners."""
+
+import numpy as np
+import pytest
+import torch
+from ppo_cases import current_lr, entropy_weight
+from rllib_cases import MODULE, SMALL, env_steps, learner_of, module_of
+
+from policies.hyperparams import PPOHyperparams
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+
+@pytest.fixture
+def build():
+    """Make a PPO Algorithm from a few hyperparameters; all are stopped at the end."""
+    from policies.rllib_config import build_algorithm_config
+
+    built = []
+
+    def make(num_env_runners=0, **values):
+        hyperparams = PPOHyperparams(**{**SMALL["ppo"], **values})
+        config = build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=7, num_env_runners=num_env_runners)
+        built.append(config.build_algo())
+        return built[-1]
+
+    yield make
+    for algo in built:
+        algo.stop()
+
+
+def saved_and_restored(algo, folder, make_new):
+    """A second Algorithm with the first one's checkpoint."""
+    algo.save_to_path(str(folder))
+    restored = make_new()
+    restored.restore_from_path(str(folder))
+    return restored
+
+
+def in_first_update(algo, read):
+    """(env steps, what `read` gives in the first update of the next iteration)."""
+    learner, seen = learner_of(algo), []
+    update = learner._update
+
+    def reading(*args, **kwargs):
+        seen.append(read(algo))
+        return update(*args, **kwargs)
+
+    learner._update = reading
+    steps = env_steps(algo.train())
+    learner._update = update
+    return steps, seen[0]
+
+
+@pytest.mark.parametrize(("read", "name", "decay"), [
+    (current_lr, "lr", "lr_decay_steps"),
+    (entropy_weight, "entropy_coeff", "entropy_decay_steps"),
+])  # fmt: skip
+def test_schedules_go_on_after_a_restore(build, tmp_path, read, name, decay):
+    values = {name: 0.1, f"{name}_final": 0.02, decay: 400}
+    algo = build(**values)
+    for _ in range(2):
+        algo.train()
+    restored = saved_and_restored(algo, tmp_path, lambda: build(**values))
+    steps, value = in_first_update(restored, read)
+    assert 190 <= steps <= 200  # the third iteration's
+    assert value == pytest.approx(0.1 - 0.08 * steps / 400, rel=1e-3)
+
+
+def test_the_kl_weight_moves_in_training_and_is_restored(build, tmp_path):
+    values = {"use_kl_loss": True, "kl_coeff": 0.4, "kl_target": 1e-9, "lr": 1e-2, "num_epochs": 4}
+    algo = build(**values)
+    for iteration in (1, 2):
+        algo.train()
+        # Each iteration moves the policy by more than twice the target.
+        assert float(learner_of(algo).curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.4 * 1.5**iteration)
+    restored = saved_and_restored(algo, tmp_path, lambda: build(**values))
+    assert float(learner_of(restored).curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.9)
+    # Population based training goes on from another trial's checkpoint with a kl_coeff of its own.
+    mutated = saved_and_restored(algo, tmp_path / "mutated", lambda: build(**{**values, "kl_coeff": 0.6}))
+    assert float(learner_of(mutated).curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.6)
+
+
+def first_ratios(algo):
+    """exp(log probability in the first update - in sampling) of the rows that are env steps."""
+    learner, module, ratios = learner_of(algo), module_of(algo), []
+    update = learner._update
+
+    def reading(batch, *args, **kwargs):
+        if not ratios:
+            rows = batch[MODULE]
+            with torch.no_grad():
+                logits = module.forward_train(rows)["action_dist_inputs"]
+            now = torch.distributions.Categorical(logits=logits).log_prob(rows["actions"])
+            ratios.append(torch.exp(now - rows["action_logp"])[rows["loss_mask"]])
+        return update(batch, *args, **kwargs)
+
+    learner._update = reading
+    algo.train()
+    learner._update = update
+    return ratios[0]
+
+
+def runner_statistics(algo):
+    return [
+        {name: np.asarray(value) for name, value in state.items() if name.startswith("obs_")}
+        for state in algo.env_runner_group.foreach_env_runner(
+            lambda runner: {name: value.numpy() for name, value in runner.module.state_dict().items()},
+            local_env_runner=False,
+        )
+    ] or [{name: value.numpy() for name, value in algo.env_runner.module.state_dict().items() if name[:4] == "obs_"}]
+
+
+@pytest.mark.parametrize("num_env_runners", [0, 2])
+def test_sampling_and_training_use_the_same_statistics(build, num_env_runners):
+    algo = build(num_env_runners, normalize_observations=True, lr=1e-2, vf_share_layers=True)
+    for _ in range(3):
+        # Statistics move by a lot in the first iterations: with newer ones the ratios would be far from 1.
+        ratios = first_ratios(algo)
+        assert len(ratios) > 20
+        torch.testing.assert_close(ratios, torch.ones_like(ratios), rtol=1e-4, atol=1e-4)
+        statistics = runner_statistics(algo)
+        assert len(statistics) == max(1, num_env_runners)
+        for found in statistics:
+            for name in ("obs_mean", "obs_var", "obs_count"):
+                np.testing.assert_array_equal(found[name], module_of(algo).state_dict()[name].numpy())
+
+
+def test_statistics_are_of_the_env_steps_alone(build):
+    """RLlib's batch has a row more for each episode chunk, which would be counted twice."""
+    algo = build(normalize_observations=True)
+    steps = env_steps(algo.train())
+    assert int(module_of(algo).obs_count) == steps
+
+
+def test_statistics_are_restored_and_grow_on(build, tmp_path):
+    algo = build(normalize_observations=True)
+    algo.train()
+    before = {name: value.clone() for name, value in module_of(algo).state_dict().items()}
+    restored = saved_and_restored(algo, tmp_path, lambda: build(normalize_observations=True))
+    for name, value in module_of(restored).state_dict().items():
+        torch.testing.assert_close(value, before[name], rtol=0, atol=0)
+    ratios = first_ratios(restored)
+    torch.testing.assert_close(ratios, torch.ones_like(ratios), rtol=1e-4, atol=1e-4)
+    assert int(module_of(restored).obs_count) > int(before["obs_count"])

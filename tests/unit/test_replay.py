@@ -1,0 +1,203 @@
+"""Replay memories: what goes in, what comes out, how often."""
+
+import numpy as np
+import pytest
+
+from policies.hyperparams import DQNHyperparams
+from policies.replay import (
+    LastTransitions,
+    NStep,
+    PrioritizedReplayBuffer,
+    ReplayBuffer,
+    Transitions,
+    make_replay,
+)
+
+
+def rows(first, count):
+    numbers = np.arange(first, first + count, dtype=np.float32)
+    obs = np.stack([numbers, -numbers], axis=1)
+    return Transitions(obs, (numbers % 3).astype(np.int64), numbers, obs + 0.5, numbers / 10)
+
+
+def fragment(rewards, terminated=(), truncated=(), reset=()):
+    """One sub-environment's steps; observation t is [t]. `reset` steps only reset."""
+    count = len(rewards)
+
+    def flags(steps):
+        return np.isin(np.arange(count), steps)[:, None]
+
+    return {
+        "obs": np.arange(count + 1, dtype=np.float32)[:, None, None],
+        "actions": np.arange(count)[:, None],
+        "rewards": np.array(rewards, dtype=np.float64)[:, None],
+        "terminated": flags(terminated),
+        "truncated": flags(truncated),
+        "stepped": ~flags(reset),
+    }
+
+
+def as_rows(transitions):
+    return [
+        (int(obs[0]), int(action), float(reward), int(following[0]), pytest.approx(float(discount)))
+        for obs, action, reward, following, discount in zip(
+            transitions.obs,
+            transitions.actions,
+            transitions.rewards,
+            transitions.next_obs,
+            transitions.discounts,
+            strict=True,
+        )
+    ]
+
+
+def test_one_step_transitions_bootstrap_unless_terminated():
+    columns = fragment([1, 2, 3, 0, 5], terminated=[1], truncated=[4], reset=[2, 3])
+    columns["stepped"][3] = True
+    assert as_rows(NStep(1, 1, 0.9).transitions(columns)) == [
+        (0, 0, 1.0, 1, 0.9),
+        (1, 1, 2.0, 2, 0.0),
+        (3, 3, 0.0, 4, 0.9),
+        (4, 4, 5.0, 5, 0.9),  # truncated: its value goes on
+    ]
+
+
+def test_n_step_sums_stop_at_the_end_of_the_episode():
+    columns = fragment([1, 1, 1, 1, 0, 1], terminated=[3], reset=[4])
+    found = as_rows(NStep(1, 3, 0.5).transitions(columns))
+    assert found == [
+        (0, 0, 1.75, 3, 0.125),
+        (1, 1, 1.75, 4, 0.0),
+        (2, 2, 1.5, 4, 0.0),
+        (3, 3, 1.0, 4, 0.0),
+        # Step 5 waits for two more.
+    ]
+
+
+def test_truncated_n_step_sums_bootstrap_over_the_steps_they_have():
+    found = as_rows(NStep(1, 3, 0.5).transitions(fragment([1, 1], truncated=[1])))
+    assert found == [(0, 0, 1.5, 2, 0.25), (1, 1, 1.0, 2, 0.5)]
+
+
+def test_n_step_sums_go_on_in_the_next_fragment_unless_the_streams_are_reset():
+    n_step = NStep(1, 3, 1.0)
+    assert as_rows(n_step.transitions(fragment([1, 2]))) == []
+    assert as_rows(n_step.transitions(fragment([3]))) == [(0, 0, 6.0, 1, 1.0)]
+    n_step.forget()
+    assert as_rows(n_step.transitions(fragment([4, 5]))) == []
+
+
+def test_streams_do_not_mix():
+    columns = fragment([1, 1, 1])
+    both = {
+        name: np.concatenate([value, value * 10 if name == "rewards" else value], axis=1)
+        for name, value in columns.items()
+    }
+    assert sorted(float(value) for value in NStep(2, 2, 1.0).transitions(both).rewards) == [2, 2, 20, 20]
+
+
+def test_the_oldest_transitions_go_first():
+    replay = ReplayBuffer(5, np.random.default_rng(0))
+    for first in (0, 3, 6):
+        replay.add(rows(first, 3))
+    assert len(replay) == 5
+    (batch,) = replay.batches(1, 400)
+    assert set(batch.rewards) == {4.0, 5.0, 6.0, 7.0, 8.0}
+
+
+def test_more_than_fits_keeps_the_newest():
+    replay = ReplayBuffer(4, np.random.default_rng(0))
+    replay.add(rows(0, 11))
+    (batch,) = replay.batches(1, 200)
+    assert set(batch.rewards) == {7.0, 8.0, 9.0, 10.0}
+
+
+def test_rows_stay_together():
+    replay = ReplayBuffer(7, np.random.default_rng(1))
+    replay.add(rows(0, 12))
+    for batch in replay.batches(20, 3):
+        np.testing.assert_array_equal(batch.obs[:, 0], batch.rewards)
+        np.testing.assert_array_equal(batch.next_obs[:, 0], batch.rewards + 0.5)
+        np.testing.assert_array_equal(batch.actions, batch.rewards % 3)
+        np.testing.assert_allclose(batch.discounts, batch.rewards / 10)
+
+
+def test_uniform_draws_every_row_as_often_and_from_its_seed():
+    def draw(seed):
+        replay = ReplayBuffer(10, np.random.default_rng(seed))
+        replay.add(rows(0, 10))
+        return np.concatenate([batch.rewards for batch in replay.batches(500, 20)])
+
+    counts = np.bincount(draw(0).astype(int), minlength=10)
+    # 1,000 expected each; the standard deviation is 30.
+    assert np.all(np.abs(counts - 1000) < 150)
+    np.testing.assert_array_equal(draw(3), draw(3))
+    assert not np.array_equal(draw(3), draw(4))
+
+
+def test_large_rows_are_drawn_in_several_gathers(monkeypatch):
+    monkeypatch.setattr("policies.replay._MAX_GATHER_BYTES", 100)
+    replay = ReplayBuffer(10, np.random.default_rng(0))
+    replay.add(rows(0, 10))
+    batches = list(replay.batches(7, 4))
+    assert len(batches) == 7
+    assert len({batch.rewards.tobytes() for batch in batches}) > 3
+
+
+def test_no_replay_gives_the_newest_in_order():
+    replay = LastTransitions(3, np.random.default_rng(0))
+    replay.add(rows(0, 2))
+    replay.add(rows(2, 3))
+    (batch,) = replay.batches(1, 3)
+    assert list(batch.rewards) == [2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize("capacity", [1, 5, 8, 1000])
+def test_prioritized_draws_in_proportion(capacity):
+    replay = PrioritizedReplayBuffer(capacity, np.random.default_rng(0), alpha=1.0, beta=1.0)
+    replay.add(rows(0, capacity))
+    size = min(capacity, 5)
+    replay.set_priorities(np.arange(capacity), np.zeros(capacity, dtype=np.float32))
+    replay.set_priorities(np.arange(size), np.arange(1, size + 1, dtype=np.float32))
+    drawn = np.concatenate([batch.rewards for batch in replay.batches(200, 50)]).astype(int)
+    counts = np.bincount(drawn, minlength=capacity)[:size]
+    expected = 10_000 * np.arange(1, size + 1) / (size * (size + 1) / 2)
+    assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 1)
+
+
+def test_importance_weights_undo_the_preference():
+    replay = PrioritizedReplayBuffer(4, np.random.default_rng(0), alpha=1.0, beta=1.0)
+    replay.add(rows(0, 4))
+    replay.set_priorities(np.arange(4), np.array([1.0, 2.0, 4.0, 8.0], dtype=np.float32))
+    (batch,) = replay.batches(1, 500)
+    weights = {int(reward): float(weight) for reward, weight in zip(batch.rewards, batch.weights, strict=True)}
+    assert weights == pytest.approx({0: 1.0, 1: 0.5, 2: 0.25, 3: 0.125}, rel=1e-4)
+
+
+def test_new_rows_get_the_highest_priority():
+    replay = PrioritizedReplayBuffer(100, np.random.default_rng(0), alpha=1.0, beta=0.4)
+    replay.add(rows(0, 50))
+    replay.set_priorities(np.arange(50), np.full(50, 0.01, dtype=np.float32))
+    replay.set_priorities(np.array([0]), np.array([30.0], dtype=np.float32))
+    where = replay.add(rows(50, 1))
+    (batch,) = replay.batches(1, 1000)
+    assert abs(np.mean(batch.rewards == 50) - 0.5) < 0.06
+    assert list(where) == [50]
+
+
+def test_priorities_that_are_no_numbers_do_not_spoil_the_tree():
+    replay = PrioritizedReplayBuffer(4, np.random.default_rng(0), alpha=0.6, beta=0.4)
+    replay.add(rows(0, 4))
+    replay.set_priorities(np.arange(4), np.array([np.nan, np.inf, 1.0, 1.0], dtype=np.float32))
+    (batch,) = replay.batches(1, 100)
+    assert np.all(np.isfinite(batch.weights))
+
+
+@pytest.mark.parametrize(
+    ("replay", "kind", "capacity"),
+    [("uniform", ReplayBuffer, 700), ("prioritized", PrioritizedReplayBuffer, 700), ("none", LastTransitions, 32)],
+)
+def test_the_memory_that_the_hyperparameters_name(replay, kind, capacity):
+    made = make_replay(DQNHyperparams(replay=replay, replay_capacity=700, train_batch_size=32), seed=3)
+    assert type(made) is kind
+    assert made.capacity == capacity

@@ -1,0 +1,47 @@
+"""The points of a sweep as far as they are known before it starts, and the largest trials that unknown ones may be."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+from policies.hyperparams import Hyperparams
+from tune_jobs.search_space import Domain, Listed, Range, draw_point, draw_points
+from tune_jobs.spec import SweepSpec
+
+_DECIDE_SIZE = (
+    "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers"
+)  # fmt: skip
+"""Hyperparameters on which a trial's env steps and disk space depend."""
+
+
+def planned_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
+    """The point of each index; None: the search method chooses it when its trial starts."""
+    if spec.search.type == "random":
+        return list(draw_points(spec.space, spec.num_samples, spec.seed))
+    num_random = min(spec.search.num_startup_trials, spec.num_samples)
+    known = [draw_point(spec.space, index, spec.seed) for index in range(num_random)]
+    return [*known, *[None] * (spec.num_samples - num_random)]
+
+
+def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[Hyperparams]:
+    """Values whose trials are at least as large as those of any point of the space; they need not go together.
+
+    Args:
+        spec: The sweep.
+        known: Of the points that are known; at least one.
+    """
+    ends = {name: _ends(domain) for name, domain in spec.space.items() if name in _DECIDE_SIZE}
+    return [
+        known[0].model_copy(update=dict(zip(ends, values, strict=True))) for values in itertools.product(*ends.values())
+    ]
+
+
+def _ends(domain: Domain) -> list[Any]:
+    if isinstance(domain, Range):
+        return list(domain.bounds)
+    assert isinstance(domain, Listed)
+    if all(isinstance(value, int | float) for value in domain.values):
+        return [min(domain.values), max(domain.values)]
+    return list(domain.values)
