@@ -140,7 +140,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
 
 def _search_fact(spec: SweepSpec) -> str:
     if spec.search.type == "random":
-        return "random, and all of the grids"
+        return "random draws for each combination of the grids"
     return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
 
 

@@ -66,15 +66,12 @@ class EvaluationHyperBand(_EndsUnscored, HyperBandScheduler):  # type: ignore[mi
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        sizes, milestones, last = self._get_n0, self._get_r0, self._s_max_1 - 1
-        self._get_n0 = lambda position: sizes(last - position)
-        self._get_r0 = lambda position: milestones(last - position)
+        milestone = self._get_r0
+        # Rounded down it may be 0, before a trial's first evaluation.
+        self._get_r0 = lambda num_halvings: max(1, milestone(num_halvings))
 
     def _create_bracket(self, position: int) -> Any:
-        bracket = super()._create_bracket(position)
-        # How often it halves, which Ray counts from 0 by position.
-        bracket._halves = self._s_max_1 - 1 - position  # noqa: SLF001
-        return bracket
+        return super()._create_bracket(self._s_max_1 - 1 - position)
 
 
 class EvaluationMedian(_EndsUnscored, MedianStoppingRule):  # type: ignore[misc]

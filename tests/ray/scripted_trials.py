@@ -10,7 +10,7 @@ STEPS = 100
 
 
 def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_every=1):
-    """Run one trial a score, two at a time; returns the env steps that each came to.
+    """Run one trial a score, one after another where the scheduler lets them; returns the env steps each came to.
 
     Args:
         folder: Where everything is written.
@@ -50,8 +50,8 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
         },
         tune_config=tune.TuneConfig(
             scheduler=build_scheduler(scheduler, max_env_steps),
-            # As in a sweep, see `waits_for_others`.
-            max_concurrent_trials=None if waits_for_others(scheduler) else 2,
+            # One at a time, or who is compared with whom would depend on which process starts first.
+            max_concurrent_trials=None if waits_for_others(scheduler) else 1,
             reuse_actors=True,
             trial_name_creator=lambda trial: trial.config["trial_id"],
             trial_dirname_creator=lambda trial: trial.config["trial_id"],

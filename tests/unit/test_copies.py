@@ -1,0 +1,183 @@
+"""A trial that goes on from a copy of another's checkpoint, with values of its own."""
+
+import dataclasses
+import shutil
+
+import pytest
+from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
+from trial_runs import Trial
+
+from analysis.records import ChangeRecord, CheckpointRecord, TrialRecord
+from analysis.selection import rank_points
+from analysis.tables import trials_frame
+from policies.errors import CheckpointError
+from tune_jobs.copies import copied_folder, copy_latest_checkpoint
+from tune_jobs.store import TrialStore
+from tune_jobs.trial import TrialLoop
+
+
+def change(iteration, **fields):
+    return ChangeRecord(
+        **{
+            "iteration": iteration, "num_env_steps": iteration * 100, "source_trial_id": "t0001",
+            "source_iteration": 20, "before": {"lr": 0.1}, "after": {"lr": 0.2}, "time": 0.0,
+        } | fields
+    )  # fmt: skip
+
+
+class Recording(FakeEngine):
+    """Remembers what it was built from."""
+
+    def build(self, task, checkpoint):
+        super().build(task, checkpoint)
+        self.task, self.checkpoint = task, checkpoint
+
+
+@pytest.fixture
+def better(tmp_path):
+    """Another trial, 20 iterations far."""
+    task = dataclasses.replace(make_task(tmp_path), trial_id="t0001")
+    loop = TrialLoop(task, FakeEngine(), FakeEvaluator(), FakeClock())
+    loop.open()
+    while loop.iteration < 20:
+        loop.advance(60.0)
+    return TrialStore(tmp_path, "t0001")
+
+
+def taken_over(tmp_path, better, iteration=5, episodes=lambda iteration: (20.0,), scores=float):
+    """A trial that came to `iteration` and then got a copy of the better one's checkpoint."""
+    worse = Trial(tmp_path, engine=FakeEngine(episodes), scores=scores)
+    worse.run_to(iteration)
+    copy_latest_checkpoint(better, worse.store, iteration)
+    return worse
+
+
+def test_the_trial_goes_on_at_its_own_count_from_the_others_checkpoint(tmp_path, better):
+    taken_over(tmp_path, better)
+    after = Trial(tmp_path, engine=Recording(), changes=(change(5),))
+    assert after.engine.checkpoint == copied_folder(after.store, 5)
+    assert after.engine.iteration == 20
+    assert (after.engine.task.num_iterations, after.engine.task.num_env_steps) == (5, 500)
+    assert after.loop.iteration == 5
+    after.run_to(7)
+    assert [record.iteration for record in after.results] == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_the_copy_stays_though_the_other_trial_deletes_its_checkpoints(tmp_path, better):
+    taken_over(tmp_path, better)
+    shutil.rmtree(better.folder)
+    assert Trial(tmp_path, engine=Recording(), changes=(change(5),)).engine.iteration == 20
+
+
+def test_a_copy_without_a_change_in_the_record_does_not_count(tmp_path, better):
+    worse = taken_over(tmp_path, better, iteration=10)
+    after = Trial(tmp_path, engine=Recording())
+    assert after.engine.checkpoint == tmp_path / worse.store.checkpoint_path(10)
+    earlier = Trial(tmp_path, engine=Recording(), changes=(change(4),))
+    assert earlier.engine.checkpoint == tmp_path / worse.store.checkpoint_path(10)
+
+
+def test_a_copy_counts_before_the_trials_own_checkpoint_of_the_same_iteration_which_stays(tmp_path, better):
+    taken_over(tmp_path, better, iteration=10)
+    after = Trial(tmp_path, engine=Recording(), changes=(change(10),))
+    assert after.engine.checkpoint == copied_folder(after.store, 10)
+    assert 10 in after.kept
+
+
+def test_a_trial_that_is_opened_again_before_it_saved_goes_on_from_the_copy_and_then_from_its_own(tmp_path, better):
+    taken_over(tmp_path, better)
+    # Scores so low that no checkpoint is the best.
+    first = Trial(tmp_path, engine=Recording(), changes=(change(5),), scores=lambda i: -1.0)
+    first.run_to(8)
+    again = Trial(tmp_path, engine=Recording(), changes=(change(5),), scores=lambda i: -1.0)
+    assert (again.engine.checkpoint, again.loop.iteration) == (copied_folder(again.store, 5), 5)
+    again.run_to(10)
+    last = Trial(tmp_path, engine=Recording(), changes=(change(5),))
+    assert last.engine.checkpoint == tmp_path / last.store.checkpoint_path(10)
+    assert not copied_folder(last.store, 5).exists()
+
+
+def test_a_pause_before_any_training_saves_nothing_with_the_score_of_other_weights(tmp_path, better):
+    # Its own best is its first, so that it has no checkpoint of iteration 5.
+    taken_over(tmp_path, better, scores=lambda iteration: -iteration)
+    after = Trial(tmp_path, engine=Recording(), changes=(change(5),), scores=lambda iteration: -iteration)
+    assert after.kept == [1]
+    after.loop.pause()
+    assert after.kept == [1]
+    after.run_to(6)
+    after.loop.pause()
+    assert after.kept[-1] == 6
+
+
+def test_the_training_return_is_of_the_new_weights_alone(tmp_path, better):
+    taken_over(tmp_path, better, episodes=lambda iteration: (500.0,))
+    after = Trial(tmp_path, engine=FakeEngine(lambda iteration: (7.0, 9.0)), changes=(change(5),))
+    assert after.run_to(6).training_return == 8.0
+    # The same after it was opened again.
+    after.loop.pause()
+    again = Trial(tmp_path, engine=FakeEngine(lambda iteration: (7.0, 9.0)), changes=(change(5),))
+    assert again.run_to(7).training_return == 8.0
+
+
+def test_a_damaged_copy_is_refused(tmp_path, better):
+    taken_over(tmp_path, better)
+    (copied_folder(TrialStore(tmp_path, "t0000"), 5) / "engine.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"engine\.json"):
+        Trial(tmp_path, engine=Recording(), changes=(change(5),))
+
+
+def test_a_damaged_checkpoint_is_not_copied(tmp_path, better):
+    (tmp_path / better.checkpoints()[-1].path / "engine.json").write_text("{}")
+    own = TrialStore(tmp_path, "t0000")
+    with pytest.raises(CheckpointError, match=r"engine\.json"):
+        copy_latest_checkpoint(better, own, 5)
+    assert not copied_folder(own, 5).exists()
+
+
+def test_a_checkpoint_that_is_deleted_while_it_is_copied_gives_way_to_the_newer_one(tmp_path, better, monkeypatch):
+    known = better.checkpoints()
+    real, calls = better.checkpoints, []
+
+    def checkpoints():
+        calls.append(1)
+        gone = CheckpointRecord(trial_id="t0001", iteration=19, num_env_steps=1, path="trials/t0001/checkpoints/gone")
+        return [gone] if len(calls) == 1 else real()
+
+    monkeypatch.setattr(better, "checkpoints", checkpoints)
+    assert copy_latest_checkpoint(better, TrialStore(tmp_path, "t0000"), 5) == known[-1]
+
+
+def test_a_trial_without_a_checkpoint_cannot_be_copied(tmp_path):
+    with pytest.raises(CheckpointError, match="t0001 has no checkpoint"):
+        copy_latest_checkpoint(TrialStore(tmp_path, "t0001"), TrialStore(tmp_path, "t0000"), 5)
+
+
+# -- what a changed trial's record says
+
+
+def changed_trial():
+    changes = (
+        change(10, before={"lr": 0.1}, after={"lr": 0.2}),
+        change(20, before={"lr": 0.2}, after={"lr": 0.3}, source_trial_id="t0002"),
+    )
+    best = CheckpointRecord(trial_id="t0000", iteration=15, num_env_steps=1500, path="x", evaluation_return=9.0)
+    return TrialRecord(
+        trial_id="t0000", index=0, point_index=0, seed=0, point={"lr": 0.3}, hyperparams={"lr": 0.3, "gamma": 0.9},
+        changes=changes, checkpoints=(best,), status="completed",
+    )  # fmt: skip
+
+
+def test_a_change_acts_from_the_next_iteration_on():
+    trial = changed_trial()
+    values = {iteration: trial.point_at(iteration)["lr"] for iteration in (1, 10, 11, 20, 21, 99)}
+    assert values == {1: 0.1, 10: 0.1, 11: 0.2, 20: 0.2, 21: 0.3, 99: 0.3}
+    assert trial.first_hyperparams == {"lr": 0.1, "gamma": 0.9}
+
+
+def test_a_score_stands_beside_the_values_it_was_reached_with():
+    assert rank_points([changed_trial()])[0].point == {"lr": 0.2}
+    row = trials_frame([changed_trial()]).iloc[0]
+    assert row["lr"] == 0.2
+    assert row["changes"] == "at 1,000 env steps from t0001: lr 0.2; at 2,000 env steps from t0002: lr 0.3"
+    plain = changed_trial().model_copy(update={"changes": ()})
+    assert "changes" not in trials_frame([plain]).columns

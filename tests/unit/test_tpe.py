@@ -1,0 +1,216 @@
+"""TPE on trials that take no time: the score is a function of the point."""
+
+import builtins
+import importlib.util
+import json
+import math
+
+import numpy as np
+import pytest
+
+from analysis.records import TrialRecord
+from policies.errors import CannotRunError, SpecError
+from tune_jobs.plan import Machine, make_plan
+from tune_jobs.search_space import draw_point
+from tune_jobs.spec_file import load_spec
+from tune_jobs.tpe import propose_point
+
+pytest.importorskip("optuna")
+
+SPACE = {"lr": {"loguniform": [1e-5, 1e-1]}, "activation": {"choice": ["tanh", "relu", "silu"]}}
+
+
+def make_spec(num_samples=40, startup=8, **changes):
+    search = {"type": "tpe", "num_startup_trials": startup}
+    base = {"env": "CartPole-v1", "algorithm": "ppo", "space": SPACE, "num_samples": num_samples, "search": search}
+    return load_spec({**base, **changes})
+
+
+def valley(point):
+    """Best, 0, at lr 1e-3 with silu."""
+    return -abs(math.log10(point["lr"]) + 3) - (point["activation"] != "silu")
+
+
+def record(index, point, score=None, *, status="completed", point_index=None, steps=200_000):
+    point_index = index if point_index is None else point_index
+    return TrialRecord(
+        trial_id=f"t{index:04d}", index=index, point_index=point_index, seed=index, point=point, hyperparams={"lr": 1},
+        status=status, best_evaluation_return=score, num_env_steps=steps,
+    )  # fmt: skip
+
+
+def search(spec, score, *, at_once=1):
+    """All points of a sweep, `at_once` trials running at a time."""
+    records = []
+    for index in range(spec.num_samples):
+        point = propose_point(spec, records, index, lambda point: None)
+        records.append(record(index, point, status="running"))
+        if index >= at_once - 1:
+            done = index - at_once + 1
+            records[done] = record(done, records[done].point, score(records[done].point))
+    return [item.point for item in records]
+
+
+@pytest.mark.parametrize("at_once", [1, 4])
+def test_later_points_concentrate_where_scores_are_better_than_those_of_random_ones(at_once):
+    gains, silu = [], []
+    for seed in range(3):
+        spec = make_spec(seed=seed)
+        points = search(spec, valley, at_once=at_once)[20:]
+        random = [draw_point(spec.space, index, spec.seed) for index in range(20, 40)]
+        gains.append(np.mean([valley(p) for p in points]) - np.mean([valley(p) for p in random]))
+        silu.append(np.mean([p["activation"] == "silu" for p in points]))
+    # A random point scores -1.7 in the mean; none scores above 0.
+    assert min(gains) > 0.5
+    assert np.mean(silu) > 0.55
+
+
+def test_points_are_the_planned_random_ones_until_enough_have_ended():
+    spec = make_spec(startup=8)
+    points = search(spec, valley)
+    plan = make_plan(spec, Machine(num_cpus=2))
+    assert points[:8] == [trial.point for trial in plan.trials[:8]]
+    assert points[8] != draw_point(spec.space, 8, spec.seed)
+
+
+def test_the_same_records_give_the_same_point_whatever_ran_before():
+    spec = make_spec()
+    points = search(spec, valley)[:12]
+    records = [record(index, point, valley(point)) for index, point in enumerate(points)]
+    again = [TrialRecord.model_validate(json.loads(item.model_dump_json())) for item in records]
+    first = propose_point(spec, records, 12, lambda point: None)
+    assert propose_point(spec, again, 12, lambda point: None) == first
+    assert propose_point(make_spec(seed=1), records, 12, lambda point: None) != first
+    assert propose_point(spec, records, 13, lambda point: None) != first
+
+
+def test_trials_that_run_at_the_same_time_are_kept_apart():
+    spec = make_spec(startup=4, space={"lr": SPACE["lr"]})
+    ended = [record(index, {"lr": lr}, valley({"lr": lr, "activation": "silu"})) for index, lr in enumerate(
+        [1e-5, 1e-4, 9e-4, 1e-3, 1.1e-3, 1e-2, 1e-1])]  # fmt: skip
+    alone = [propose_point(spec, ended, 7 + k, lambda point: None)["lr"] for k in range(12)]
+    running = [record(7 + k, {"lr": 1e-3 * (1 + k / 50)}, status="running") for k in range(6)]
+    beside = [propose_point(spec, ended + running, 13 + k, lambda point: None)["lr"] for k in range(12)]
+
+    def near(values):
+        return np.mean(np.abs(np.log10(values) + 3) < 0.1)
+
+    assert near(beside) < near(alone)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"status": "failed", "score": 100.0},
+        {"status": "failed", "score": None},
+        {"status": "completed", "score": None},
+        {"status": "stopped", "score": -50.0, "steps": 20_000},
+    ],
+)
+def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad):
+    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
+    grid = np.linspace(0.02, 0.98, 24)
+    records = [
+        record(index, {"lr": lr}, **({"score": 1.0} if lr < 0.5 else bad)) for index, lr in enumerate(map(float, grid))
+    ]
+    proposed = [propose_point(spec, records, 24 + k, lambda point: None)["lr"] for k in range(20)]
+    assert np.mean(np.array(proposed) < 0.5) > 0.8
+
+
+def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_steps_within_a_rung_do_not_matter():
+    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
+
+    def proposed(left, right):
+        records = [
+            record(index, {"lr": lr}, status="stopped", **(left if lr < 0.5 else right))
+            for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24)))
+        ]
+        return np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)])
+
+    assert proposed({"score": 1.0, "steps": 31_000}, {"score": 9.0, "steps": 10_400}) > 0.8
+    assert proposed({"score": 9.0, "steps": 10_000}, {"score": 1.0, "steps": 10_400}) > 0.8
+
+
+def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended():
+    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, seeds_per_point=2)
+
+    def proposed(other_seed):
+        records = []
+        for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24))):
+            second = {"score": 1.0} if lr < 0.5 else other_seed
+            records += [
+                record(2 * index, {"lr": lr}, 1.0 if lr < 0.5 else 5.0, point_index=index),
+                record(2 * index + 1, {"lr": lr}, point_index=index, **second),
+            ]
+        return np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)])
+
+    assert proposed({"score": -9.0}) > 0.8  # mean -2
+    assert proposed({"score": 5.0}) < 0.2
+    assert proposed({"score": None, "status": "failed"}) > 0.8
+    assert proposed({"score": 99.0, "status": "running"}) > 0.8
+
+
+def test_every_kind_of_domain_keeps_its_bounds_steps_and_types():
+    space = {
+        "lr": {"qloguniform": [0.01, 0.5, 0.01]},
+        "gamma": {"quniform": [0.9, 0.99, 0.03]},
+        "clip_param": {"uniform": [0.1, 0.3]},
+        "num_epochs": {"randint": [1, 5]},
+        "train_batch_size": {"qrandint": [512, 1024, 128]},
+        "minibatch_size": {"qlograndint": [64, 512, 64]},
+        "num_envs": {"lograndint": [1, 9]},
+        "hidden_sizes": {"grid": [[8], [16, 16]]},
+        "vf_share_layers": {"choice": [True, False]},
+    }
+    spec = make_spec(num_samples=30, startup=4, space=space)
+    points = search(spec, lambda point: -point["lr"] + point["num_epochs"])
+    seen = {name: [point[name] for point in points] for name in space}
+    assert set(map(json.dumps, seen["hidden_sizes"])) <= {"[8]", "[16, 16]"}
+    assert set(seen["vf_share_layers"]) <= {True, False}
+    assert set(seen["num_epochs"]) <= {1, 2, 3, 4}
+    assert set(seen["num_envs"]) <= set(range(1, 9))
+    assert set(seen["train_batch_size"]) <= {512, 640, 768, 896, 1024}
+    assert set(seen["minibatch_size"]) <= set(range(64, 513, 64))
+    assert set(seen["gamma"]) <= {0.9, 0.93, 0.96, 0.99}
+    assert all(0.1 <= value <= 0.3 for value in seen["clip_param"])
+    assert all(value == round(value, 2) and 0.01 <= value <= 0.5 for value in seen["lr"])
+    for point in points:
+        assert json.loads(json.dumps(point)) == point
+        assert not any(isinstance(value, np.generic) for value in point.values())
+
+
+def test_a_proposal_whose_values_do_not_go_together_is_replaced():
+    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}})
+    records = [record(index, {"lr": lr}, lr) for index, lr in enumerate([0.1, 0.3, 0.5, 0.7, 0.9])]
+    asked = []
+
+    def check(point):
+        asked.append(point)
+        if point["lr"] > 0.5:
+            raise SpecError("too large")
+
+    assert all(propose_point(spec, records, 5 + k, check)["lr"] <= 0.5 for k in range(5))
+    assert len(asked) > 5
+
+    def refuse(point):
+        raise SpecError("never")
+
+    with pytest.raises(SpecError, match="never"):
+        propose_point(spec, records, 5, refuse)
+
+
+def test_without_optuna_the_plan_says_what_to_install(monkeypatch):
+    find_spec, real_import = importlib.util.find_spec, builtins.__import__
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find_spec(name, *rest)
+    )
+
+    def no_optuna(name, *rest):
+        assert not name.startswith("optuna")
+        return real_import(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", no_optuna)
+    with pytest.raises(CannotRunError) as caught:
+        make_plan(make_spec(), Machine(num_cpus=2))
+    assert "tune-jobs[tpe]" in caught.value.hint
+    make_plan(make_spec(search={"type": "random"}), Machine(num_cpus=2))
