@@ -86,7 +86,9 @@ class TrialRecord(_Record):
     seed: int
     point: dict[str, Any] = Field(description="The sampled values alone; in a population the newest.")
     hyperparams: dict[str, Any] = Field(default_factory=dict, description="All values, fixed ones too.")
-    has_point: bool = Field(default=True, description="False: the search method chooses the point when the trial starts.")
+    has_point: bool = Field(
+        default=True, description="False: the search method chooses the point when the trial starts."
+    )
     changes: tuple[ChangeRecord, ...] = Field((), description="What population based training changed, oldest first.")
     status: TrialStatus = "pending"
     stop_reason: str | None = Field(None, description="The stop rule, cap or scheduler that ended it.")

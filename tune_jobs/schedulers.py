@@ -33,6 +33,7 @@ class OnEvaluations(TrialScheduler):  # type: ignore[misc]
     """Mixin: passes on only results of an iteration that was evaluated."""
 
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
+        """See `TrialScheduler`."""
         if not result.get("evaluated"):
             return str(TrialScheduler.CONTINUE)
         return str(super().on_trial_result(tune_controller, trial, result))
@@ -66,7 +67,7 @@ class EvaluationHyperBand(_EndsUnscored, HyperBandScheduler):  # type: ignore[mi
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        milestone = self._get_r0
+        milestone = vars(self)["_get_r0"]
         # Rounded down it may be 0, before a trial's first evaluation.
         self._get_r0 = lambda num_halvings: max(1, milestone(num_halvings))
 
@@ -114,7 +115,12 @@ def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> TrialScheduler:
         # Its brackets count in units of the grace period: in env steps they would want 50,000 trials for 50,000 steps.
         units = max(1, math.ceil(max_env_steps / grace))
         scheduler = EvaluationHyperBand(
-            time_attr="grace_periods", max_t=units, reduction_factor=spec.reduction_factor, **common
+            time_attr="grace_periods",
+            max_t=units,
+            reduction_factor=spec.reduction_factor,
+            # The last ones end by the stop rules; milestones are rounded down, and would end them before the cap.
+            stop_last_trials=False,
+            **common,
         )
     elif spec.type == "median":
         scheduler = EvaluationMedian(time_attr="num_env_steps", grace_period=grace, **common)

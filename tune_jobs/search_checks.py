@@ -22,8 +22,8 @@ def search_problems(spec: SweepSpec) -> Found:
         found += _tpe_problems(spec)
     if spec.scheduler.type in ("pbt", "hyperband") and spec.resources.max_concurrent is not None:
         text = (
-            f"{spec.resources.max_concurrent} does not go with scheduler.type {spec.scheduler.type}, which pauses trials "
-            "until others have come as far: limit how many run by resources.num_cpus"
+            f"{spec.resources.max_concurrent} does not go with scheduler.type {spec.scheduler.type}, which pauses "
+            "trials until others have come as far: limit how many run by resources.num_cpus"
         )
         found.append(("resources.max_concurrent", text))
     if spec.scheduler.type == "pbt":
