@@ -28,12 +28,9 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(PIP) install --quiet --constraint constraints.txt --editable .
 	@touch $@
 
+# Box2D has wheels for some versions of Python only: without it what needs it is skipped, with the reason.
 $(VENV)/installed-test: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
-	@touch $@
-
-# Box2D has wheels for some versions of Python only: without it the presets that need it are skipped, with the reason.
-$(VENV)/installed-learn: $(VENV)/installed-test
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[box2d]' || echo "Box2D cannot be installed here"
 	@touch $@
 
@@ -52,7 +49,7 @@ lint: $(VENV)/installed-test
 types: $(VENV)/installed-test
 	$(BIN)/mypy
 
-learn: $(VENV)/installed-learn
+learn: $(VENV)/installed-test
 	$(BIN)/python -m tests.learning
 
 bench: $(VENV)/installed-bench
