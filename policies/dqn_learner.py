@@ -117,12 +117,14 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         batch = self.to_batch(rows)
         out = module._forward_train(batch)  # noqa: SLF001 - forward_train only adds a check that costs as much
         loss, td_errors, q_selected = self.loss(batch, out)
-        optimizer.zero_grad(set_to_none=True)
+        # What `zero_grad` does, without its bookkeeping.
+        params = [param for group in optimizer.param_groups for param in group["params"]]
+        for param in params:
+            param.grad = None
         loss.backward()  # type: ignore[no-untyped-call]
         stats: dict[str, Tensor | float] = {"total_loss": loss.detach(), "td_errors": td_errors}
         stats["qf_mean"] = q_selected.detach().mean()
         if self.hyperparams.grad_clip is not None:
-            params = [param for group in optimizer.param_groups for param in group["params"]]
             stats["gradient_norm"] = torch.nn.utils.clip_grad_norm_(params, self.hyperparams.grad_clip, foreach=True)
         optimizer.step()
         return stats

@@ -88,7 +88,10 @@ class Encoder(nn.Module):
         if self.conv is not None:
             # Environments give (height, width, channels), torch wants the channels first.
             observations = self.conv(observations.permute(0, 3, 1, 2)).flatten(1)
-        features: Tensor = self.mlp(observations)
+        # Not by calling the modules: what torch does around each call costs as much as a small layer.
+        features = observations
+        for layer in self.mlp:
+            features = layer.forward(features)
         return features
 
 

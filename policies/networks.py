@@ -181,11 +181,11 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
 
 def _q_values(observations: Tensor, encoder: nn.Module, af: nn.Module, vf: nn.Module | None) -> Tensor:
     """Q(s, a) = A(s, a), or V(s) + A(s, a) - mean A(s, .) if dueling (Wang et al. 2016, equation 9)."""
-    features = encoder(observations)
-    advantages: Tensor = af(features)
+    features = encoder.forward(observations)
+    advantages: Tensor = af.forward(features)
     if vf is None:
         return advantages
-    values: Tensor = vf(features)
+    values: Tensor = vf.forward(features)
     return values + advantages - advantages.mean(dim=-1, keepdim=True)
 
 

@@ -29,12 +29,16 @@ def settings() -> tuple[SweepSpec, DQNHyperparams]:
 
 
 def ours(num_env_steps: int) -> float:
-    """Env steps/s of one trial of the preset that no return ends, its evaluations and checkpoints included."""
+    """Env steps/s of one trial with the preset's hyperparameters that no return ends; checkpoints included.
+
+    It is evaluated at the end alone, over 20 episodes: the peer is not evaluated at all.
+    """
     from tests.benchmarks.__main__ import speeds
 
     storage = Path(tempfile.mkdtemp())
     changes = ["stop.evaluation_return=", "stop.training_return=", f"stop.num_env_steps={num_env_steps}"]
     changes += ["seeds_per_point=1", "resources.max_concurrent=1"]
+    changes += ["evaluation.every_iterations=1000", "evaluation.num_episodes=20"]
     command = [_CLI, "launch", PRESET, "--storage", str(storage), "--name", "dqn", "--no-finish"]
     run([*command, *(part for change in changes for part in ("--set", change))], cwd=ROOT)
     (speed,) = speeds(storage / "dqn")
