@@ -393,10 +393,5 @@ def test_every_scheduler_runs_to_the_end(tmp_path, scheduler):
     assert "completed" in statuses
     if scheduler in ("asha", "hyperband"):
         assert "stopped" in statuses
-    if scheduler == "hyperband":
-        # It compares all of them at once, and here one that can't learn is ahead by its first weights.
-        ahead = max(result.trials, key=lambda trial: store.trial(trial.trial_id).read_iterations()[1].evaluation_return)
-        assert ahead.num_env_steps >= 512
-    else:
-        # Without a reason to stop it, the one that learns goes on to the end.
-        assert result.trials[0].status == "completed"
+    # Without a reason to stop it, the one that learns goes on to the end.
+    assert result.trials[0].status == "completed"
