@@ -319,7 +319,8 @@ def hyperparam_problems(
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
-    suggestion = f" ({' and '.join(others)} {'have' if len(others) > 1 else 'has'} it.)" if others else did_you_mean(name, known)
+    have = "have" if len(others) > 1 else "has"
+    suggestion = f" ({' and '.join(others)} {have} it.)" if others else did_you_mean(name, known)
     if name == "learning_rate":
         suggestion = " Did you mean 'lr'?"  # its letters are nearer to DQN's learning_starts
     listed = "" if suggestion else f" It has {', '.join(sorted(known))}."
