@@ -111,7 +111,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         """One gradient step on one batch.
 
         Returns:
-            `total_loss`, `q_mean`, `gradient_norm` (if clipped) and `td_errors`, shape (B,).
+            `total_loss`, `qf_mean`, `gradient_norm` (if clipped) and `td_errors`, shape (B,).
         """
         module = self.module[DEFAULT_MODULE_ID]
         batch = self.to_batch(rows)

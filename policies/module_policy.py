@@ -15,11 +15,11 @@ from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 
 from policies.errors import CheckpointError
 from policies.networks import import_module_class
-from policies.policy import Policy, action_function, check_finite_tensors
-from policies.portable import ModuleWeights, PortablePolicy, space_from_description
+from policies.policy import WeightsPolicy
+from policies.portable import ModuleWeights, PortablePolicy
 
 
-class ModulePolicy(Policy):
+class ModulePolicy(WeightsPolicy):
     """Greedy actions of an RLModule class of the user's own.
 
     Each observation is a forward pass of its own, so that its action does not depend on what else is in a batch.
@@ -34,16 +34,7 @@ class ModulePolicy(Policy):
     """
 
     def __init__(self, portable: PortablePolicy, description: str | None = None) -> None:
-        action_space = space_from_description(portable.action_space)
-        super().__init__(
-            space_from_description(portable.observation_space),
-            action_space,
-            env_id=portable.env_id,
-            env_args=portable.env_args,
-            description=description or f"{portable.algorithm.upper()} on {portable.env_id}",
-        )
-        self.portable = portable
-        self._to_actions = action_function(portable, action_space)
+        super().__init__(portable, description)
         assert portable.network.module is not None  # read_policy and save_policy have checked it
         self.module = self._build(portable.network.module)
 
@@ -68,10 +59,6 @@ class ModulePolicy(Policy):
             ) from error
         module.eval()
         return module
-
-    def check_finite(self) -> None:
-        """See `Policy.check_finite`."""
-        check_finite_tensors(self.portable.network, self.description)
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         if len(observations) == 0:

@@ -117,14 +117,11 @@ class Policy(ABC):
         """Actions for observations of shape (num, ...)."""
 
 
-class NetworkPolicy(Policy):
-    """Greedy actions of a portable network.
-
-    The result for an observation does not depend on what else is in its batch, to the last bit, so an episode
-    is the same one whether it is evaluated alone, beside others, or filmed.
+class WeightsPolicy(Policy):
+    """Greedy actions by the weights of a portable policy; the base of those that have any.
 
     Args:
-        portable: The network and its spaces.
+        portable: The weights and their spaces.
         description: Shown in captions; by default the algorithm and the env.
     """
 
@@ -138,12 +135,27 @@ class NetworkPolicy(Policy):
             description=description or f"{portable.algorithm.upper()} on {portable.env_id}",
         )
         self.portable = portable
-        self._forward = ForwardPass(portable.network)
         self._to_actions = action_function(portable, action_space)
 
     def check_finite(self) -> None:
         """See `Policy.check_finite`."""
         check_finite_tensors(self.portable.network, self.description)
+
+
+class NetworkPolicy(WeightsPolicy):
+    """Greedy actions of a portable network.
+
+    The result for an observation does not depend on what else is in its batch, to the last bit, so an episode
+    is the same one whether it is evaluated alone, beside others, or filmed.
+
+    Args:
+        portable: The network and its spaces.
+        description: Shown in captions; by default the algorithm and the env.
+    """
+
+    def __init__(self, portable: PortablePolicy, description: str | None = None) -> None:
+        super().__init__(portable, description)
+        self._forward = ForwardPass(portable.network)
 
     def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
         """The network's raw output: logits, means and log standard deviations, or Q-values or advantages.
