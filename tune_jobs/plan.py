@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from policies.convolution import output_shape
 from policies.envs import EnvInfo, check_env
 from policies.errors import CannotRunError, SpecError
 from policies.hyperparams import (
@@ -318,8 +319,15 @@ def _num_weights(env: EnvInfo, values: Hyperparams) -> int:
         return 0
     space: Any = env.action_space
     num_outputs = 2 * int(space.n) if hasattr(space, "n") else 2 * math.prod(space.shape or ())
-    sizes = [math.prod(env.observation_space.shape or ()), *values.hidden_sizes, num_outputs + 1]
-    weights = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
+    shape = tuple(env.observation_space.shape or ())
+    weights = 0
+    if values.conv_filters is not None:
+        channels = [shape[-1], *(item[0] for item in values.conv_filters)]
+        for (inputs, outputs), (_, kernel, _) in zip(itertools.pairwise(channels), values.conv_filters, strict=True):
+            weights += (inputs * kernel**2 + 1) * outputs
+        shape = output_shape(shape, values.conv_filters)
+    sizes = [math.prod(shape), *values.hidden_sizes, num_outputs + 1]
+    weights += sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     networks = 1 if isinstance(values, DQNHyperparams) else 2  # PPO: policy and value function
     return networks * weights
 

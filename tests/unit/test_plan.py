@@ -177,6 +177,19 @@ def test_disk_grows_with_networks_checkpoints_and_trials():
     assert wide - least > 2 * 4 * 2 * 1e6 * 4 * 3
 
 
+def test_disk_counts_what_convolutions_make_of_an_image():
+    """64 channels of nearly every pixel are far more numbers than the image has."""
+    source = {
+        "env": {"id": "CartPole-v1", "pixels": True},
+        "algorithm": "dqn",
+        "hyperparams": {"hidden_sizes": [16], "conv_filters": [[64, 3, 1]]},
+    }
+    made = 38 * 58 * 64  # of 40 x 60 pixels
+    narrow = plan(source=source | {"hyperparams": {"hidden_sizes": [16], "conv_filters": [[4, 8, 4]]}}).max_disk_bytes
+    # 4 bytes a weight, in four checkpoints at least.
+    assert plan(source=source).max_disk_bytes - narrow > 4 * 4 * 16 * (made - 9 * 14 * 4)
+
+
 def test_notes_tell_what_may_not_be_meant():
     assert "repeats every point" in plan("space.lr=").notes[0]
     assert "below CartPole-v0's threshold 195" in plan("stop.training_return=100").notes[0]
