@@ -290,8 +290,11 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
 
 def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     """Most env steps of one iteration: all sub-environments step together, so the last step overshoots."""
-    wanted = _wanted_env_steps(values)
-    together = values.num_envs * max(1, spec.resources.num_env_runners)
+    wanted, num_runners = _wanted_env_steps(values), max(1, spec.resources.num_env_runners)
+    if isinstance(values, DQNHyperparams):
+        # It ends with a sampling phase, in which each runner makes its share of train_freq.
+        return wanted - 1 + num_runners * (math.ceil(values.train_freq / num_runners) - 1 + values.num_envs)
+    together = values.num_envs * num_runners
     return (math.ceil(wanted / together) + 1) * together
 
 

@@ -163,7 +163,10 @@ def test_env_steps_are_bounded_by_the_cap_and_one_iteration_a_trial():
     assert plan("num_samples=1").max_env_steps == 4 * (99_999 + 1_032)
     assert plan("num_samples=1", "stop.num_iterations=2").max_env_steps == 4 * 2 * 1_032
     dqn = {"env": "CartPole-v1", "algorithm": "dqn", "stop": {"num_env_steps": 5_000}}
-    assert plan(source=dqn).max_env_steps == 4_999 + 1_001
+    assert plan(source=dqn).max_env_steps == 4_999 + 999 + 4
+    # An iteration may end with a whole sampling phase more than it needs.
+    values = {"env_steps_per_iteration": 1_000, "train_freq": 256, "num_envs": 8}
+    assert plan(source=dqn | {"hyperparams": values}).max_env_steps == 4_999 + 999 + 255 + 8
 
 
 def test_disk_grows_with_networks_checkpoints_and_trials():
