@@ -1,0 +1,181 @@
+"""Many small networks as one: their weights stacked along a first axis, so that one batched product serves them all.
+
+Shapes: K networks, B rows a network, D numbers a row, L hidden layers, A outputs.
+
+The networks of a stack have the same activation and layer sizes. Smaller ones are padded with zeros, which is exact: a
+padded unit's input is 0 and every activation maps 0 to 0, so its output and the gradients of all padded weights are 0,
+and an optimizer that starts at 0 leaves them there.
+
+The backward pass is written out. On networks of this size torch's graph costs more than the products in it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+_aten = torch.ops.aten
+
+_FORWARD: dict[str, Callable[[Tensor], Tensor] | None] = {
+    "linear": None,
+    "relu": torch.relu_,
+    "tanh": torch.tanh_,
+    "silu": torch.nn.functional.silu,
+    "elu": torch.nn.functional.elu,
+    "gelu": torch.nn.functional.gelu,
+}
+_KEEPS_INPUT = frozenset({"silu", "elu", "gelu"})
+"""Activations whose derivative needs the input; the others' follows from the output, which is computed in place."""
+
+
+def _input_gradient(activation: str, gradient: Tensor, kept: Tensor) -> Tensor:
+    """Gradient of an activation's input, from that of its output and what the forward pass kept."""
+    if activation == "relu":
+        return _aten.threshold_backward(gradient, kept, 0)  # type: ignore[no-any-return]
+    if activation == "tanh":
+        return _aten.tanh_backward(gradient, kept)  # type: ignore[no-any-return]
+    if activation == "silu":
+        return _aten.silu_backward(gradient, kept)  # type: ignore[no-any-return]
+    if activation == "elu":
+        return _aten.elu_backward(gradient, 1.0, 1.0, 1.0, False, kept)  # type: ignore[no-any-return]  # noqa: FBT003
+    if activation == "gelu":
+        return _aten.gelu_backward(gradient, kept)  # type: ignore[no-any-return]
+    return gradient
+
+
+class StackedNetworks:
+    """K networks of dense layers; the activation after each but the last.
+
+    Args:
+        num_networks: K.
+        sizes: Inputs, units of each hidden layer, outputs.
+        activation: A name of `policies.hyperparams.ACTIVATIONS`.
+        device: Where the weights lie.
+
+    Attributes:
+        weights: All weights, shape (K, P); a layer's block is its matrix, then its bias as one more row.
+        gradients: Of the last `backward`, as the weights.
+        layers: Views of the weights, shape (K, inputs + 1, outputs) each.
+    """
+
+    def __init__(self, num_networks: int, sizes: Sequence[int], activation: str, device: str = "cpu") -> None:
+        self.num_networks, self.sizes, self.activation = num_networks, tuple(sizes), activation
+        num_weights = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
+        self.weights = torch.zeros(num_networks, num_weights, device=device)
+        self.gradients = torch.zeros_like(self.weights)
+        self.layers = self._views(self.weights)
+        self._gradient_layers = self._views(self.gradients)
+        self._function = _FORWARD[activation]
+        self._kept: list[tuple[Tensor, Tensor]] = []
+
+    def _views(self, flat: Tensor) -> list[Tensor]:
+        views, start = [], 0
+        for inputs, outputs in itertools.pairwise(self.sizes):
+            stop = start + (inputs + 1) * outputs
+            views.append(flat[:, start:stop].view(self.num_networks, inputs + 1, outputs))
+            start = stop
+        return views
+
+    def views_of(self, flat: Tensor) -> list[Tensor]:
+        """A tensor of shape (K, P) layer by layer, as `layers`."""
+        return self._views(flat)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs, shape (K, B, A), of inputs with a last column of ones, shape (K, B, D + 1)."""
+        self._kept = []
+        # The ones make the first bias a part of the product.
+        x = self._activate(x, torch.bmm(x, self.layers[0]))
+        for layer in self.layers[1:-1]:
+            x = self._activate(x, torch.baddbmm(layer[:, -1:], x, layer[:, :-1]))
+        self._kept.append((x, x))
+        last = self.layers[-1]
+        return torch.baddbmm(last[:, -1:], x, last[:, :-1])
+
+    def _activate(self, inputs: Tensor, x: Tensor) -> Tensor:
+        out = x if self._function is None else self._function(x)
+        self._kept.append((inputs, x if self.activation in _KEEPS_INPUT else out))
+        return out
+
+    def evaluate(self, x: Tensor, start: int, stop: int) -> Tensor:
+        """Outputs of the networks start to stop alone; keeps nothing for a `backward`."""
+        x = torch.bmm(x, self.layers[0][start:stop])
+        for layer in self.layers[1:]:
+            x = x if self._function is None else self._function(x)
+            x = torch.baddbmm(layer[start:stop, -1:], x, layer[start:stop, :-1])
+        return x
+
+    def backward(self, gradient: Tensor) -> None:
+        """Set `gradients` from that of the outputs of the last `forward`, shape (K, B, A)."""
+        x, _ = self._kept[-1]
+        self._set_gradients(-1, x, gradient)
+        for number in range(len(self.layers) - 2, -1, -1):
+            gradient = torch.bmm(gradient, self.layers[number + 1][:, :-1].transpose(1, 2))
+            x, kept = self._kept[number]
+            gradient = _input_gradient(self.activation, gradient, kept)
+            if number == 0:
+                torch.bmm(x.transpose(1, 2), gradient, out=self._gradient_layers[0])
+            else:
+                self._set_gradients(number, x, gradient)
+        self._kept = []
+
+    def _set_gradients(self, number: int, x: Tensor, gradient: Tensor) -> None:
+        views = self._gradient_layers[number]
+        torch.bmm(x.transpose(1, 2), gradient, out=views[:, :-1])
+        torch.sum(gradient, dim=1, out=views[:, -1])
+
+
+def with_ones(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Rows with a last column of ones: what `StackedNetworks.forward` takes."""
+    out = np.empty((*x.shape[:-1], x.shape[-1] + 1), dtype=np.float32)
+    out[..., :-1] = x
+    out[..., -1] = 1.0
+    return out
+
+
+class ActingNetworks:
+    """The forward pass in NumPy, for the few rows of one env step: each call costs a third of torch's.
+
+    Args:
+        networks: Whose weights are taken, at each `refresh`.
+        num_acting: The first so many networks act.
+    """
+
+    def __init__(self, networks: StackedNetworks, num_acting: int) -> None:
+        self._networks, self._num_acting = networks, num_acting
+        self._activation = networks.activation
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take over the weights as they are now."""
+        self._layers = []
+        for layer in self._networks.layers:
+            values = layer[: self._num_acting].detach().cpu().numpy()
+            self._layers.append((values[:, :-1], values[:, -1:]))
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Outputs, shape (num_acting, B, A), of inputs of shape (num_acting, B, D)."""
+        for matrix, bias in self._layers[:-1]:
+            x = np.matmul(x, matrix)
+            x += bias
+            x = _activate(self._activation, x)
+        matrix, bias = self._layers[-1]
+        out: NDArray[np.float32] = np.matmul(x, matrix)
+        out += bias
+        return out
+
+
+def _activate(activation: str, x: NDArray[np.float32]) -> NDArray[np.float32]:
+    if activation == "tanh":
+        return np.tanh(x, out=x)
+    if activation == "relu":
+        return np.maximum(x, np.float32(0.0), out=x)
+    if activation == "linear":
+        return x
+    function = _FORWARD[activation]
+    assert function is not None
+    return function(torch.from_numpy(x)).numpy()

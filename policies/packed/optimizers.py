@@ -1,0 +1,130 @@
+"""Adam and RMSprop over stacked weights, each row with settings of its own.
+
+The formulas are torch.optim's, so that an optimizer's state goes over into RLlib's and back.
+
+Shapes: K rows (networks), P weights a row.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class StackedOptimizer(Protocol):
+    """Moves weights of shape (K, P)."""
+
+    lr: Tensor
+    """(K, 1); may be set at any time."""
+    state: dict[str, Tensor]
+    """Name -> moments, shape (K, P)."""
+    num_steps: Tensor
+    """Steps each row has made, (K, 1), float64."""
+
+    def begin(self, num_updates: int) -> None:
+        """Prepare for so many steps: what does not depend on gradients is computed once for all of them."""
+        ...
+
+    def step(self, gradients: Tensor) -> None:
+        """Move the weights by one step."""
+        ...
+
+
+class StackedAdam:
+    """Adam (Kingma & Ba 2015, algorithm 1) as `torch.optim.Adam` computes it.
+
+    Args:
+        weights: (K, P); moved in place.
+        lr: (K, 1).
+        beta1: Decay of the mean gradient, (K, 1).
+        beta2: Decay of the squared gradient, (K, 1).
+        epsilon: (K, 1).
+    """
+
+    def __init__(self, weights: Tensor, lr: Tensor, beta1: Tensor, beta2: Tensor, epsilon: Tensor) -> None:
+        self.weights, self.lr = weights, lr
+        self._beta1, self._beta2, self._epsilon = beta1.double(), beta2.double(), epsilon
+        self._weight1, self._beta2_32, self._weight2 = (1 - beta1).float(), beta2.float(), (1 - beta2).float()
+        self.state = {"exp_avg": torch.zeros_like(weights), "exp_avg_sq": torch.zeros_like(weights)}
+        self.num_steps = torch.zeros_like(lr, dtype=torch.float64)
+        self._rates: list[tuple[Tensor, Tensor]] = []
+
+    def begin(self, num_updates: int) -> None:
+        """See `StackedOptimizer`; the learning rate is that of now."""
+        counts = self.num_steps + torch.arange(num_updates, 0, -1, dtype=torch.float64, device=self.lr.device).view(
+            -1, 1, 1
+        )
+        correction1, correction2 = 1 - self._beta1**counts, 1 - self._beta2**counts
+        rates = (self.lr.double() / correction1).float()
+        scales = correction2.rsqrt().float()
+        # Popped from the end: the first step is the last in the list.
+        self._rates = list(zip(rates.unbind(0), scales.unbind(0), strict=True))
+
+    def step(self, gradients: Tensor) -> None:
+        """See `StackedOptimizer`."""
+        if not self._rates:
+            self.begin(1)
+        rate, scale = self._rates.pop()
+        mean, square = self.state["exp_avg"], self.state["exp_avg_sq"]
+        mean.lerp_(gradients, self._weight1)
+        square.mul_(self._beta2_32)
+        square += gradients * gradients * self._weight2
+        denominator = square.sqrt()
+        denominator.mul_(scale).add_(self._epsilon)
+        torch.div(mean, denominator, out=denominator)
+        denominator.mul_(rate)
+        self.weights.sub_(denominator)
+        self.num_steps += 1
+
+
+class StackedRMSprop:
+    """RMSprop (Hinton 2012) as `torch.optim.RMSprop` computes it.
+
+    Args:
+        weights: (K, P); moved in place.
+        lr: (K, 1).
+        rho: Decay of the squared gradient, (K, 1).
+        momentum: (K, 1).
+        epsilon: (K, 1).
+    """
+
+    def __init__(self, weights: Tensor, lr: Tensor, rho: Tensor, momentum: Tensor, epsilon: Tensor) -> None:
+        self.weights, self.lr = weights, lr
+        self._rho, self._weight, self._momentum, self._epsilon = rho, 1 - rho, momentum, epsilon
+        self.state = {"square_avg": torch.zeros_like(weights), "momentum_buffer": torch.zeros_like(weights)}
+        self.num_steps = torch.zeros_like(lr, dtype=torch.float64)
+
+    def begin(self, num_updates: int) -> None:
+        """See `StackedOptimizer`: nothing."""
+
+    def step(self, gradients: Tensor) -> None:
+        """See `StackedOptimizer`."""
+        square, buffer = self.state["square_avg"], self.state["momentum_buffer"]
+        square.mul_(self._rho)
+        square += gradients * gradients * self._weight
+        update = gradients / (square.sqrt() + self._epsilon)
+        # Without momentum the buffer is the update itself, as in torch.
+        buffer.mul_(self._momentum).add_(update)
+        self.weights.sub_(buffer * self.lr)
+        self.num_steps += 1
+
+
+def clip_by_global_norm(gradients: Tensor, limit: Tensor, networks_per_member: int) -> Tensor:
+    """Scale each member's gradient to a global L2 norm of at most its limit, in place, as RLlib does.
+
+    Args:
+        gradients: (networks_per_member * M, P): the first networks of all members, then the second.
+        limit: (M, 1); infinity: no clipping.
+        networks_per_member: Networks that count as one.
+
+    Returns:
+        The norms before clipping, (M, 1).
+    """
+    norms: Tensor = torch.linalg.vector_norm(gradients.view(networks_per_member, -1, gradients.shape[1]), dim=2)
+    norms = torch.linalg.vector_norm(norms, dim=0).unsqueeze(1)
+    # An unlimited member's is inf / inf.
+    factors = torch.where(limit.isinf(), 1.0, (limit / torch.clamp(norms + 1e-6, min=limit)).clamp(max=1.0))
+    gradients.mul_(factors.repeat(networks_per_member, 1))
+    return norms

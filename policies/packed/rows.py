@@ -1,0 +1,74 @@
+"""Rows of a stack <-> members: building stacked networks and optimizers from members, and writing them back.
+
+Shapes: M members, n networks a member; row k * M + m is network k of member m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from policies.packed.member import Member, NetworkLayout, network_layouts, num_stack_outputs
+from policies.packed.networks import StackedNetworks
+from policies.packed.optimizers import StackedOptimizer
+
+
+class StackedRows:
+    """The networks of some members, from the members' own weights.
+
+    Args:
+        members: With as many layers each, and one activation.
+        num_inputs: Numbers of an observation.
+        num_outputs: Of a policy's head, or actions.
+        device: Where the weights lie.
+        prefix: Of the weights' names: that of the target networks, or none.
+    """
+
+    def __init__(
+        self, members: Sequence[Member], num_inputs: int, num_outputs: int, device: str, prefix: str = ""
+    ) -> None:
+        first = members[0].hyperparams
+        self._members, self._num_inputs, self._prefix = members, num_inputs, prefix
+        self._layouts = [network_layouts(member.hyperparams, num_outputs) for member in members]
+        self.networks_per_member = len(self._layouts[0])
+        hidden = [max(sizes) for sizes in zip(*(member.hyperparams.hidden_sizes for member in members), strict=True)]
+        sizes = (num_inputs, *hidden, num_stack_outputs(first, num_outputs))
+        self.networks = StackedNetworks(self.networks_per_member * len(members), sizes, first.activation, device)
+        for _, layers, member, layout in self._rows(self.networks.layers):
+            layout.write(layers, member.weights, prefix)
+
+    def _rows(self, layers: Sequence[Tensor]) -> Iterator[tuple[int, list[Tensor], Member, NetworkLayout]]:
+        for index, (member, layouts) in enumerate(zip(self._members, self._layouts, strict=True)):
+            for number, layout in enumerate(layouts):
+                row = number * len(self._members) + index
+                yield row, [layer[row] for layer in layers], member, layout
+
+    def per_row(self, value: Callable[[Member], float]) -> Tensor:
+        """A number of each member as a column over all rows, (n * M, 1)."""
+        return self.per_member(value).repeat(self.networks_per_member, 1)
+
+    def per_member(self, value: Callable[[Member], float]) -> Tensor:
+        """A number of each member, (M, 1)."""
+        values = [[value(member)] for member in self._members]
+        return torch.tensor(values, dtype=torch.float32, device=self.networks.weights.device)
+
+    def read_moments(self, optimizer: StackedOptimizer) -> None:
+        """Give the optimizer the members' moments and step counts."""
+        for name, flat in optimizer.state.items():
+            for row, layers, member, layout in self._rows(self.networks.views_of(flat)):
+                if name in member.moments:
+                    layout.write(layers, member.moments[name])
+                optimizer.num_steps[row] = member.num_optimizer_steps
+
+    def write_back(self, optimizer: StackedOptimizer | None = None) -> None:
+        """Give the members their weights as they are now, and their optimizer's state."""
+        for _, layers, member, layout in self._rows(self.networks.layers):
+            member.weights.update(layout.read(layers, self._num_inputs, self._prefix))
+        if optimizer is None:
+            return
+        for name, flat in optimizer.state.items():
+            for row, layers, member, layout in self._rows(self.networks.views_of(flat)):
+                member.moments.setdefault(name, {}).update(layout.read(layers, self._num_inputs))
+                member.num_optimizer_steps = int(optimizer.num_steps[row])

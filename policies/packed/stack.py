@@ -1,0 +1,51 @@
+"""What a stack is: members of a pack that share one tensor program."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from policies.hyperparams import DQNHyperparams, TrainedHyperparams
+from policies.packed.envs import PackedEnvs
+from policies.packed.member import Member, MemberStats
+
+
+class Stack(Protocol):
+    """Trains its members together. They may come and go between iterations; the others do not notice.
+
+    They are equal in `policies.packed.shape.shape_of` and in the environment.
+    """
+
+    envs: PackedEnvs
+    members: list[Member]
+    """In the order of their rows."""
+
+    def add(self, member: Member, env_seed: int) -> None:
+        """A further member; its episodes begin.
+
+        Raises:
+            EnvError: Its environments cannot be made or reset; it is no member then.
+        """
+        ...
+
+    def remove(self, member_id: str) -> Member:
+        """Take a member out, with its weights as they are now."""
+        ...
+
+    def member(self, member_id: str) -> Member:
+        """A member, with its weights as they are now."""
+        ...
+
+    def train_iteration(self) -> dict[str, MemberStats]:
+        """One iteration of every member, by id. Members in `envs.errors` have failed."""
+        ...
+
+
+def make_stack(hyperparams: TrainedHyperparams, envs: PackedEnvs, device: str = "cpu") -> Stack:
+    """A stack without members, for such hyperparameters."""
+    if isinstance(hyperparams, DQNHyperparams):
+        from policies.packed.dqn_stack import DQNStack
+
+        return DQNStack(envs, device)
+    from policies.packed.ppo_stack import PPOStack
+
+    return PPOStack(envs, device)

@@ -1,0 +1,114 @@
+"""A member on disk: safetensors and JSON, nothing that is executed when it is read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from policies.errors import CheckpointError
+from policies.files import write_atomic
+from policies.hyperparams import Algorithm, PPOHyperparams, make_hyperparams
+from policies.packed.member import Member, Weights
+
+STATE_FOLDER = "packed"
+_FORMAT_VERSION = 1
+_TENSORS, _JSON = "state.safetensors", "state.json"
+_COUNTERS = (
+    "num_optimizer_steps", "num_env_steps", "num_episodes", "num_iterations", "num_updates", "kl_coeff", "due",
+    "target_updates_at", "num_target_updates",
+)  # fmt: skip
+_WEIGHTS = "weights"
+_HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
+
+
+def save_member(member: Member, folder: Path) -> None:
+    """Write a member into a folder, which is made.
+
+    Args:
+        member: With its weights written back.
+        folder: Where `state.safetensors` and `state.json` will lie.
+    """
+    from safetensors.numpy import save
+
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {f"{_WEIGHTS}/{name}": np.ascontiguousarray(value) for name, value in member.weights.items()}
+    for moment, weights in member.moments.items():
+        tensors |= {f"{moment}/{name}": np.ascontiguousarray(value) for name, value in weights.items()}
+    description = {
+        "format_version": _FORMAT_VERSION,
+        "algorithm": "ppo" if isinstance(member.hyperparams, PPOHyperparams) else "dqn",
+        "hyperparams": member.hyperparams.model_dump(mode="json"),
+        "seed": member.seed,
+        "counters": {name: getattr(member, name) for name in _COUNTERS},
+        "rng": member.rng.bit_generator.state,
+    }
+    write_atomic(folder / _TENSORS, save(tensors))
+    write_atomic(folder / _JSON, json.dumps(description, indent=1) + "\n")
+
+
+def load_member(folder: Path, member_id: str) -> Member:
+    """Read a member.
+
+    Args:
+        folder: What `save_member` wrote; callers check the manifest's hashes first.
+        member_id: Its name from now on.
+
+    Raises:
+        CheckpointError: Something is missing or damaged, or was written by a newer version.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        description: dict[str, Any] = json.loads((folder / _JSON).read_bytes())
+        tensors = load((folder / _TENSORS).read_bytes())
+        if description["format_version"] > _FORMAT_VERSION:
+            raise CheckpointError(
+                f"{folder / _JSON} has format version {description['format_version']}; this tune-jobs reads up to "
+                f"{_FORMAT_VERSION}.",
+                "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
+            )
+        hyperparams = make_hyperparams(cast("Algorithm", description["algorithm"]), description["hyperparams"])
+        rng = np.random.Generator(np.random.PCG64())
+        rng.bit_generator.state = description["rng"]
+        parts: dict[str, Weights] = {}
+        for name, value in tensors.items():
+            part, _, weight = name.partition("/")
+            parts.setdefault(part, {})[weight] = value
+        return Member(
+            member_id,
+            cast("Any", hyperparams),
+            int(description["seed"]),
+            weights=parts.pop(_WEIGHTS),
+            moments=parts,
+            rng=rng,
+            **{name: description["counters"][name] for name in _COUNTERS},
+        )
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise CheckpointError(f"{folder} does not hold a member's state: {error!r}.", _HINT) from error
+
+
+def check_shapes(member: Member, expected: Weights) -> None:
+    """Check that a member's weights are those of the network its hyperparameters describe.
+
+    Args:
+        member: As it was read.
+        expected: Weights of a new member with the same hyperparameters.
+
+    Raises:
+        CheckpointError: They are not.
+    """
+    for part, weights in {_WEIGHTS: member.weights, **member.moments}.items():
+        for name, value in weights.items():
+            known = expected.get(name)
+            if known is None or known.shape != value.shape:
+                shape = "none" if known is None else known.shape
+                raise CheckpointError(
+                    f"The saved {part} {name} have shape {value.shape}, the network's have {shape}.", _HINT
+                )
+    missing = sorted(set(expected) - set(member.weights))
+    if missing:
+        raise CheckpointError(f"The saved weights lack {', '.join(missing)}.", _HINT)

@@ -1,0 +1,142 @@
+"""A member of a pack as an RLlib `Algorithm` that trains on, and as a portable policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
+
+from policies.dqn_algorithm import ReplayDQN
+from policies.errors import CheckpointError
+from policies.hyperparams import PPOHyperparams
+from policies.packed.member import Member
+from policies.packed.state import STATE_FOLDER, load_member
+from policies.policy_network import PolicyNetwork
+from policies.portable import PortablePolicy, describe_space, read_policy
+from policies.restore import check_weights, network_from_weights
+from policies.rllib_config import build_algorithm_config
+
+
+def portable_policy(
+    member: Member,
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any],
+    training: Mapping[str, Any],
+) -> PortablePolicy:
+    """The greedy policy of a member, with its weights written back."""
+    return PortablePolicy(
+        network=network_from_weights(member.weights, member.hyperparams, observation_space, action_space),
+        algorithm="ppo" if isinstance(member.hyperparams, PPOHyperparams) else "dqn",
+        env_id=env_id,
+        env_args=dict(env_args),
+        observation_space=describe_space(observation_space),
+        action_space=describe_space(action_space),
+        action_transform="unsquash" if isinstance(action_space, gym.spaces.Box) else "none",
+        training=dict(training),
+    )
+
+
+def algorithm_from_checkpoint(
+    checkpoint: Path, *, failure_penalty: float | None = None, num_env_runners: int = 0, num_gpus: float = 0.0
+) -> Algorithm:
+    """A checkpoint of the packed engine as an RLlib Algorithm that trains on from it.
+
+    Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's;
+    random numbers are others, and a replay memory is empty.
+
+    Args:
+        checkpoint: A checkpoint folder of a trial.
+        failure_penalty: As `build_algorithm_config`.
+        num_env_runners: As `build_algorithm_config`.
+        num_gpus: As `build_algorithm_config`.
+
+    Raises:
+        NotFoundError: There is none.
+        CheckpointError: It is damaged, or the Algorithm does not hold the checkpoint's weights afterwards.
+    """
+    saved = read_policy(checkpoint)
+    member = load_member(checkpoint / STATE_FOLDER, checkpoint.name)
+    return to_algorithm(
+        member,
+        env_id=saved.env_id,
+        env_args=saved.env_args,
+        expected=saved.network,
+        failure_penalty=failure_penalty,
+        num_env_runners=num_env_runners,
+        num_gpus=num_gpus,
+    )
+
+
+def to_algorithm(
+    member: Member, *, env_id: str, env_args: dict[str, Any], expected: PolicyNetwork | None = None, **settings: Any
+) -> Algorithm:
+    """A member, with its weights written back, as an RLlib Algorithm.
+
+    Args:
+        member: Of PPO or DQN.
+        env_id: Its environment.
+        env_args: Of the environment.
+        expected: The network it must act with.
+        settings: Further arguments of `build_algorithm_config`.
+
+    Raises:
+        CheckpointError: The weights are not those of the network the hyperparameters describe, or not the expected.
+    """
+    words = np.random.SeedSequence([member.seed, member.num_iterations]).generate_state(1)
+    seed = int(words[0]) % 2**31 if member.num_iterations else member.seed
+    algorithm = build_algorithm_config(
+        member.hyperparams, env_id=env_id, env_args=env_args, seed=seed, **settings
+    ).build_algo()
+    try:
+        _take_over(algorithm, member)
+        if expected is not None:
+            check_weights(algorithm, expected)
+    except CheckpointError:
+        algorithm.stop()
+        raise
+    except Exception as error:
+        algorithm.stop()
+        raise CheckpointError(
+            f"The state of {member.member_id} does not go into RLlib's networks: {error!r}.",
+            "Use another checkpoint of the trial; this one cannot be gone on from.",
+        ) from error
+    return algorithm
+
+
+def _take_over(algorithm: Algorithm, member: Member) -> None:
+    learner = algorithm.learner_group._learner  # noqa: SLF001 - RLlib has no public way to the local one
+    module = learner.module[DEFAULT_MODULE_ID].unwrapped()
+    module.load_state_dict({name: torch.as_tensor(value) for name, value in member.weights.items()})
+    params = dict(module.named_parameters())
+    for _, optimizer in learner.get_optimizers_for_module(DEFAULT_MODULE_ID):
+        for name, param in params.items():
+            moments = {
+                moment: torch.as_tensor(weights[name]).to(param.device)
+                for moment, weights in member.moments.items()
+                if name in weights
+            }
+            if moments:
+                optimizer.state[param] = {"step": torch.tensor(float(member.num_optimizer_steps)), **moments}
+    algorithm.env_runner_group.sync_weights(from_worker_or_learner_group=algorithm.learner_group, inference_only=True)
+    algorithm._iteration = member.num_iterations  # noqa: SLF001 - RLlib sets it only from its own checkpoints
+    algorithm.metrics.log_value(
+        (ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME), member.num_env_steps, reduce="lifetime_sum"
+    )
+    if isinstance(algorithm, ReplayDQN):
+        algorithm.num_env_steps, algorithm.num_episodes = member.num_env_steps, member.num_episodes
+        algorithm.num_updates = member.num_updates
+        learner.target_updates_at = member.target_updates_at
+        learner.num_target_updates = member.num_target_updates
+    else:
+        for coefficient in learner.curr_kl_coeffs_per_module.values():
+            coefficient.data.fill_(member.kl_coeff)
