@@ -6,7 +6,7 @@ Names of weights are those of `policies.networks`' modules, so that a member can
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -150,16 +150,25 @@ def size_class(num_units: int) -> int:
     return size
 
 
-def group_members(members: Sequence[Member]) -> list[list[Member]]:
-    """Members whose networks are computed together: of the same activation and about the same sizes."""
+def group_members(
+    members: Sequence[Member], max_size: int = MAX_GROUP, also: Callable[[Member], Any] = lambda _: 0
+) -> list[list[Member]]:
+    """Members whose networks are computed together: of the same activation and about the same sizes.
 
-    def key(member: Member) -> tuple[str, tuple[int, ...]]:
-        return member.hyperparams.activation, tuple(map(size_class, member.hyperparams.hidden_sizes))
+    Args:
+        members: All of a stack.
+        max_size: Of a group.
+        also: What else the members of a group have in common; sortable.
+    """
+
+    def key(member: Member) -> tuple[str, tuple[int, ...], Any]:
+        sizes = tuple(map(size_class, member.hyperparams.hidden_sizes))
+        return member.hyperparams.activation, sizes, also(member)
 
     groups = []
     for _, alike in itertools.groupby(sorted(members, key=key), key=key):
         found = list(alike)
-        num_groups = -(-len(found) // MAX_GROUP)
+        num_groups = -(-len(found) // max_size)
         bounds = [len(found) * number // num_groups for number in range(num_groups + 1)]
         groups += [found[start:stop] for start, stop in itertools.pairwise(bounds)]
     return groups

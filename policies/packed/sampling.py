@@ -97,6 +97,16 @@ class Observations:
         np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP, out=scaled)
         return scaled
 
+    def prepare_rows(self, rows: Floats, num_inputs: int) -> Floats:
+        """Rows of a replay memory, (M, B, columns), with their observations prepared in place."""
+        if self._normalizes:
+            for first in (0, num_inputs + 1):
+                columns = rows[..., first : first + num_inputs]
+                columns -= self._mean
+                columns *= self._factor
+                np.clip(columns, -OBSERVATION_CLIP, OBSERVATION_CLIP, out=columns)
+        return rows
+
     def part(self, start: int, stop: int) -> Observations:
         """Of the members start to stop alone."""
         return Observations(self._members[start:stop], self._num_envs, normalizes=self._normalizes)

@@ -10,8 +10,7 @@ from typing import cast
 import numpy as np
 import torch
 
-from policies.envs import check_env
-from policies.errors import CannotRunError, CheckpointError, TuneJobsError
+from policies.errors import CheckpointError
 from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.envs import EnvKind, choose_kind, make_packed_envs
 from policies.packed.initial import new_member

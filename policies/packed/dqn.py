@@ -1,0 +1,83 @@
+"""DQN's loss of many members at once, and its gradient.
+
+Sources: Mnih et al. 2015; van Hasselt et al. 2016 (double Q-learning); Wang et al. 2016, equation 9 (dueling).
+
+Shapes: M members, B rows, A actions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from policies.hyperparams import DQNHyperparams
+
+
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """What one update's forward passes give."""
+
+    gradient: Tensor
+    """Of each member's loss with respect to the network's outputs, (M, B, outputs)."""
+    td_errors: Tensor
+    """Q(s, a) minus its target, (M, B)."""
+    q_selected: Tensor
+    """Q(s, a), (M, B)."""
+
+
+def q_values(outputs: Tensor, num_actions: int) -> Tensor:
+    """Q, (M, B, A), of a network's outputs: Q-values, or advantages and a value if dueling."""
+    if outputs.shape[-1] == num_actions:
+        return outputs
+    advantages = outputs[..., :num_actions]
+    return outputs[..., num_actions:] + advantages - advantages.mean(dim=-1, keepdim=True)
+
+
+def best_next_values(target_q: Tensor, online_q: Tensor | None) -> Tensor:
+    """Q' of the best next action, (M, B): the best by Q' itself or, for double Q-learning, by the online network."""
+    if online_q is None:
+        return target_q.amax(dim=-1)
+    return target_q.gather(-1, online_q.argmax(dim=-1, keepdim=True)).squeeze(-1)
+
+
+def loss_gradient(
+    outputs: Tensor, actions: Tensor, targets: Tensor, weights: Tensor | None, hyperparams: DQNHyperparams
+) -> Loss:
+    """The gradient of each member's mean loss.
+
+    Args:
+        outputs: Of the online network for the observations, (M, B, outputs).
+        actions: (M, B), whole numbers.
+        targets: (M, B).
+        weights: Importance weights, (M, B); None: all 1.
+        hyperparams: Of any member; all have the same `td_loss` and `dueling`.
+    """
+    num_actions = outputs.shape[-1] - hyperparams.dueling
+    index = actions.unsqueeze(-1)
+    q_selected = q_values(outputs, num_actions).gather(-1, index).squeeze(-1)
+    td_errors = q_selected - targets
+    slope = td_errors.clamp(-1.0, 1.0) if hyperparams.td_loss == "huber" else 2.0 * td_errors
+    if weights is not None:
+        slope = slope * weights
+    slope = (slope / td_errors.shape[1]).unsqueeze(-1)
+    gradient = torch.zeros_like(outputs)
+    if hyperparams.dueling:
+        # Q = V + A - mean A: every advantage has a part in the mean.
+        gradient[..., :num_actions] = slope / -num_actions
+        gradient[..., num_actions:] = slope
+        gradient[..., :num_actions].scatter_add_(-1, index, slope)
+    else:
+        gradient.scatter_(-1, index, slope)
+    return Loss(gradient, td_errors, q_selected)
+
+
+def mean_loss(td_errors: Tensor, weights: Tensor | None, hyperparams: DQNHyperparams) -> Tensor:
+    """Each member's loss, (M,)."""
+    if hyperparams.td_loss == "huber":
+        small = td_errors.abs()
+        rows = torch.where(small <= 1.0, 0.5 * td_errors**2, small - 0.5)
+    else:
+        rows = td_errors**2
+    return (rows if weights is None else rows * weights).mean(dim=1)
