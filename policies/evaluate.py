@@ -77,10 +77,24 @@ class Evaluator:
         max_episode_steps: int | None = None,
     ) -> None:
         self.seeds = check_seeds(seeds)
-        self._env_id, self._env_args = env_id, dict(env_args or {})
-        self._envs = [make_env(env_id, self._env_args)]
+        self.env_id, self.env_args = env_id, dict(env_args or {})
+        self._envs = [make_env(env_id, self.env_args)]
         self.max_episode_steps = episode_cap(self._envs[0], max_episode_steps)
-        self._cartpoles = _CartPoles.make_if_cartpole(self._envs[0], env_id, self._env_args, self.seeds)
+        self._cartpoles = _CartPoles.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)
+
+    @property
+    def cartpole_starts(self) -> NDArray[np.float64] | None:
+        """CartPole's start states by seed, shape (num_seeds, 4); None: it is another env, or has wrappers."""
+        return None if self._cartpoles is None else self._cartpoles.start_states
+
+    def check(self, policy: Policy) -> None:
+        """Check that a policy can be run.
+
+        Raises:
+            NonFiniteWeightsError: Its weights are NaN or infinite.
+            EnvError: It is for other observations or actions.
+        """
+        check_policy(policy, self._envs[0])
 
     def run(self, policy: Policy) -> Episodes:
         """One greedy episode a seed.
@@ -89,7 +103,7 @@ class Evaluator:
             NonFiniteWeightsError: The policy's weights are NaN or infinite.
             EnvError: The policy is for other observations or actions, or the env raised an error.
         """
-        check_policy(policy, self._envs[0])
+        self.check(policy)
         if isinstance(policy, Resettable):
             # It draws numbers in the order of its calls, so its episodes must be played one after the other.
             results = [self._play_alone(policy, seed) for seed in self.seeds]
@@ -117,7 +131,7 @@ class Evaluator:
     def _play_side_by_side(self, policy: Policy) -> list[tuple[float, int]]:
         """Several envs at once, so that the network sees a batch; a free env takes the next seed."""
         while len(self._envs) < min(len(self.seeds), _MAX_ENVS):
-            self._envs.append(make_env(self._env_id, self._env_args))
+            self._envs.append(make_env(self.env_id, self.env_args))
         waiting = deque(enumerate(self.seeds))
         results: dict[int, tuple[float, int]] = {}
         running = [_Running(env, *waiting.popleft()) for env in self._envs[: len(self.seeds)]]
@@ -291,7 +305,7 @@ class _CartPoles:
 
     def __init__(self, env: Any, start_states: NDArray[np.float64]) -> None:
         self._env = env
-        self._start_states = start_states  # shape (num_seeds, 4)
+        self.start_states = start_states  # shape (num_seeds, 4)
 
     @classmethod
     def make_if_cartpole(
@@ -318,8 +332,8 @@ class _CartPoles:
         """One episode a start state: return and length of each."""
         num_envs: int = self._env.num_envs
         results: list[tuple[float, int]] = []
-        for first in range(0, len(self._start_states), num_envs):
-            chunk = self._start_states[first : first + num_envs]
+        for first in range(0, len(self.start_states), num_envs):
+            chunk = self.start_states[first : first + num_envs]
             results += self._play_chunk(policy, chunk, max_episode_steps)
         return results
 

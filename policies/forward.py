@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +30,26 @@ class ForwardPass:
         self._scale = None if network.scale == 1.0 else np.float32(network.scale)
         self._normalize = None if network.normalization is None else _Normalize(network.normalization)
         self._conv = [_Conv(layer) for layer in network.conv]
-        self._layers = [_Linear(layer) for layer in network.layers]
+        self.layers = [_Linear(layer) for layer in network.layers]
+
+    @property
+    def prepares(self) -> bool:
+        """Whether `prepare` does anything."""
+        return self._scale is not None or self._normalize is not None
+
+    def prepare(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Scaled and normalised observations."""
+        x = observations
+        if self._scale is not None:
+            x = x * self._scale
+        return x if self._normalize is None else self._normalize(x)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
         """Outputs, shape (num, num_outputs), for observations of shape (num, ...)."""
         if self._conv and len(observations) > _IMAGES_AT_ONCE:
             parts = range(0, len(observations), _IMAGES_AT_ONCE)
             return np.concatenate([self(observations[first : first + _IMAGES_AT_ONCE]) for first in parts])
-        x = observations
-        if self._scale is not None:
-            x = x * self._scale
-        if self._normalize is not None:
-            x = self._normalize(x)
+        x = self.prepare(observations)
         if self._conv:
             for conv in self._conv:
                 x = conv(x)
@@ -47,8 +58,49 @@ class ForwardPass:
         # takes other BLAS kernels at other batch sizes, whose results differ in the last bit. It costs no
         # more at these sizes.
         x = x[:, None, :] if x.ndim == 2 else x.reshape(len(x), 1, math.prod(x.shape[1:]))
-        for layer in self._layers:
+        for layer in self.layers:
             x = layer(x)
+        return x[:, 0, :]
+
+
+class ForwardPasses:
+    """Several networks at once, each for observations of its own; the bits are those of a `ForwardPass` each.
+
+    Args:
+        passes: Of networks with layers and without convolutions, all of one `layout`.
+    """
+
+    def __init__(self, passes: Sequence[ForwardPass]) -> None:
+        self._passes = passes
+        self._layers = [_Linears(linears) for linears in zip(*(one.layers for one in passes), strict=True)]
+
+    def choose(self, places: Sequence[int]) -> ForwardPasses:
+        """Some of these networks alone."""
+        return ForwardPasses([self._passes[place] for place in places])
+
+    @staticmethod
+    def layout(network: PolicyNetwork) -> tuple[Any, ...]:
+        """What networks must have in common to be computed at once; empty if a network cannot be."""
+        if network.conv or not network.layers:
+            return ()
+        layers = tuple((layer.weight.shape, layer.activation) for layer in network.layers)
+        return (network.scale != 1.0 or network.normalization is not None, layers)
+
+    def __call__(self, observations: NDArray[np.float32], counts: Sequence[int]) -> NDArray[np.float32]:
+        """Outputs, shape (num, num_outputs).
+
+        Args:
+            observations: Shape (num, n): those for the first network, then those for the second, and so on.
+            counts: How many there are for each.
+        """
+        bounds = list(itertools.pairwise(itertools.accumulate(counts, initial=0)))
+        x = observations
+        if self._passes[0].prepares:
+            parts = zip(self._passes, bounds, strict=True)
+            x = np.concatenate([one.prepare(x[first:last]) for one, (first, last) in parts])
+        x = x[:, None, :]
+        for layer in self._layers:
+            x = layer(x, bounds)
         return x[:, 0, :]
 
 
@@ -79,14 +131,43 @@ class _Linear:
     """A layer, its weights transposed once into the order that the product wants."""
 
     def __init__(self, layer: Layer) -> None:
-        self._matrix = np.ascontiguousarray(layer.weight.T, dtype=np.float32)
-        self._bias = np.asarray(layer.bias, dtype=np.float32)
-        self._activation = _ACTIVATION_FUNCTIONS[layer.activation]
+        self.matrix = np.ascontiguousarray(layer.weight.T, dtype=np.float32)
+        self.bias = np.asarray(layer.bias, dtype=np.float32)
+        self.activation = _ACTIVATION_FUNCTIONS[layer.activation]
 
     def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        x = np.matmul(x, self._matrix)
-        x += self._bias
-        return x if self._activation is None else self._activation(x)
+        x = np.matmul(x, self.matrix)
+        x += self.bias
+        return x if self.activation is None else self.activation(x)
+
+
+class _Linears:
+    """A layer of several networks."""
+
+    def __init__(self, linears: Sequence[_Linear]) -> None:
+        self._linears = linears
+        self._activation = linears[0].activation
+
+    @functools.cached_property
+    def _stack(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """All matrices and all biases, with a 1 for what they are multiplied by in between."""
+        matrices, biases = ([getattr(linear, name) for linear in self._linears] for name in ("matrix", "bias"))
+        return np.stack(matrices)[:, None], np.stack(biases)[:, None, None]
+
+    def __call__(self, x: NDArray[np.float32], bounds: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
+        if len({last - first for first, last in bounds}) == 1:
+            # As many observations for each network: one call, of the same vector-matrix products.
+            matrices, biases = self._stack
+            y = np.matmul(x.reshape(len(bounds), -1, 1, x.shape[-1]), matrices)
+            y += biases
+            y = y.reshape(len(x), 1, -1)
+        else:
+            y = np.empty((len(x), 1, len(self._linears[0].bias)), dtype=np.float32)
+            for linear, (first, last) in zip(self._linears, bounds, strict=True):
+                part = y[first:last]
+                np.matmul(x[first:last], linear.matrix, out=part)
+                part += linear.bias
+        return y if self._activation is None else self._activation(y)
 
 
 def _relu(x: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,0 +1,134 @@
+"""Greedy episodes of many policies at once.
+
+Each policy gets the very episodes, to the last bit, that `Evaluator.run` gives it. In CartPole the episodes of all
+policies are stepped in one object, and networks of equal layers are computed together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.errors import TuneJobsError
+from policies.evaluate import Episodes, Evaluator
+from policies.forward import ForwardPass, ForwardPasses
+from policies.packed.cartpole_envs import CartPoleRows
+from policies.policy import ActionSpace, NetworkPolicy, Policy, action_function
+
+_MAX_ROWS = 4096
+"""Episodes at once; more would take memory and save nothing."""
+
+Result = Episodes | Exception
+
+
+def evaluate_many(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Result]:
+    """One greedy episode a seed, of each policy.
+
+    Args:
+        evaluator: Env and seeds.
+        policies: What acts.
+
+    Returns:
+        For each policy what `evaluator.run` returns, or the error that it raises: `NonFiniteWeightsError` or
+        `EnvError`.
+    """
+    results: dict[int, Result] = {}
+    by_layout: dict[tuple[Any, ...], list[int]] = {}
+    for index, policy in enumerate(policies):
+        layout = _layout(evaluator, policy)
+        try:
+            if layout:
+                evaluator.check(policy)
+                by_layout.setdefault(layout, []).append(index)
+            else:
+                results[index] = evaluator.run(policy)
+        except TuneJobsError as error:
+            results[index] = error
+    joint = [index for indexes in by_layout.values() for index in indexes]
+    at_once = max(1, _MAX_ROWS // len(evaluator.seeds))
+    for first in range(0, len(joint), at_once):
+        some = joint[first : first + at_once]
+        results |= zip(some, _play_cartpoles(evaluator, [policies[index] for index in some]), strict=True)
+    return [results[index] for index in range(len(policies))]
+
+
+def _layout(evaluator: Evaluator, policy: Policy) -> tuple[Any, ...]:
+    """What policies that are computed together have in common; empty: this one has its episodes alone."""
+    # Exactly this class: one of somebody's own may act otherwise.
+    if evaluator.cartpole_starts is None or type(policy) is not NetworkPolicy:
+        return ()
+    return ForwardPasses.layout(policy.portable.network)
+
+
+class _Group:
+    """Policies of one layout that still have running episodes."""
+
+    def __init__(self, policies: dict[int, NetworkPolicy]) -> None:
+        self.indexes = list(policies)
+        self._forward = ForwardPasses([ForwardPass(policy.portable.network) for policy in policies.values()])
+        # All of them act in the same env, so what makes actions of outputs is the same.
+        one = next(iter(policies.values()))
+        self._to_actions = action_function(one.portable, cast("ActionSpace", one.action_space))
+
+    def act(self, observations: NDArray[np.float32], counts: NDArray[np.intp]) -> NDArray[Any]:
+        """Actions for the observations of each policy, `counts` of each."""
+        return self._to_actions(self._forward(observations, counts.tolist()))
+
+    def keep(self, counts: NDArray[np.intp]) -> None:
+        """Leave out the policies whose count is 0."""
+        if not counts.all():
+            places = np.flatnonzero(counts).tolist()
+            self.indexes = [self.indexes[place] for place in places]
+            self._forward = self._forward.choose(places)
+
+
+def _play_cartpoles(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Episodes]:
+    """The episodes of policies that are sorted by their layouts; all of them in one object.
+
+    Rows are the running episodes, those of the first policy first.
+    """
+    starts, num_seeds = evaluator.cartpole_starts, len(evaluator.seeds)
+    cartpoles = CartPoleRows.make(evaluator.env_id, evaluator.env_args)
+    assert starts is not None
+    assert cartpoles is not None
+    by_layout: dict[Any, dict[int, NetworkPolicy]] = {}
+    for index, policy in enumerate(policies):
+        assert isinstance(policy, NetworkPolicy)
+        by_layout.setdefault(_layout(evaluator, policy), {})[index] = policy
+    groups = [_Group(members) for members in by_layout.values()]
+    returns, lengths = np.zeros(len(policies) * num_seeds), np.zeros(len(policies) * num_seeds, dtype=np.int64)
+    episodes = np.arange(len(returns))  # of each row: policy * num_seeds + seed
+    counts = np.full(len(policies), num_seeds, dtype=np.intp)
+    states = np.tile(starts, (len(policies), 1))
+    cartpoles.put(states, np.zeros(len(states), dtype=np.int32))
+    observations = states.astype(np.float32)
+    for _ in range(evaluator.max_episode_steps):
+        actions, first = [], 0
+        for group in groups:
+            count = counts[group.indexes]
+            last = first + int(count.sum())
+            actions.append(group.act(observations[first:last], count))
+            first = last
+        observations, rewards, _, _, ended = cartpoles.step(np.concatenate(actions))
+        returns[episodes] += rewards
+        lengths[episodes] += 1
+        if ended.any():
+            rows = np.flatnonzero(~ended)
+            cartpoles.put(cartpoles.states[rows], cartpoles.lengths[rows])
+            observations, episodes = observations[rows], episodes[rows]
+            counts = np.bincount(episodes // num_seeds, minlength=len(policies))
+            for group in groups:
+                group.keep(counts[group.indexes])
+            groups = [group for group in groups if group.indexes]
+            if not groups:
+                break
+    cartpoles.close()
+    return [
+        Episodes(evaluator.seeds, tuple(totals), tuple(steps))
+        for totals, steps in zip(
+            returns.reshape(-1, num_seeds).tolist(), lengths.reshape(-1, num_seeds).tolist(), strict=True
+        )
+    ]

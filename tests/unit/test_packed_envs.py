@@ -1,0 +1,526 @@
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import traceback
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
+from odd_envs import EXIT, RAISE, WRONG_SHAPE
+from policy_factory import register_test_envs
+
+from policies.env_modules import allow_modules
+from policies.envs import make_env
+from policies.errors import EnvError
+from policies.packed.envs import check_seedable, choose_kind, make_packed_envs
+
+register_test_envs()
+allow_modules(["odd_envs"])
+
+N = 3
+KINDS = [
+    pytest.param("CartPole-v1", "vectorised", id="cartpole-vectorised"),
+    pytest.param("CartPole-v1", "scalar", id="cartpole-scalar"),
+    pytest.param("Pendulum-v1", "scalar", id="pendulum-scalar"),
+    pytest.param("Pendulum-v1", "processes", id="pendulum-processes"),
+]
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def make_one(env_id, kind, num_envs=N, env_args=None, members=(), **kwargs):
+        envs = make_packed_envs(env_id, env_args, num_envs, kind=kind, **kwargs)
+        made.append(envs)
+        for member_id, seed in dict(members).items():
+            envs.add(member_id, seed)
+        return envs
+
+    yield make_one
+    for envs in made:
+        envs.close()
+    assert multiprocessing.active_children() == []
+
+
+class Actor:
+    """The actions of one member: the same ones again for the same seed."""
+
+    def __init__(self, space, seed, num_envs=N):
+        self.space, self.rng, self.num_envs = space, np.random.default_rng(seed), num_envs
+
+    def __call__(self):
+        if isinstance(self.space, gym.spaces.Discrete):
+            return self.rng.integers(0, self.space.n, self.num_envs)
+        size = (self.num_envs, *self.space.shape)
+        return self.rng.uniform(self.space.low, self.space.high, size).astype(np.float32)
+
+
+def step_all(envs, actors):
+    return envs.step(np.concatenate([actors[member_id]() for member_id in envs.member_ids]))
+
+
+def rows_of(envs, member_id, num_envs=N):
+    first = envs.member_ids.index(member_id) * num_envs
+    return slice(first, first + num_envs)
+
+
+def seen_by(envs, step, member_id):
+    rows = rows_of(envs, member_id)
+    names = ("observations", "final_observations", "rewards", "own_rewards", "terminated", "truncated")
+    return {name: getattr(step, name)[rows].copy() for name in names}
+
+
+def assert_equal_bits(one, another):
+    assert len(one) == len(another)
+    for left, right in zip(one, another, strict=True):
+        for name, values in left.items():
+            np.testing.assert_array_equal(values, right[name], err_msg=name)
+
+
+# -- CartPole's vectorised version
+
+
+@pytest.mark.parametrize("env_args", [{"max_episode_steps": 25}, {"sutton_barto_reward": True}])
+def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make, env_args):
+    envs = make("CartPole-v1", "vectorised", env_args=env_args, members={"a": 1, "b": 2})
+    scalars = [make_env("CartPole-v1", env_args) for _ in range(2 * N)]
+
+    def restart(row):
+        scalars[row].reset(seed=0)
+        scalars[row].unwrapped.state = envs._rows.states[row].copy()
+
+    for row in range(2 * N):
+        restart(row)
+    rng = np.random.default_rng(0)
+    num_ended = {"terminated": 0, "truncated": 0}
+    for _ in range(300):
+        actions = rng.integers(0, 2, 2 * N)
+        step = envs.step(actions)
+        for row, env in enumerate(scalars):
+            observation, reward, terminated, truncated, _ = env.step(int(actions[row]))
+            np.testing.assert_array_equal(step.final_observations[row], observation)
+            assert (step.rewards[row], step.terminated[row], step.truncated[row]) == (reward, terminated, truncated)
+            num_ended["terminated"] += terminated
+            num_ended["truncated"] += truncated
+            if terminated or truncated:
+                restart(row)
+    assert num_ended["terminated"] > 10
+    assert (num_ended["truncated"] > 10) is ("max_episode_steps" in env_args)
+
+
+def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make):
+    envs = make("CartPole-v1", "vectorised", num_envs=50, env_args={"max_episode_steps": 2}, members={"a": 1, "b": 2})
+    starts = [envs.observations]
+    for _ in range(20):
+        step = envs.step(np.zeros(100, dtype=np.int64))
+        starts += [step.observations] if step.truncated.all() else []
+    starts = np.concatenate(starts)
+    assert len(starts) == 11 * 100
+    assert len(np.unique(starts, axis=0)) == len(starts)
+    assert np.abs(starts).max() <= 0.05
+    assert np.abs(starts).max() > 0.049
+    assert np.abs(starts.mean(axis=0)).max() < 0.004
+
+
+def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make):
+    traces = []
+    every = dict.fromkeys(range(60), 1)
+    for stretches in ({0: 60}, every, {0: 7, 7: 20, 27: 33}, {0: 100}, {}, {0: 10, 3: 20, 17: 2, 30: 8, 33: 40}):
+        envs = make("CartPole-v1", "vectorised", env_args={"max_episode_steps": 5}, members={"a": 3})
+        actor, trace = Actor(envs.action_space, 0), []
+        for index in range(60):
+            if index in stretches:
+                envs.begin(stretches[index])
+            trace.append(seen_by(envs, envs.step(actor()), "a"))
+        traces.append(trace)
+    for trace in traces[1:]:
+        assert_equal_bits(trace, traces[0])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_args"),
+    [("Pendulum-v1", {}), ("CartPole-v1", {"pixels": True}), ("CartPole-v1", {"frame_stack": 2})],
+)
+def test_only_a_plain_cartpole_is_vectorised(env_id, env_args):
+    with pytest.raises(EnvError, match="no vectorised version"):
+        make_packed_envs(env_id, env_args, 2, kind="vectorised")
+
+
+def test_a_cartpole_of_somebody_s_own_is_not_vectorised():
+    class LowGravity(CartPoleEnv):
+        """Its registry entry has forgotten that Gymnasium's vectorised version does not know of this."""
+
+    gym.register("TestLowGravity-v0", LowGravity, max_episode_steps=20, vector_entry_point=CartPoleVectorEnv)
+    try:
+        with pytest.raises(EnvError, match="no vectorised version"):
+            make_packed_envs("TestLowGravity-v0", None, 2, kind="vectorised")
+    finally:
+        del gym.registry["TestLowGravity-v0"]
+
+
+# -- any kind
+
+
+@pytest.mark.parametrize(("env_id", "kind"), KINDS)
+def test_a_member_gets_the_same_beside_any_others(make, env_id, kind):
+    def trace_alone(member_id, seed, actor_seed):
+        envs = make(env_id, kind, env_args={"max_episode_steps": 15}, members={member_id: seed}, num_processes=2)
+        actor = Actor(envs.action_space, actor_seed)
+        return [seen_by(envs, envs.step(actor()), member_id) for _ in range(60)]
+
+    alone = {"a": trace_alone("a", 11, 0), "z": trace_alone("z", 7, 1)}
+    envs = make(env_id, kind, env_args={"max_episode_steps": 15}, members={"x": 5, "a": 11, "y": 6}, num_processes=2)
+    actors = {name: Actor(envs.action_space, seed) for seed, name in enumerate(("a", "z", "x", "y"))}
+    beside = {"a": [], "z": []}
+    for index in range(77):
+        # In the middle of episodes, and of a stretch of steps.
+        if index == 8:
+            envs.remove("x")
+        elif index == 17:
+            envs.add("z", 7)
+        elif index == 33:
+            envs.arrange(["z", "a", "y"])
+        if index % 25 == 0:
+            envs.begin(25)
+        step = step_all(envs, actors)
+        for member_id in {"a", "z"}.intersection(envs.member_ids):
+            beside[member_id].append(seen_by(envs, step, member_id))
+    for member_id, trace in alone.items():
+        assert_equal_bits(beside[member_id][:60], trace)
+        assert sum(seen["truncated"].sum() + seen["terminated"].sum() for seen in trace) >= 9
+
+
+@pytest.mark.parametrize(("env_id", "kind"), KINDS)
+def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make, env_id, kind):
+    envs = make(env_id, kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
+    actors = {name: Actor(envs.action_space, seed) for seed, name in enumerate("abcd")}
+    step_all(envs, actors)
+
+    def observed():
+        return {member_id: envs.observations[rows_of(envs, member_id)].copy() for member_id in envs.member_ids}
+
+    before = observed()
+    envs.arrange(["c", "a", "b"])
+    assert envs.member_ids == ("c", "a", "b")
+    envs.add("d", 4)
+    envs.remove("a")
+    assert envs.member_ids == ("c", "b", "d")
+    after = observed()
+    for member_id in ("b", "c"):
+        np.testing.assert_array_equal(after[member_id], before[member_id])
+    fresh = make(env_id, kind, members={"d": 4}, num_processes=1)
+    np.testing.assert_array_equal(after["d"], fresh.observations)
+    step = step_all(envs, actors)
+    assert len(step.rewards) == len(step.observations) == len(envs.observations) == 3 * N
+
+
+@pytest.mark.parametrize(("env_id", "kind"), KINDS)
+def test_members_are_named_once_and_all_of_them_are_arranged(make, env_id, kind):
+    envs = make(env_id, kind, members={"a": 1, "b": 2}, num_processes=1)
+    with pytest.raises(ValueError, match="a member already"):
+        envs.add("a", 3)
+    with pytest.raises(ValueError, match="the members are a, b"):
+        envs.arrange(["a"])
+    assert envs.member_ids == ("a", "b")
+    assert len(envs.observations) == 2 * N
+    for member_id in ("a", "b"):
+        envs.remove(member_id)
+    assert envs.member_ids == ()
+    assert len(envs.observations) == 0
+    envs.add("a", 1)
+    assert len(envs.observations) == N
+
+
+@pytest.mark.parametrize(("env_id", "kind"), KINDS)
+def test_no_step_spans_a_reset(make, env_id, kind):
+    limit = 6
+    envs = make(env_id, kind, env_args={"max_episode_steps": limit}, members={"a": 1, "b": 2}, num_processes=2)
+    actors = {"a": Actor(envs.action_space, 0), "b": Actor(envs.action_space, 1)}
+    envs.begin(40)
+    kept = []
+    for index in range(1, 41):
+        step = step_all(envs, actors)
+        ended = step.terminated | step.truncated
+        assert ended.all() if index % limit == 0 else not ended.any()  # so each episode has all its steps
+        assert envs.observations is step.observations
+        if ended.any():
+            assert (step.observations[ended] != step.final_observations[ended]).any(axis=1).all()
+        else:
+            assert step.final_observations is step.observations
+        assert step.own_rewards is step.rewards
+        assert step.observations.dtype == step.rewards.dtype == np.float32
+        assert step.terminated.dtype == step.truncated.dtype == np.bool_
+        kept.append((step, {name: np.copy(value) for name, value in vars(step).items()}))
+    for step, values in kept:  # arrays are not written to again
+        for name, value in values.items():
+            np.testing.assert_array_equal(getattr(step, name), value)
+
+
+@pytest.mark.parametrize("kind", ["vectorised", "scalar"])
+def test_truncated_is_not_terminated(make, kind):
+    envs = make("CartPole-v1", kind, env_args={"max_episode_steps": 12}, num_envs=2, members={"a": 1})
+    balanced, pushed = [], []
+    for index in range(12):
+        step = envs.step(np.array([index % 2, 0]))
+        balanced.append((bool(step.terminated[0]), bool(step.truncated[0])))
+        pushed.append((bool(step.terminated[1]), bool(step.truncated[1])))
+    assert balanced == [(False, False)] * 11 + [(False, True)]
+    assert (True, False) in pushed
+    assert not any(truncated for _, truncated in pushed)
+
+
+@pytest.mark.parametrize("kind", ["vectorised", "scalar"])
+def test_the_failure_penalty_is_for_the_learner_alone(make, kind):
+    envs = make("CartPole-v1", kind, env_args={"max_episode_steps": 12}, members={"a": 1}, failure_penalty=-7.5)
+    num_failed = num_truncated = 0
+    for index in range(40):
+        step = envs.step(np.array([0, 1, index % 2]))
+        failed = step.terminated
+        num_failed, num_truncated = num_failed + failed.sum(), num_truncated + step.truncated.sum()
+        np.testing.assert_array_equal(step.rewards, np.where(failed, np.float32(-7.5), np.float32(1)))
+        np.testing.assert_array_equal(step.own_rewards, np.ones(N, np.float32))
+        assert step.rewards.dtype == np.float32
+    assert num_failed > 4
+    assert num_truncated == 3
+
+
+def test_a_penalty_without_a_failure_is_refused():
+    for kind in ("scalar", "processes"):
+        with pytest.raises(EnvError, match="no failure"):
+            make_packed_envs("MountainCar-v0", None, 2, kind=kind, failure_penalty=-1)
+
+
+# -- scalar environments
+
+
+@pytest.mark.parametrize("kind", ["scalar", "processes"])
+@pytest.mark.parametrize(
+    ("env_id", "env_args"),
+    [
+        ("CartPole-v1", {"frame_stack": 2}),
+        ("Pendulum-v1", {"max_episode_steps": 9}),
+        ("policy_factory:Walk", {"end": 1.0}),
+    ],
+)
+def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(make, kind, env_id, env_args):
+    allow_modules(["policy_factory"])
+    envs = make(env_id, kind, env_args=env_args, members={"a": 2**32 - 2}, num_processes=2)
+    scalars = [make_env(env_id, env_args) for _ in range(N)]
+    first = [env.reset(seed=seed)[0] for env, seed in zip(scalars, (2**32 - 2, 2**32 - 1, 0), strict=True)]
+    np.testing.assert_array_equal(envs.observations, np.array(first, np.float32))
+    actor, num_ended = Actor(envs.action_space, 0), 0
+    for _ in range(60):
+        actions = actor()
+        step = envs.step(actions)
+        for row, env in enumerate(scalars):
+            action = int(actions[row]) + int(env.action_space.start) if actions.ndim == 1 else actions[row]
+            observation, reward, terminated, truncated, _ = env.step(action)
+            np.testing.assert_array_equal(step.final_observations[row], np.asarray(observation, np.float32))
+            assert step.rewards[row] == np.float32(reward)
+            assert (step.terminated[row], step.truncated[row]) == (terminated, truncated)
+            if terminated or truncated:
+                observation, _ = env.reset()
+                num_ended += 1
+            np.testing.assert_array_equal(step.observations[row], np.asarray(observation, np.float32))
+    assert num_ended
+
+
+def test_images_stay_bytes(make):
+    envs = make("CartPole-v1", "scalar", env_args={"pixels": True}, num_envs=1, members={"a": 1})
+    assert envs.observations.dtype == np.uint8
+    step = envs.step(np.array([1]))
+    assert step.observations.shape == (1, 40, 60, 1)
+    assert step.observations.max() > 0
+
+
+def test_an_env_may_write_into_its_action(make):
+    class Greedy(gym.Env):
+        observation_space = gym.spaces.Box(-1, 1, (1,))
+        action_space = gym.spaces.Box(-1, 1, (2,))
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            action[:] = 9.0
+            return np.zeros(1, np.float32), 0.0, False, False, {}
+
+    gym.register("TestGreedy-v0", Greedy)
+    try:
+        envs = make("TestGreedy-v0", "scalar", num_envs=2, members={"a": 1})
+        actions = np.zeros((2, 2), np.float32)
+        envs.step(actions)
+        assert (actions == 0).all()
+    finally:
+        del gym.registry["TestGreedy-v0"]
+
+
+# -- failures
+
+
+def go_on(envs, breaking=None, how=0, place=1):
+    actions = np.zeros(len(envs.observations), dtype=np.int64)
+    if breaking is not None:
+        actions[rows_of(envs, breaking)][place] = how
+    return envs.step(actions)
+
+
+@pytest.mark.parametrize("kind", ["scalar", "processes"])
+@pytest.mark.parametrize(("how", "words"), [(RAISE, "the motor broke"), (WRONG_SHAPE, r"shape \(5,\), not \(2,\)")])
+def test_an_env_that_raises_fails_its_member_alone(make, kind, how, words):
+    envs = make("odd_envs:Fragile", kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
+    alone = make("odd_envs:Fragile", "scalar", members={"a": 1, "c": 3})
+    for index in range(20):
+        step, expected = go_on(envs, "b", how if index == 3 else 0), go_on(alone)
+        for member_id in ("a", "c"):
+            assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
+        if index >= 3:
+            assert all((values == 0).all() for values in seen_by(envs, step, "b").values())
+            assert (envs.observations[rows_of(envs, "b")] == 0).all()
+    assert list(envs.errors) == ["b"]
+    error = envs.errors["b"]
+    assert isinstance(error, EnvError)
+    with pytest.raises(EnvError, match=rf"odd_envs:Fragile raised an error in step\(\): .*{words}"):
+        raise error
+    # Where in the env it happened, for the trial's log.
+    assert ("odd_envs.py" if how == RAISE else "sub_envs.py") in "".join(traceback.format_exception(error))
+    envs.arrange(["b", "c", "a"])
+    envs.remove("b")
+    assert envs.errors == {}
+    envs.add("b", 2)
+    step = go_on(envs)
+    assert (step.observations[rows_of(envs, "b")] != 0).all()
+    assert envs.errors == {}
+
+
+@pytest.mark.parametrize("kind", ["scalar", "processes"])
+def test_a_member_that_cannot_be_reset_is_none(make, kind):
+    envs = make("odd_envs:RefusesSeeds", kind, num_envs=2, members={"a": 2}, num_processes=2)
+    with pytest.raises(EnvError, match=r"reset\(\): ValueError: 13 brings bad luck"):
+        envs.add("b", 12)  # its second sub-environment, in another process than the first
+    assert envs.member_ids == ("a",)
+    assert envs.errors == {}
+    go_on(envs)
+    envs.add("b", 14)
+    step = go_on(envs)
+    alone = make("odd_envs:RefusesSeeds", "scalar", num_envs=2, members={"b": 14})
+    np.testing.assert_array_equal(step.observations[2:], go_on(alone).observations)
+
+
+def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_with_it_again(make):
+    envs = make("odd_envs:Fragile", "processes", members={"a": 1, "b": 2}, num_processes=2)
+    go_on(envs)
+    # Places 0 and 2 of a, and place 1 of b, are in one process.
+    step = go_on(envs, "b", EXIT)
+    assert set(envs.errors) == {"a", "b"}
+    assert "ended with exit code 7" in str(envs.errors["a"])
+    assert (step.observations == 0).all()
+    assert not go_on(envs).rewards.any()
+    for member_id, seed in (("a", 1), ("b", 2)):
+        envs.remove(member_id)
+        envs.add(member_id, seed)
+    envs.add("c", 3)
+    assert envs.errors == {}
+    go_on(envs)
+    step = go_on(envs, "b", EXIT)
+    assert list(envs.errors) == ["b"]
+    alone = make("odd_envs:Fragile", "scalar", members={"a": 1, "c": 3})
+    go_on(alone)
+    expected = go_on(alone)
+    for member_id in ("a", "c"):
+        assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
+
+
+def test_a_process_that_is_killed_fails_its_members(make):
+    envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
+    os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+    go_on(envs)
+    assert "was killed by SIGKILL" in str(envs.errors["a"])
+    assert isinstance(envs.errors["a"], EnvError)
+    envs.remove("a")
+    envs.add("b", 2)  # another process takes its place
+    assert go_on(envs).rewards.all()
+
+
+def test_a_process_that_is_dead_when_a_member_comes_fails_both(make):
+    envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
+    process = multiprocessing.active_children()[0]
+    process.kill()
+    process.join()
+    with pytest.raises(EnvError, match="SIGKILL"):
+        envs.add("b", 2)
+    assert envs.member_ids == ("a",)
+    assert list(envs.errors) == ["a"]
+    assert (envs.observations == 0).all()
+    envs.add("b", 2)
+    go_on(envs)
+    assert list(envs.errors) == ["a"]
+
+
+# -- which kind
+
+
+def test_cartpole_is_vectorised():
+    choice = choose_kind("CartPole-v1", {"max_episode_steps": 200}, spare_cpus=4)
+    assert choice.kind == "vectorised"
+    assert 0 < choice.step_us < 20
+    assert choose_kind("CartPole-v1", {"frame_stack": 2}, spare_cpus=4).kind == "scalar"
+
+
+def test_a_fast_env_stays_in_the_process():
+    choice = choose_kind("Pendulum-v1", None, spare_cpus=4)
+    assert choice.kind == "scalar"
+    assert 0 < choice.step_us < 1000
+    assert choice.why == f"a step takes {choice.step_us:.0f} us"
+
+
+def test_a_slow_env_gets_processes_where_cpus_are_idle():
+    choice = choose_kind("odd_envs:Slow", None, spare_cpus=2)
+    assert choice.kind == "processes"
+    assert 2000 < choice.step_us < 20_000
+    assert choice.why.endswith("ms, and 2 CPUs would be idle")
+    choice = choose_kind("odd_envs:Slow", None, spare_cpus=0)
+    assert choice.kind == "scalar"
+    assert choice.why.endswith("ms, but no CPU is idle")
+
+
+@pytest.mark.parametrize("fail_at", [1, 2, 3, 50])
+def test_an_env_that_raises_is_left_to_its_trial(fail_at):
+    choice = choose_kind("TestWalk-v0", {"fail_at": fail_at}, spare_cpus=0)
+    assert choice.kind == "scalar"
+    check_seedable("TestWalk-v0", {"fail_at": fail_at})
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_args"),
+    [
+        ("CartPole-v1", None),
+        ("CartPole-v1", {"pixels": True}),
+        ("Pendulum-v1", None),
+        ("TestWalk-v0", {"end": 1.0}),
+        ("odd_envs:Slow", None),
+    ],
+)
+def test_envs_that_can_be_seeded(env_id, env_args):
+    check_seedable(env_id, env_args)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Unseedable", "odd_envs:Unseedable cannot be seeded.* the observation at first .*of it.* is .* one time and "),
+        ("ForgetsLater", "odd_envs:ForgetsLater cannot be seeded.* the next episode's first observation after 7 steps"),
+        (
+            "Sharing",
+            "odd_envs:Sharing depends on other environments in the same process.* the observation after 1 step ",
+        ),
+    ],
+)
+def test_envs_that_cannot_be_seeded_are_refused_with_what_differs(name, words):
+    with pytest.raises(EnvError, match=words) as caught:
+        check_seedable(f"odd_envs:{name}", None)
+    assert "engine: rllib" in caught.value.hint
