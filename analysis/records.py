@@ -89,6 +89,9 @@ class TrialRecord(_Record):
     has_point: bool = Field(
         default=True, description="False: the search method chooses the point when the trial starts."
     )
+    engine: str = Field(
+        "rllib", description="What trains it: packed (with others, in one process), rllib, or baseline."
+    )
     changes: tuple[ChangeRecord, ...] = Field((), description="What population based training changed, oldest first.")
     status: TrialStatus = "pending"
     stop_reason: str | None = Field(None, description="The stop rule, cap or scheduler that ended it.")

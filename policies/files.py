@@ -27,6 +27,23 @@ def write_atomic(path: Path, data: bytes | str) -> None:
         temporary.write_bytes(content)
 
 
+def write_plain(path: Path, data: bytes | str) -> None:
+    """Write a file into a folder that nobody looks into yet; who shows the folder syncs what is in it.
+
+    Args:
+        path: File to write; missing parent folders are made.
+        data: Content; text is written as UTF-8.
+
+    Raises:
+        CannotRunError: The folder or the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary name beside `path` that becomes `path` when the block ends without an error.
@@ -48,13 +65,17 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.replace(path)
         _sync_folder(path.parent)
     except OSError as error:
-        raise CannotRunError(
-            f"Cannot write {path}: {error.strerror or error}.",
-            "Check that the folder exists, is writable and has free space, or choose another one.",
-        ) from error
+        raise _cannot_write(path, error) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _cannot_write(path: Path, error: OSError) -> CannotRunError:
+    return CannotRunError(
+        f"Cannot write {path}: {error.strerror or error}.",
+        "Check that the folder exists, is writable and has free space, or choose another one.",
+    )
 
 
 def sha256_file(path: Path) -> str:

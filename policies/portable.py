@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -66,11 +66,23 @@ class PortablePolicy:
     """Where it comes from: trial id, iteration, hyperparameters, seed, ... Free, and not needed to act."""
 
 
-def save_policy(policy: PortablePolicy, folder: Path, stem: str = "policy") -> Path:
+def save_policy(
+    policy: PortablePolicy,
+    folder: Path,
+    stem: str = "policy",
+    *,
+    write: Callable[[Path, bytes | str], None] = write_atomic,
+) -> Path:
     """Write `<stem>.safetensors` and `<stem>.json` into a folder.
 
     Each file appears whole or not at all, the weights first, so an interrupted save never leaves a JSON file
     without its weights; the hash in it tells if the weights beside it are those of another save.
+
+    Args:
+        policy: What to write.
+        folder: Where.
+        stem: Name of the files, without their endings.
+        write: Writes a file; `write_plain` where the folder is not to be seen yet.
 
     Returns:
         The path of the JSON file.
@@ -96,8 +108,8 @@ def save_policy(policy: PortablePolicy, folder: Path, stem: str = "policy") -> P
         "weights_sha256": hashlib.sha256(weights).hexdigest(),
         "training": policy.training,
     }
-    write_atomic(folder / f"{stem}.safetensors", weights)
-    write_atomic(folder / f"{stem}.json", json.dumps(_jsonable(description), indent=2, allow_nan=False) + "\n")
+    write(folder / f"{stem}.safetensors", weights)
+    write(folder / f"{stem}.json", json.dumps(_jsonable(description), indent=2, allow_nan=False) + "\n")
     return folder / f"{stem}.json"
 
 

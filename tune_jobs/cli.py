@@ -70,14 +70,14 @@ def launch(
     **options: Any,
 ) -> None:
     """Run a sweep: all trials, then the best policy, its video and a report."""
-    from tune_jobs import cli_output
-
     if dry_run:
+        from tune_jobs import cli_plan
+
         with stdout_for(as_json=as_json):
             loaded, plan = _plan(spec, overrides, name=name, address=options["address"])
-        cli_output.show_plan(loaded, plan, as_json=as_json)
+        cli_plan.show_plan(loaded, plan, as_json=as_json)
         return
-    from tune_jobs import sweeps
+    from tune_jobs import cli_output, sweeps
 
     with stdout_for(as_json=as_json):
         result = sweeps.launch(spec, overrides=overrides, name=name, storage=storage, **options)
@@ -86,7 +86,8 @@ def launch(
 
 
 def _plan(spec: str, overrides: tuple[str, ...], *, name: str | None, address: str | None) -> tuple[Any, Any]:
-    from tune_jobs.plan import local_machine, make_plan
+    from tune_jobs.machine import local_machine
+    from tune_jobs.plan import make_plan
     from tune_jobs.spec import check_sweep_name
     from tune_jobs.spec_file import load_spec
 

@@ -20,12 +20,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from analysis.records import BestRecord, EvaluationRecord, TrialRecord
-    from tune_jobs.plan import SweepPlan, TrialPlan
-    from tune_jobs.spec import SweepSpec
     from tune_jobs.spec_file import Preset
     from tune_jobs.sweeps import SweepResult, SweepStatus
 
-_MAX_TRIALS_SHOWN = 24
 # Derived figures that a reader of the JSON would otherwise compute anew.
 _DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
 _STATUS_STYLES = {
@@ -93,71 +90,6 @@ def format_bytes(number: float) -> str:
     return f"{number:.1f} TB"
 
 
-def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
-    """Print what a sweep would do."""
-    if as_json:
-        print_json({"spec": spec.model_dump(mode="json"), "plan": plan.to_json()})
-        return
-    console = _console()
-    _print_facts(console, _plan_facts(spec, plan))
-    for note in plan.notes:
-        console.print(f"note: {note}", style="yellow")
-    console.print(_plan_table(plan.trials))
-    hidden = len(plan.trials) - _MAX_TRIALS_SHOWN
-    if hidden > 0:
-        console.print(f"and {hidden:,} more; --json lists them all")
-    console.print("Nothing was started: this was a dry run.", style="dim")
-
-
-def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
-    machine, stop = plan.machine, spec.stop
-    returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
-    rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
-    rules += [] if stop.num_episodes is None else [f"{stop.num_episodes:,} episodes"]
-    rules += [
-        f"{stop.num_env_steps:,} env steps",
-        f"{stop.num_iterations:,} iterations",
-        f"{stop.time_s:g} s",
-    ]
-    threshold = "" if plan.env.threshold is None else f" (solved at {plan.env.threshold:g})"
-    gpus = f" and {plan.gpus_per_trial:g} GPU" if plan.gpus_per_trial else ""
-    resources = f"{plan.cpus_per_trial} CPU{'s' * (plan.cpus_per_trial > 1)}{gpus}"
-    has = f"{machine.num_cpus:g} CPUs" + (f" and {machine.num_gpus:g} GPUs" if machine.num_gpus else "")
-    return {
-        "environment": f"{plan.env.env_id}{threshold}",
-        "algorithm": spec.algorithm,
-        "trials": f"{len(plan.trials):,}: {plan.num_points:,} points, {spec.seeds_per_point} seed(s) each",
-        "at once": f"{plan.max_concurrent}, each on {resources}; {machine.source} has {has}",
-        "a trial stops at": " or ".join(rules),
-        "search": _search_fact(spec),
-        "scheduler": spec.scheduler.type,
-        "env steps": f"at most {plan.max_env_steps:,} in all",
-        "disk": f"at most about {format_bytes(plan.max_disk_bytes)}",
-        "seeds": f"sweep {spec.seed}; evaluation {_span(plan.evaluation_seeds)}; "
-        f"confirmation {_span(plan.confirmation_seeds)}",
-    }
-
-
-def _search_fact(spec: SweepSpec) -> str:
-    if spec.search.type == "random":
-        return "random draws for each combination of the grids"
-    return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
-
-
-def _span(seeds: Sequence[int]) -> str:
-    return f"{seeds[0]} to {seeds[-1]}"
-
-
-def _plan_table(trials: Sequence[TrialPlan]) -> Table:
-    # The first trial's point is known; where a searcher chooses the later ones, they have none yet.
-    names = list(trials[0].point)
-    table = _table("trial", "seed", *names)
-    for trial in trials[:_MAX_TRIALS_SHOWN]:
-        values = [format_value(trial.point[name]) if trial.has_point else "by tpe" for name in names]
-        table.add_row(trial.trial_id, str(trial.seed), *values)
-    return table
-
-
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
     """Print what a launch, resume or extend came to, and where everything lies."""
     at = "" if storage is None else f" --storage {shlex.quote(storage)}"
@@ -167,7 +99,7 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
     if as_json:
         print_json({**to_json(result), "exit_code": result.exit_code})
     else:
-        console = _console()
+        console = make_console()
         _print_trial_counts(console, result.trials)
         if result.best is not None:
             _print_best(console, result.best)
@@ -176,7 +108,7 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
         from analysis.wording import shown_path
 
         paths = {"sweep": result.folder, **result.artifacts}
-        _print_facts(console, {name.replace("_", " "): shown_path(path) for name, path in paths.items()})
+        print_facts(console, {name.replace("_", " "): shown_path(path) for name, path in paths.items()})
         for note in result.notes:
             console.print(f"note: {note}", style="yellow")
     if result.interrupted:
@@ -200,11 +132,11 @@ def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
     if as_json:
         print_json(statuses)
         return
-    console = _console()
+    console = make_console()
     if not statuses:
         console.print("There are no sweeps here yet.")
         return
-    table = _table("sweep", "state", "trials", "created")
+    table = make_table("sweep", "state", "trials", "created")
     for status in statuses:
         created = time.strftime("%Y-%m-%d %H:%M", time.localtime(status.sweep.created_at))
         table.add_row(status.sweep.name, _state(status), _counts(status), created)
@@ -222,7 +154,7 @@ def show_status(status: SweepStatus, *, as_json: bool) -> None:
         "trials": f"{status.sweep.num_trials}: {_counts(status)}",
         "run time": format_duration(status.sweep.run_time_s),
     }
-    _print_facts(_console(), facts)
+    print_facts(make_console(), facts)
 
 
 def _state(status: SweepStatus) -> str:
@@ -244,8 +176,9 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
 
     names = list(dict.fromkeys(name for trial in trials for name in trial.point))
     columns = ["trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by"]
+    engines_differ = len({trial.engine for trial in trials}) > 1
     copies = any(trial.changes for trial in trials)
-    table = _table(*columns, *(["copied"] if copies else []))
+    table = make_table(*columns, *(["engine"] if engines_differ else []), *(["copied"] if copies else []))
     for trial in trials:
         table.add_row(
             trial.trial_id,
@@ -257,9 +190,10 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
             format_score(trial.evaluation_return),
             format_score(trial.best_evaluation_return),
             Text(_first_line(trial.error) if trial.status == "failed" else (trial.stop_reason or "-")),
+            *([trial.engine] if engines_differ else []),
             *([", ".join(change.source_trial_id for change in trial.changes) or "-"] if copies else []),
         )
-    _console().print(table)
+    make_console().print(table)
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:
@@ -267,7 +201,7 @@ def show_best(best: BestRecord, *, as_json: bool) -> None:
     if as_json:
         print_json(best)
     else:
-        _print_best(_console(), best)
+        _print_best(make_console(), best)
 
 
 def _print_best(console: Console, best: BestRecord) -> None:
@@ -279,7 +213,7 @@ def _print_best(console: Console, best: BestRecord) -> None:
         "confirmed at": f"{_returns(best.confirmation)}; gap {best.optimism_gap:+.1f}",
         "random policy": _returns(best.random),
     }
-    _print_facts(console, facts | _verdict(best.confirmation))
+    print_facts(console, facts | _verdict(best.confirmation))
 
 
 def show_evaluation(policy: EvaluationRecord, random: EvaluationRecord, *, as_json: bool) -> None:
@@ -290,7 +224,12 @@ def show_evaluation(policy: EvaluationRecord, random: EvaluationRecord, *, as_js
     facts = {policy.policy: _returns(policy)}
     if policy.policy != "random":
         facts["random policy"] = _returns(random)
-    _print_facts(_console(), facts | {"seeds": _span(policy.seeds)} | _verdict(policy))
+    print_facts(make_console(), facts | {"seeds": span(policy.seeds)} | _verdict(policy))
+
+
+def span(seeds: Sequence[int]) -> str:
+    """The first and the last of them."""
+    return f"{seeds[0]} to {seeds[-1]}"
 
 
 def _returns(record: EvaluationRecord) -> str:
@@ -312,7 +251,7 @@ def show_paths(paths: Mapping[str, Path], *, as_json: bool) -> None:
     if as_json:
         print_json(paths)
     else:
-        _print_facts(_console(), {name: shown_path(path) for name, path in paths.items()})
+        print_facts(make_console(), {name: shown_path(path) for name, path in paths.items()})
 
 
 def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
@@ -332,9 +271,9 @@ def show_presets(presets: Sequence[Preset], *, as_json: bool) -> None:
         return
     from rich.text import Text
 
-    console = _console()
+    console = make_console()
     details = ("what", "expected", "env steps", "time on 2 cores")
-    table = _table("preset", *details, wrapped=details)
+    table = make_table("preset", *details, wrapped=details)
     for preset in presets:
         # As texts, or a title in brackets would be read as a style.
         cells = (preset.title, preset.expected, preset.env_steps, preset.time.removesuffix(" on 2 cores"))
@@ -351,7 +290,8 @@ def show_preset(preset: Preset, *, as_json: bool) -> None:
         click.echo(preset.text, nl=False)
 
 
-def _console() -> Console:
+def make_console() -> Console:
+    """Where tables are printed: they end at the terminal's width."""
     from rich.console import Console
 
     # A pipe or a log has no width: 80 columns would cut tables and paths for nothing.
@@ -359,7 +299,8 @@ def _console() -> Console:
     return Console(markup=False, highlight=False, emoji=False, width=width, soft_wrap=False)
 
 
-def _table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Table:
+def make_table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Table:
+    """A table without rows; the columns of `wrapped` break where others are cut."""
     from rich import box
     from rich.table import Table
 
@@ -369,7 +310,8 @@ def _table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Ta
     return table
 
 
-def _print_facts(console: Console, facts: Mapping[str, str]) -> None:
+def print_facts(console: Console, facts: Mapping[str, str]) -> None:
+    """Print names and what belongs to them, one a line."""
     from rich.table import Table
     from rich.text import Text
 

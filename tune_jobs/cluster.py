@@ -26,7 +26,7 @@ from policies.errors import CannotRunError, TuneJobsError
 from policies.files import write_atomic
 from tune_jobs.address import recorded_cluster
 from tune_jobs.live import quiet
-from tune_jobs.plan import Machine
+from tune_jobs.machine import Machine
 from tune_jobs.ray_environment import prepare_environment
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
@@ -166,15 +166,18 @@ def _alive_nodes() -> list[dict[str, Any]]:
 
 
 def cluster_machine(source: str) -> Machine:
-    """The CPUs and GPUs of the joined cluster's nodes."""
-    nodes = tuple(
-        (float(node["Resources"].get("CPU", 0)), float(node["Resources"].get("GPU", 0))) for node in _alive_nodes()
-    )
+    """The CPUs, GPUs and memory of the joined cluster's nodes."""
+    resources = [node["Resources"] for node in _alive_nodes()]
+    nodes = tuple((float(node.get("CPU", 0)), float(node.get("GPU", 0))) for node in resources)
+    num_cpus = sum(cpus for cpus, _ in nodes)
+    # What a node had free when its Ray started, less the object store.
+    shares = [node.get("memory", 0.0) / node["CPU"] for node in resources if node.get("CPU")]
     return Machine(
-        num_cpus=sum(cpus for cpus, _ in nodes),
+        num_cpus=num_cpus,
         num_gpus=sum(gpus for _, gpus in nodes),
         source=source,
         nodes=nodes,
+        memory_bytes=min(shares) * num_cpus if shares and min(shares) > 0 else None,
     )
 
 

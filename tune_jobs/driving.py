@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.address import check_address
+from tune_jobs.machine import Machine
 from tune_jobs.monitor import SweepMonitor
 from tune_jobs.own_code import modules_of
-from tune_jobs.plan import Machine, SweepPlan, TrialPlan
+from tune_jobs.plan import SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec, check_sweep_name
 from tune_jobs.store import SweepStore, name_taken
 
@@ -110,6 +111,7 @@ def pending_record(trial: TrialPlan) -> TrialRecord:
         point=trial.point,
         hyperparams=trial.hyperparams,
         has_point=trial.has_point,
+        engine=trial.engine,
     )
 
 
@@ -215,7 +217,9 @@ def _run_trials(
     with shown(monitor, progress, store.folder / "driver.log"), _stopping_on_signals(store, monitor):
         from tune_jobs.runner import RunJob, run_trials
 
-        job = RunJob(store.folder, todo, plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent)
+        job = RunJob(
+            store.folder, todo, plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent, packs=plan.packs
+        )
         # Signals are handled anew once Ray is joined: it sets a handler of its own for SIGTERM, which ends the process.
         with (
             contextlib.suppress(KeyboardInterrupt),

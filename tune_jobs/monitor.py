@@ -52,6 +52,8 @@ class SweepMonitor:
         self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
         self._history: deque[tuple[float, int]] = deque([(self._start, self._num_env_steps)])
         self._selection: Selection | None = None
+        # All records are looked at for it: with a thousand trials too much to do at every report.
+        self._selection_is_old = True
 
     @property
     def elapsed_s(self) -> float:
@@ -77,10 +79,7 @@ class SweepMonitor:
             self._history.popleft()
         seen = None if before is None else (before.status, before.best_evaluation_return)
         if seen != (record.status, record.best_evaluation_return):
-            try:
-                self._selection = select_best(list(self.records.values()))
-            except NoUsableTrialError:
-                self._selection = None
+            self._selection_is_old = True
 
     def counts(self) -> dict[str, int]:
         """Number of trials by status."""
@@ -88,6 +87,12 @@ class SweepMonitor:
 
     def best(self) -> Selection | None:
         """The winner so far, by the rule that will choose the winner; None while no trial is usable."""
+        if self._selection_is_old:
+            self._selection_is_old = False
+            try:
+                self._selection = select_best(list(self.records.values()))
+            except NoUsableTrialError:
+                self._selection = None
         return self._selection
 
     def estimate(self) -> Estimate:

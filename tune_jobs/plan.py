@@ -6,57 +6,38 @@ sweep with more samples gives the same trials first. What can't run is refused h
 
 from __future__ import annotations
 
-import itertools
-import math
-import os
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from pydantic import ValidationError
 
-from policies.convolution import output_shape
+from analysis.records import FINISHED, TrialRecord
 from policies.envs import EnvInfo, check_env
 from policies.errors import CannotRunError, SpecError
-from policies.hyperparams import (
-    DQNHyperparams,
-    Hyperparams,
-    PPOHyperparams,
-    RandomHyperparams,
-    make_hyperparams,
-)
+from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
 from tune_jobs.env_rules import check_env_args, check_env_rules
+from tune_jobs.machine import Machine
 from tune_jobs.own_code import check_rl_module
+from tune_jobs.pack_sizes import Member, plan_packs
+from tune_jobs.packs import Engine, PackPlan, choose_engines, pack_key
 from tune_jobs.points import largest_hyperparams, planned_points
 from tune_jobs.search_space import num_points
 from tune_jobs.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec import SweepSpec, describe, dotted
 from tune_jobs.tpe import check_installed
+from tune_jobs.trial_sizes import max_disk_bytes, max_env_steps, member_bytes
 
 NUM_CONFIRMATION_EPISODES = 100
 MAX_TRIALS = 100_000
 
-# Measured with Ray 2.60 and rounded up: an RLlib checkpoint without its weights, a line of results with its
-# TensorBoard scalars, and what is made once (videos, report, Ray Tune's own state).
-_CHECKPOINT_BASE_BYTES = 250_000
-_ITERATION_BYTES = 10_000
+# What is made once, rounded up: videos, report, Ray Tune's own state.
 _SWEEP_BYTES = 20_000_000
-_BYTES_PER_WEIGHT = 4
 _FOR_EVER = "It would wait for ever."
-# The network, its copy for sampling, DQN's target network, and Adam's two moments.
-_COPIES_OF_WEIGHTS = 6
 
-
-@dataclass(frozen=True)
-class Machine:
-    """What there is to run on."""
-
-    num_cpus: float
-    num_gpus: float = 0.0
-    source: str = "this machine"
-    nodes: tuple[tuple[float, float], ...] = ()
-    """(CPUs, GPUs) of each node of a cluster; empty: one node that has everything."""
+_Point = tuple[dict[str, Any] | None, Hyperparams | None]
+"""The sampled values, and all values; both None: the search method chooses them when the trial starts."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +55,7 @@ class TrialPlan:
     """All values, validated, as JSON."""
     has_point: bool = True
     """False: the search method chooses the point when the trial starts; point and hyperparams are empty until then."""
+    engine: Engine = "rllib"
 
 
 @dataclass(frozen=True)
@@ -85,6 +67,7 @@ class SweepPlan:
     cpus_per_trial: int
     gpus_per_trial: float
     max_concurrent: int
+    """Trials at once, those in packs too."""
     evaluation_seeds: tuple[int, ...]
     confirmation_seeds: tuple[int, ...]
     max_env_steps: int
@@ -94,17 +77,27 @@ class SweepPlan:
     env: EnvInfo
     machine: Machine
     notes: tuple[str, ...] = ()
-    """What the sweep's author may not have meant."""
+    """What the sweep's author may not have meant, and which trials are not packed."""
+    packs: PackPlan | None = None
+    """Of the packed trials that have not ended; None: there are none."""
+
+    @property
+    def engines(self) -> dict[str, int]:
+        """Number of trials by engine."""
+        return dict(Counter(trial.engine for trial in self.trials))
 
     def to_json(self) -> dict[str, Any]:
         """The plan as JSON-like data, without the environment's spaces."""
-        data = {name: value for name, value in vars(self).items() if name not in ("trials", "env", "machine")}
+        apart = ("trials", "env", "machine", "packs")
+        data = {name: value for name, value in vars(self).items() if name not in apart}
         env = {"id": self.env.env_id, "args": self.env.env_args, "threshold": self.env.threshold}
         return data | {
             "num_trials": len(self.trials),
             "trials": [asdict(trial) for trial in self.trials],
             "env": env,
             "machine": asdict(self.machine),
+            "engines": self.engines,
+            "packs": None if self.packs is None else asdict(self.packs),
         }
 
 
@@ -113,18 +106,21 @@ def trial_id(index: int) -> str:
     return f"t{index:04d}"
 
 
-def local_machine() -> Machine:
-    """The CPUs this process may use (affinity and cgroup quota count) and the GPUs it sees."""
-    return Machine(num_cpus=_usable_cpus(), num_gpus=_visible_gpus())
-
-
-def make_plan(spec: SweepSpec, machine: Machine) -> SweepPlan:
+def make_plan(
+    spec: SweepSpec, machine: Machine, records: Sequence[TrialRecord] = (), *, retry_failed: bool = False
+) -> SweepPlan:
     """Plan a sweep for a machine.
+
+    Args:
+        spec: The sweep.
+        machine: What it runs on.
+        records: Of its trials that are there already: they go on with the engines they have.
+        retry_failed: Whether the failed ones of those run again.
 
     Raises:
         EnvError: The environment isn't registered, can't be made, or doesn't go with the algorithm.
-        SpecError: A point's values contradict each other or the environment, there are too many trials, or something is
-            in a module that is not allowed.
+        SpecError: A point's values contradict each other or the environment, there are too many trials, something is
+            in a module that is not allowed, or trials that are to be packed can't be.
         CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
     if spec.search.type == "tpe":
@@ -139,23 +135,35 @@ def make_plan(spec: SweepSpec, machine: Machine) -> SweepPlan:
             "Lower num_samples or seeds_per_point, or make the grids smaller.",
         )
     concurrent = _max_concurrent(spec, machine, num_trials)
-    trials, known = _trials(spec)
+    points = _points(spec)
+    known = [values for _, values in points if values is not None]
     check_env_rules(spec, env, known)
+    trials, engine_notes = _trials(spec, env, points, records)
     sizes = _sizes(spec, known)
+    ended = {record.trial_id for record in records if record.status in FINISHED}
+    if retry_failed:
+        ended -= {record.trial_id for record in records if record.status == "failed"}
+    to_run = [trial for trial in trials if trial.trial_id not in ended]
+    members = _members(to_run, points, [max(member_bytes(env, each) for each in sets) for sets in sizes])
+    packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
+    if packs is not None:
+        all_are_packed = all(trial.engine == "packed" for trial in trials)
+        concurrent = packs.max_concurrent if all_are_packed else max(packs.max_concurrent, concurrent)
     return SweepPlan(
         trials=trials,
-        num_points=num_trials // spec.seeds_per_point,
+        num_points=len(points),
         cpus_per_trial=spec.cpus_per_trial,
         gpus_per_trial=spec.resources.num_gpus,
         max_concurrent=concurrent,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
-        max_env_steps=spec.seeds_per_point * sum(max(_max_env_steps(spec, each) for each in sets) for sets in sizes),
+        max_env_steps=spec.seeds_per_point * sum(max(max_env_steps(spec, each) for each in sets) for sets in sizes),
         max_disk_bytes=_SWEEP_BYTES
-        + spec.seeds_per_point * sum(max(_max_trial_bytes(spec, env, each) for each in sets) for sets in sizes),
+        + spec.seeds_per_point * sum(max(max_disk_bytes(spec, env, each) for each in sets) for sets in sizes),
         env=env,
         machine=machine,
-        notes=tuple(_notes(spec, env, concurrent)),
+        notes=(*_notes(spec, env, concurrent if packs is None else None), *engine_notes),
+        packs=packs,
     )
 
 
@@ -164,17 +172,22 @@ def _num_trials(spec: SweepSpec) -> int:
     return points * spec.seeds_per_point
 
 
-def _trials(spec: SweepSpec) -> tuple[tuple[TrialPlan, ...], list[Hyperparams]]:
-    """The trials, and the hyperparameters of each point that is known."""
-    points = planned_points(spec)
+def _points(spec: SweepSpec) -> list[_Point]:
+    """Each point with all its hyperparameters."""
+    return [
+        (None, None) if point is None else (point, point_hyperparams(spec, point, index))
+        for index, point in enumerate(planned_points(spec))
+    ]
+
+
+def _trials(
+    spec: SweepSpec, env: EnvInfo, points: Sequence[_Point], records: Sequence[TrialRecord]
+) -> tuple[tuple[TrialPlan, ...], tuple[str, ...]]:
+    """The trials, and the notes on their engines."""
     seeds = trial_seeds(spec.seed, len(points) * spec.seeds_per_point)
     trials: list[TrialPlan] = []
-    known = []
-    for point_index, point in enumerate(points):
-        dumped: dict[str, Any] = {}
-        if point is not None:
-            known.append(point_hyperparams(spec, point, point_index))
-            dumped = known[-1].model_dump(mode="json")
+    for point_index, (point, values) in enumerate(points):
+        dumped = {} if values is None else values.model_dump(mode="json")
         for seed_index in range(spec.seeds_per_point):
             index = len(trials)
             trials.append(
@@ -189,7 +202,26 @@ def _trials(spec: SweepSpec) -> tuple[tuple[TrialPlan, ...], list[Hyperparams]]:
                     point is not None,
                 )
             )
-    return tuple(trials), known
+    choice = choose_engines(
+        spec,
+        env,
+        [(trial.trial_id, points[trial.point_index][1]) for trial in trials],
+        {record.trial_id: record.engine for record in records},
+        lambda index: _place(spec, points[trials[index].point_index][0], trials[index].point_index),
+    )
+    planned = (replace(trial, engine=engine) for trial, engine in zip(trials, choice.engines, strict=True))
+    return tuple(planned), choice.notes
+
+
+def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[Member]:
+    """Those of the trials that are packed; `memory` is of each point's trials."""
+    members = []
+    for trial in to_run:
+        if trial.engine == "packed":
+            values = points[trial.point_index][1]
+            key = None if values is None else pack_key(values)
+            members.append(Member(trial.trial_id, key, memory[trial.point_index]))
+    return members
 
 
 def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]:
@@ -206,8 +238,7 @@ def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: in
     Raises:
         SpecError: They don't go together.
     """
-    shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
-    place = f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
+    place = _place(spec, point, point_index)
     try:
         values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **point})
     except ValidationError as error:
@@ -236,6 +267,15 @@ def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: in
     return values
 
 
+def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int) -> str:
+    """What messages call a point."""
+    if point is None:
+        shown = f"chosen by {spec.search.type}"
+    else:
+        shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
+    return f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
+
+
 def _max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
     """How many trials run at once; refuses a trial that would wait for ever."""
     cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
@@ -243,22 +283,10 @@ def _max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
     # Env runners are placed one by one and may lie on other nodes; the rest of a trial is one process on one
     # node.
     whole = cpus if spec.resources.num_env_runners == 0 else 0
-    nodes = machine.nodes or ((machine.num_cpus, machine.num_gpus),)
-    fitting = sum(
-        min(int(node_cpus // whole) if whole else num_trials, _times(node_gpus, gpus) if gpus else num_trials)
-        for node_cpus, node_gpus in nodes
-    )
-    limits = [fitting, int(machine.num_cpus // cpus), num_trials]
+    limits = [machine.fitting(whole, gpus), machine.num_cpus // cpus, num_trials]
     if spec.resources.max_concurrent is not None:
         limits.append(spec.resources.max_concurrent)
-    return max(1, min(limits))
-
-
-def _times(available: float, wanted: float) -> int:
-    """How often `wanted` GPUs fit; a share of a GPU never spreads over two, 3 x 1/3 fit despite rounding."""
-    if wanted > 1:
-        return int(available // wanted)
-    return int(available) * math.floor(1 / wanted + 1e-9)
+    return max(1, int(min(limits)))
 
 
 def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
@@ -288,54 +316,8 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
         )
 
 
-def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
-    """Most env steps of one iteration: all sub-environments step together, so the last step overshoots."""
-    wanted, num_runners = _wanted_env_steps(values), max(1, spec.resources.num_env_runners)
-    if isinstance(values, DQNHyperparams):
-        # It ends with a sampling phase, in which each runner makes its share of train_freq.
-        return wanted - 1 + num_runners * (math.ceil(values.train_freq / num_runners) - 1 + values.num_envs)
-    together = values.num_envs * num_runners
-    return (math.ceil(wanted / together) + 1) * together
-
-
-def _wanted_env_steps(values: Hyperparams) -> int:
-    """Env steps an iteration has at least."""
-    return values.train_batch_size if isinstance(values, PPOHyperparams) else values.env_steps_per_iteration
-
-
-def _max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
-    """Most env steps of one trial: it ends with the iteration in which it reaches its cap."""
-    iteration = _iteration_env_steps(spec, values)
-    return min(spec.stop.num_env_steps - 1 + iteration, spec.stop.num_iterations * iteration)
-
-
-def _max_trial_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
-    iterations = min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
-    checkpoint = _CHECKPOINT_BASE_BYTES + _num_weights(env, values) * _BYTES_PER_WEIGHT * _COPIES_OF_WEIGHTS
-    kept = min(spec.checkpoints.keep + 2, math.ceil(iterations / spec.checkpoints.every_iterations) + 2)
-    # One more while a new one is being written and the old one not yet deleted.
-    return (kept + 1) * checkpoint + iterations * _ITERATION_BYTES
-
-
-def _num_weights(env: EnvInfo, values: Hyperparams) -> int:
-    if isinstance(values, RandomHyperparams):
-        return 0
-    space: Any = env.action_space
-    num_outputs = 2 * int(space.n) if hasattr(space, "n") else 2 * math.prod(space.shape or ())
-    shape = tuple(env.observation_space.shape or ())
-    weights = 0
-    if values.conv_filters is not None:
-        channels = [shape[-1], *(item[0] for item in values.conv_filters)]
-        for (inputs, outputs), (_, kernel, _) in zip(itertools.pairwise(channels), values.conv_filters, strict=True):
-            weights += (inputs * kernel**2 + 1) * outputs
-        shape = output_shape(shape, values.conv_filters)
-    sizes = [math.prod(shape), *values.hidden_sizes, num_outputs + 1]
-    weights += sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
-    networks = 1 if isinstance(values, DQNHyperparams) else 2  # PPO: policy and value function
-    return networks * weights
-
-
-def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int) -> list[str]:
+def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
+    """`concurrent`: trials at once; None: packs hold as many as are wanted, or have a note of their own."""
     notes = []
     if (
         spec.search.type == "random"
@@ -353,34 +335,6 @@ def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int) -> list[str]:
             "trials may end before they solve it."
         )
     wanted = spec.resources.max_concurrent
-    if wanted is not None and concurrent < min(wanted, _num_trials(spec)):
+    if wanted is not None and concurrent is not None and concurrent < min(wanted, _num_trials(spec)):
         notes.append(f"resources.max_concurrent is {wanted}, but only {concurrent} trials fit at once.")
     return notes
-
-
-def _usable_cpus() -> float:
-    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    quota = _cgroup_quota(Path("/sys/fs/cgroup"))
-    # Ray counts whole CPUs; half a CPU still is one process.
-    return float(affinity if quota is None else max(1, min(affinity, math.ceil(quota))))
-
-
-def _cgroup_quota(root: Path) -> float | None:
-    """CPUs a container may use by its cgroup (v2, then v1), None if it isn't limited."""
-    try:
-        quota, period = (root / "cpu.max").read_text(encoding="ascii").split()
-        return None if quota == "max" else int(quota) / int(period)
-    except (OSError, ValueError):
-        pass
-    try:
-        micros = int((root / "cpu/cpu.cfs_quota_us").read_text(encoding="ascii"))
-        return None if micros < 0 else micros / int((root / "cpu/cpu.cfs_period_us").read_text(encoding="ascii"))
-    except (OSError, ValueError, ZeroDivisionError):
-        return None
-
-
-def _visible_gpus() -> float:
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if visible is not None:
-        return float(len([name for name in visible.split(",") if name.strip() not in ("", "-1")]))
-    return float(len(list(Path("/proc/driver/nvidia/gpus").glob("*"))))

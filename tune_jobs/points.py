@@ -11,9 +11,10 @@ from tune_jobs.search_space import Domain, Listed, Range, draw_point, draw_point
 from tune_jobs.spec import SweepSpec
 
 _DECIDE_SIZE = (
-    "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers"
+    "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers",
+    "replay_capacity",
 )  # fmt: skip
-"""Hyperparameters on which a trial's env steps and disk space depend."""
+"""Hyperparameters on which a trial's env steps, disk space and memory depend."""
 
 
 def planned_points(spec: SweepSpec) -> list[dict[str, Any] | None]:

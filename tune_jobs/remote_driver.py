@@ -17,7 +17,8 @@ from ray.exceptions import RayActorError
 
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError
-from tune_jobs.runner import Listener, RunJob, run_trials
+from tune_jobs.record_keeper import Listener
+from tune_jobs.runner import RunJob, run_trials
 from tune_jobs.store import SweepStore
 
 _POLL_INTERVAL_S = 0.5

@@ -19,18 +19,20 @@ from ray.exceptions import RayActorError, RayTaskError
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
-from analysis.records import CheckpointRecord, TrialRecord
+from analysis.records import CheckpointRecord
 from policies.errors import TuneJobsError
+from tune_jobs.pack_driver import PackDriver, PackScheduler
+from tune_jobs.pack_trainable import PackTrainable
+from tune_jobs.packs import PackPlan
 from tune_jobs.population import PopulationScheduler
 from tune_jobs.ray_environment import prepare_environment
+from tune_jobs.record_keeper import Listener, RecordKeeper
 from tune_jobs.schedulers import build_scheduler, waits_for_others
-from tune_jobs.searcher import PointSearcher
+from tune_jobs.searcher import PointChooser, PointSearcher
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
-from tune_jobs.tensorboard import ScalarWriter
 from tune_jobs.trainable import TrialTrainable
-
-Listener = Callable[[TrialRecord], None]
+from tune_jobs.trial import Progress
 
 # How long running trials may take to save a checkpoint once they were asked to stop; then they are ended.
 STOP_GRACE_S = 20.0
@@ -45,6 +47,8 @@ class RunJob:
     cpus_per_trial: float
     gpus_per_trial: float
     max_concurrent: int
+    packs: PackPlan | None = None
+    """How those of its trials are run that are packed; None: none is."""
 
 
 def run_trials(job: RunJob, listener: Listener) -> None:
@@ -56,53 +60,108 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     """
     prepare_environment()
     store = SweepStore(job.sweep_folder)
-    spec = SweepSpec.model_validate(store.read_record().spec)
-    keeper = RecordKeeper(store, job.trial_ids, listener)
     shutil.rmtree(store.tune_folder, ignore_errors=True)
-    param_space: dict[str, Any] = {"sweep_folder": str(store.folder)}
-    searcher = None
-    if spec.search.type == "tpe":
-        searcher = PointSearcher(spec, job.trial_ids, keeper.all_records, keeper.change)
-    else:
-        param_space["trial_id"] = tune.grid_search(list(job.trial_ids))
-    tuner = tune.Tuner(
-        tune.with_resources(TrialTrainable, _resources(spec, job)),
-        param_space=param_space,
-        tune_config=tune.TuneConfig(
-            search_alg=searcher,
-            num_samples=1 if searcher is None else len(job.trial_ids),
-            scheduler=_scheduler(spec, store, keeper),
-            # Without it Tune runs one trial at a time where there is a searcher.
-            max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
-            reuse_actors=True,
-            trial_name_creator=_trial_id,
-            trial_dirname_creator=_trial_id,
-        ),
-        run_config=tune.RunConfig(
-            name="run",
-            storage_path=str(store.tune_folder),
-            stop=_StopWhenAsked(store, keeper),
+    wanted = set(job.trial_ids)
+    packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
+    others = [name for name in job.trial_ids if name not in set(packed)]
+    run = _Run(job, store, listener)
+    try:
+        if packed:
+            run.packs(packed)
+        # One after the other: a pack uses all the CPUs it is given all the time.
+        if others and not (packed and store.stop_requested()):
+            run.single_trials(others)
+    finally:
+        run.keeper.close()
+
+
+class _Run:
+    """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
+
+    def __init__(self, job: RunJob, store: SweepStore, listener: Listener) -> None:
+        self._job = job
+        self._store = store
+        self._spec = SweepSpec.model_validate(store.read_record().spec)
+        self.keeper = RecordKeeper(store, job.trial_ids, listener)
+        self._scheduler = self._build_scheduler()
+        chooser = PointChooser(self._spec, self.keeper.all_records, self.keeper.change)
+        self._chooser = chooser if self._spec.search.type == "tpe" else None
+
+    def _build_scheduler(self) -> TrialScheduler:
+        if self._spec.scheduler.type == "pbt":
+            return PopulationScheduler(self._spec, self._store, self.keeper.record, self.keeper.change)
+        return build_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
+
+    def packs(self, trial_ids: Sequence[str]) -> None:
+        """Run trials in packs; Tune's trials are the packs."""
+        plan = self._job.packs
+        assert plan is not None
+        choose = None if self._chooser is None else self._chooser.prepare
+        driver = PackDriver(
+            self._store, self._spec, plan, trial_ids, scheduler=self._scheduler, keeper=self.keeper, choose=choose
+        )
+        bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
+        tune.Tuner(
+            tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
+            param_space={
+                "sweep_folder": str(self._store.folder),
+                "pack_id": tune.grid_search(list(driver.pack_ids)),
+                "env_kind": plan.env_kind,
+                "num_env_processes": plan.num_env_processes,
+            },
+            tune_config=tune.TuneConfig(
+                scheduler=PackScheduler(driver), trial_name_creator=_pack_id, trial_dirname_creator=_pack_id
+            ),
+            # The driver decides which of a dead pack's trials are tried again, and the run ends when none is left.
+            run_config=self._run_config("packs", _PackEvents(driver, self.keeper), -1, lambda: driver.is_finished),
+        ).fit()
+
+    def single_trials(self, trial_ids: Sequence[str]) -> None:
+        """Run trials one by one, as many at once as fit."""
+        spec, job = self._spec, self._job
+        param_space: dict[str, Any] = {"sweep_folder": str(self._store.folder)}
+        searcher = None
+        if self._chooser is not None:
+            searcher = PointSearcher(trial_ids, self._chooser)
+        else:
+            param_space["trial_id"] = tune.grid_search(list(trial_ids))
+        tune.Tuner(
+            tune.with_resources(TrialTrainable, _resources(spec, job)),
+            param_space=param_space,
+            tune_config=tune.TuneConfig(
+                search_alg=searcher,
+                num_samples=1 if searcher is None else len(trial_ids),
+                scheduler=self._scheduler,
+                # Without it Tune runs one trial at a time where there is a searcher.
+                max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
+                reuse_actors=True,
+                trial_name_creator=_trial_id,
+                trial_dirname_creator=_trial_id,
+            ),
+            run_config=self._run_config("run", _TrialEvents(self._store, self.keeper), spec.max_retries),
+        ).fit()
+
+    def _run_config(
+        self, name: str, events: tune.Callback, max_failures: int, is_finished: Callable[[], bool] = lambda: False
+    ) -> tune.RunConfig:
+        return tune.RunConfig(
+            name=name,
+            storage_path=str(self._store.tune_folder),
+            stop=_StopWhenAsked(self._store, self.keeper, is_finished),
             verbose=0,
-            failure_config=tune.FailureConfig(max_failures=spec.max_retries),
+            failure_config=tune.FailureConfig(max_failures=max_failures),
             # Trials write their own checkpoints; Tune's are pointers, made when it pauses one.
             checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=0, checkpoint_at_end=False),
-            callbacks=[keeper],
-        ),
-    )
-    try:
-        tuner.fit()
-    finally:
-        keeper.close()
-
-
-def _scheduler(spec: SweepSpec, store: SweepStore, keeper: RecordKeeper) -> TrialScheduler:
-    if spec.scheduler.type == "pbt":
-        return PopulationScheduler(spec, store, keeper.record, keeper.change)
-    return build_scheduler(spec.scheduler, spec.stop.num_env_steps)
+            callbacks=[events],
+        )
 
 
 def _trial_id(trial: Trial) -> str:
     return str(trial.config["trial_id"])
+
+
+def _pack_id(trial: Trial) -> str:
+    return str(trial.config["pack_id"])
 
 
 def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
@@ -115,11 +174,12 @@ def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
 
 
 class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
-    """Ends the run once the running trials have saved their checkpoints, or took too long to."""
+    """Ends the run when there is nothing to do, or once the running trials have saved, or took too long to."""
 
-    def __init__(self, store: SweepStore, keeper: RecordKeeper) -> None:
+    def __init__(self, store: SweepStore, keeper: RecordKeeper, is_finished: Callable[[], bool]) -> None:
         self._store = store
         self._keeper = keeper
+        self._is_finished = is_finished
         self._asked_at: float | None = None
 
     def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
@@ -127,6 +187,8 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
 
     def stop_all(self) -> bool:
         """Whether to end the run now."""
+        if self._is_finished():
+            return True
         if self._asked_at is None:
             if not self._store.stop_requested():
                 return False
@@ -134,39 +196,16 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         return not self._keeper.running or time.monotonic() - self._asked_at > STOP_GRACE_S
 
 
-class RecordKeeper(tune.Callback):  # type: ignore[misc]
-    """Turns Tune's events into trial records, on disk and for the listener."""
+class _TrialEvents(tune.Callback):  # type: ignore[misc]
+    """Tells the keeper of records what Tune does with the trials."""
 
-    def __init__(self, store: SweepStore, trial_ids: Sequence[str], listener: Listener) -> None:
+    def __init__(self, store: SweepStore, keeper: RecordKeeper) -> None:
         self._store = store
-        self._records = {name: store.trial(name).read_record() for name in trial_ids}
-        self._others = [record for record in store.read_trials() if record.trial_id not in self._records]
-        self._listener = listener
-        self._scalars = ScalarWriter(store.folder)
-        self.running: set[str] = set()
-
-    def record(self, trial_id: str) -> TrialRecord:
-        """A trial's newest record."""
-        return self._records[trial_id]
-
-    def all_records(self) -> list[TrialRecord]:
-        """The newest record of every trial of the sweep, those of earlier runs too."""
-        return sorted([*self._others, *self._records.values()], key=lambda record: record.index)
-
-    def change(self, trial_id: str, **changes: Any) -> None:
-        """Change fields of a trial's record."""
-        record = self._records[trial_id].model_copy(update=changes)
-        self._records[trial_id] = record
-        self._store.trial(trial_id).write_record(record)
-        self._listener(record)
+        self._keeper = keeper
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A process took the trial."""
-        trial_id = _trial_id(trial)
-        self.running.add(trial_id)
-        before = self._records[trial_id].started_at
-        started_at = time.time() if before is None else before
-        self.change(trial_id, status="running", started_at=started_at, ended_at=None, error=None)
+        self._keeper.started(_trial_id(trial))
 
     def on_trial_result(
         self,
@@ -177,79 +216,98 @@ class RecordKeeper(tune.Callback):  # type: ignore[misc]
         **info: Any,
     ) -> None:
         """A report, about once a second and after each evaluation."""
-        trial_id = _trial_id(trial)
         fields = dict(result["progress"])
-        evaluated, status = fields.pop("evaluated"), fields.pop("status")
-        fields["num_iterations"] = fields.pop("iteration")
         fields["checkpoints"] = tuple(CheckpointRecord.model_validate(item) for item in fields["checkpoints"])
-        if status != "running":
-            self.running.discard(trial_id)
-        self.change(trial_id, status=status, node=result["node"], pid=result["pid"], **fields)
-        self._scalars.write(self._records[trial_id], evaluated=evaluated)
+        self._keeper.progressed(_trial_id(trial), Progress(**fields), node=result["node"], pid=result["pid"])
 
     def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
         """Schedulers pause trials and tell no one; a paused trial has saved its checkpoint and needs no waiting for."""
         for trial in trials:
             trial_id = _trial_id(trial)
-            if trial.status == Trial.PAUSED and trial_id in self.running:
-                self.running.discard(trial_id)
-                self.change(trial_id, status="paused")
+            if trial.status == Trial.PAUSED and trial_id in self._keeper.running:
+                self._keeper.paused(trial_id)
+        self._keeper.flush()
 
     def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Tune is done with the trial: its own end, the scheduler's decision, or the end of the run."""
-        trial_id = _trial_id(trial)
-        self.running.discard(trial_id)
-        self._scalars.close(trial_id)
-        if self._records[trial_id].status not in ("running", "paused"):
-            return
-        if self._store.stop_requested():
-            self.change(trial_id, status="paused")
-        else:
-            steps = self._records[trial_id].num_env_steps
-            self.change(
-                trial_id,
-                status="stopped",
-                stop_reason=f"scheduler, at {steps} env steps",
-                ended_at=time.time(),
-            )
+        self._keeper.ended(_trial_id(trial))
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will be retried."""
-        trial_id = _trial_id(trial)
-        self.running.discard(trial_id)
-        failures = self._records[trial_id].num_failures + 1
-        self.change(trial_id, status="pending", num_failures=failures, error=self._error(trial))
+        self._keeper.failed(_trial_id(trial), self._error(trial), retried=True)
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will not."""
-        trial_id = _trial_id(trial)
-        self.running.discard(trial_id)
-        self._scalars.close(trial_id)
-        failures = self._records[trial_id].num_failures + 1
-        self.change(trial_id, status="failed", num_failures=failures, error=self._error(trial), ended_at=time.time())
+        self._keeper.failed(_trial_id(trial), self._error(trial), retried=False)
 
     def _error(self, trial: Trial) -> str:
-        # Trial.get_pickled_error looks where Tune syncs to, and nothing has been synced yet; this is where it writes.
-        path = trial.pickled_error_file
-        error = cloudpickle.loads(Path(path).read_bytes()) if path and Path(path).is_file() else None
-        return describe_failure(error, self._store.trial(_trial_id(trial)).log_tail())
+        return describe_failure(_error_of(trial), self._store.trial(_trial_id(trial)).log_tail())
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles its callbacks into a file that is never read back here; listeners and open files can't be.
         return {}
 
-    def close(self) -> None:
-        """No event will come any more."""
-        self._scalars.close_all()
+
+class _PackEvents(tune.Callback):  # type: ignore[misc]
+    """Tells the driver of the packs what becomes of their processes."""
+
+    def __init__(self, driver: PackDriver, keeper: RecordKeeper) -> None:
+        self._driver = driver
+        self._keeper = keeper
+
+    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """The pack's process runs."""
+        self._driver.started(_pack_id(trial))
+
+    def on_trial_result(
+        self,
+        iteration: int,
+        trials: list[Trial],
+        trial: Trial,
+        result: dict[str, Any],
+        **info: Any,
+    ) -> None:
+        """Nothing: the scheduler has taken it; Tune need not keep it."""
+        del result["reports"]
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        """The packs have been told to go on: time for what they need not wait for."""
+        self._keeper.flush()
+
+    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """No process for the pack any more: it has nothing to do, or the run ends."""
+        self._driver.closed(_pack_id(trial))
+
+    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """The pack's process died; Tune starts another one."""
+        pack_id = _pack_id(trial)
+        self._driver.died(pack_id, describe_failure(_error_of(trial), self._driver.log_tail(pack_id), what="pack"))
+
+    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """It died too often."""
+        self.on_trial_recover(iteration, trials, trial)
+        self._driver.closed(_pack_id(trial))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
 
 
-def describe_failure(error: BaseException | None, log_tail: str) -> str:
-    """What made a trial fail, in a line, and the end of its log."""
+def _error_of(trial: Trial) -> BaseException | None:
+    # Trial.get_pickled_error looks where Tune syncs to, and nothing has been synced yet; this is where it writes.
+    path = trial.pickled_error_file
+    if not path or not Path(path).is_file():
+        return None
+    error: BaseException = cloudpickle.loads(Path(path).read_bytes())
+    return error
+
+
+def describe_failure(error: BaseException | None, log_tail: str, what: str = "trial") -> str:
+    """What made a trial or a pack fail, in a line, and the end of its log."""
     if isinstance(error, RayTaskError):
         cause = error.cause if isinstance(error.cause, BaseException) else error
         message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {cause}"
     elif isinstance(error, RayActorError):
-        message = "The process of the trial died"
+        message = f"The process of the {what} died"
         if "Timeout (" in log_tail:
             message += ": an iteration took longer than iteration_timeout_s"
         elif error.preempted:

@@ -1,4 +1,4 @@
-"""A Ray Tune searcher that starts a sweep's trials one by one, and chooses the points of those that have none yet."""
+"""Points chosen when a trial starts, and a Ray Tune searcher that starts a sweep's trials one by one."""
 
 from __future__ import annotations
 
@@ -14,39 +14,31 @@ from tune_jobs.spec import SweepSpec
 from tune_jobs.tpe import propose_point
 
 
-class PointSearcher(Searcher):  # type: ignore[misc]
-    """Gives Tune the trials in order; a trial without a point gets one, and so do the other seeds of the point.
-
-    Tune asks only when a trial can start (`max_concurrent_trials`), so every choice knows all that has ended.
+class PointChooser:
+    """Chooses the points of trials that have none, when they are about to start, and of the other seeds of the point.
 
     Args:
         spec: The sweep.
-        trial_ids: The trials to run.
         records: All records of the sweep, newest.
         change: Changes fields of a trial's record, on disk too.
     """
 
     def __init__(
-        self,
-        spec: SweepSpec,
-        trial_ids: Sequence[str],
-        records: Callable[[], Sequence[TrialRecord]],
-        change: Callable[..., None],
+        self, spec: SweepSpec, records: Callable[[], Sequence[TrialRecord]], change: Callable[..., None]
     ) -> None:
-        super().__init__()
         self._spec = spec
-        self._waiting = deque(trial_ids)
         self._given: set[str] = set()
         self._records = records
         self._change = change
 
-    def suggest(self, trial_id: str) -> dict[str, Any] | str:  # noqa: ARG002 - Tune's own id
-        """The next trial's config, as `TrialTrainable` takes it."""
-        if not self._waiting:
-            return str(Searcher.FINISHED)
-        name = self._waiting.popleft()
+    def prepare(self, name: str) -> None:
+        """See to it that a trial has a point; it starts now.
+
+        Raises:
+            SpecError: No valid point is found.
+        """
         self._given.add(name)
-        # A trial that Tune has been given runs, though it may not have reported so.
+        # A trial that was given to a process runs, though it may not have reported so.
         records = [
             record.model_copy(update={"status": "running"})
             if record.status == "pending" and record.trial_id in self._given
@@ -56,7 +48,6 @@ class PointSearcher(Searcher):  # type: ignore[misc]
         record = next(record for record in records if record.trial_id == name)
         if not record.has_point:
             self._choose(record.point_index, records)
-        return {"trial_id": name}
 
     def _choose(self, point_index: int, records: Sequence[TrialRecord]) -> None:
         spec = self._spec
@@ -73,6 +64,30 @@ class PointSearcher(Searcher):  # type: ignore[misc]
         for record in records:
             if record.point_index == point_index and not record.has_point:
                 self._change(record.trial_id, point=point, hyperparams=hyperparams, has_point=True)
+
+
+class PointSearcher(Searcher):  # type: ignore[misc]
+    """Gives Tune the trials in order, each with a point.
+
+    Tune asks only when a trial can start (`max_concurrent_trials`), so every choice knows all that has ended.
+
+    Args:
+        trial_ids: The trials to run.
+        chooser: Chooses their points.
+    """
+
+    def __init__(self, trial_ids: Sequence[str], chooser: PointChooser) -> None:
+        super().__init__()
+        self._waiting = deque(trial_ids)
+        self._chooser = chooser
+
+    def suggest(self, trial_id: str) -> dict[str, Any] | str:  # noqa: ARG002 - Tune's own id
+        """The next trial's config, as `TrialTrainable` takes it."""
+        if not self._waiting:
+            return str(Searcher.FINISHED)
+        name = self._waiting.popleft()
+        self._chooser.prepare(name)
+        return {"trial_id": name}
 
     def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:  # noqa: FBT001, FBT002 - Tune's signature
         """Nothing: the records say how a trial ended."""

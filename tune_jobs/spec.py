@@ -16,6 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
+from tune_jobs.packs import why_none_is_packed
 from tune_jobs.search_checks import search_problems
 from tune_jobs.search_space import Domain, Number, WholeNumber
 from tune_jobs.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
@@ -204,6 +205,11 @@ class SweepSpec(_Section):
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
     checkpoints: CheckpointSpec = Field(default_factory=CheckpointSpec, description="What is kept of a trial.")
     resources: ResourcesSpec = Field(default_factory=ResourcesSpec, description="CPUs, GPUs, env runners.")
+    engine: Literal["auto", "packed", "rllib"] = Field(
+        "auto",
+        description="packed: many trials at once in each process; rllib: each trial in a process of its own, by RLlib; "
+        "auto: packed where it is possible.",
+    )
     max_retries: NonNegativeWhole = Field(2, description="How often a failed trial is tried again.")
     iteration_timeout_s: PositiveNumber = Field(
         600.0, description="An iteration that takes longer counts as a failure of its trial."
@@ -282,6 +288,9 @@ def _section_problems(spec: SweepSpec) -> list[Problem]:
     if resources.num_gpus > 1 and not resources.num_gpus.is_integer():
         text = f"{resources.num_gpus:g} is not allowed: use a fraction of one GPU, or a whole number of GPUs"
         problems.append(Problem("resources.num_gpus", text))
+    if spec.engine == "packed" and (reason := why_none_is_packed(spec)) is not None:
+        text = f"packed cannot train any of the trials: {reason}. Set auto, which takes what can"
+        problems.append(Problem("engine", text))
     return problems
 
 

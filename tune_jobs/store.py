@@ -26,7 +26,7 @@ from analysis.records import (
     TrialRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from policies.files import sha256_file, write_atomic
+from policies.files import sha256_file, write_atomic, write_plain
 from tune_jobs.locks import held
 
 MANIFEST = "manifest.json"
@@ -141,11 +141,12 @@ class TrialStore:
             files = {}
             for path in sorted(temporary.rglob("*")):
                 if path.is_file():
-                    _sync(path)
                     name = path.relative_to(temporary).as_posix()
                     files[name] = {"bytes": path.stat().st_size, "sha256": sha256_file(path)}
             manifest = {"format_version": FORMAT_VERSION, **record.model_dump(mode="json"), "files": files}
-            write_atomic(temporary / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+            write_plain(temporary / MANIFEST, json.dumps(manifest, indent=1) + "\n")
+            for path in [*temporary.rglob("*"), temporary]:
+                _sync(path)
             if target.exists():
                 # A trial that went on from an earlier checkpoint writes this iteration anew.
                 shutil.rmtree(target)
@@ -185,8 +186,14 @@ class TrialStore:
 
 
 def _sync(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
+    """Wait until a file, or the names in a folder, are on disk."""
+    # Network file systems may not sync folders.
+    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def read_manifest(checkpoint: Path) -> CheckpointRecord:

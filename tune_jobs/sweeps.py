@@ -26,8 +26,9 @@ from tune_jobs.driving import (
     run_sweep,
     write_new,
 )
+from tune_jobs.machine import Machine, local_machine
 from tune_jobs.own_code import Source, load_source
-from tune_jobs.plan import Machine, local_machine, make_plan
+from tune_jobs.plan import make_plan
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore, list_sweep_stores
 
@@ -190,7 +191,7 @@ def _go_on(
             from tune_jobs.cluster import check_storage
 
             check_storage(store.folder)
-        plan = make_plan(spec, machine or connection.machine)
+        plan = make_plan(spec, machine or connection.machine, store.read_trials(), retry_failed=retry_failed)
         check_same_trials(store, plan)
         for trial in plan.trials:
             trial_store = store.trial(trial.trial_id)

@@ -14,7 +14,7 @@ import os
 import socket
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -64,34 +64,81 @@ class TrialLog:
             self._file = None
 
 
-def read_task(sweep_folder: Path, trial_id: str) -> TrialTask:
-    """What to run, from the sweep folder.
+class TaskReader:
+    """Reads from a sweep folder what to run; the sweep's own record once.
+
+    Args:
+        sweep_folder: The sweep's folder.
 
     Raises:
-        NotFoundError: There is no such sweep or trial there.
+        NotFoundError: There is no sweep there.
     """
-    store = SweepStore(sweep_folder)
-    sweep, trial = store.read_record(), store.trial(trial_id).read_record()
-    spec = SweepSpec.model_validate(sweep.spec)
-    return TrialTask(
-        sweep_folder=store.folder,
-        trial_id=trial_id,
-        seed=trial.seed,
-        algorithm=spec.algorithm,
-        hyperparams=trial.hyperparams,
-        env_id=spec.env.id,
-        env_args=spec.env.wrapped_args,
-        stop=spec.stop,
-        evaluation=spec.evaluation,
-        checkpoints=spec.checkpoints,
-        evaluation_seeds=sweep.evaluation_seeds,
-        num_env_runners=spec.resources.num_env_runners,
-        num_gpus=spec.resources.num_gpus,
-        iteration_timeout_s=spec.iteration_timeout_s,
-        failure_penalty=spec.env.failure_penalty,
-        rl_module=spec.rl_module,
-        changes=trial.changes,
-    )
+
+    def __init__(self, sweep_folder: Path) -> None:
+        self.store = SweepStore(sweep_folder)
+        self.sweep = self.store.read_record()
+        self.spec = SweepSpec.model_validate(self.sweep.spec)
+
+    def read(self, trial_id: str) -> TrialTask:
+        """What to run as a trial.
+
+        Raises:
+            NotFoundError: There is no such trial.
+        """
+        spec, trial = self.spec, self.store.trial(trial_id).read_record()
+        return TrialTask(
+            sweep_folder=self.store.folder,
+            trial_id=trial_id,
+            seed=trial.seed,
+            algorithm=spec.algorithm,
+            hyperparams=trial.hyperparams,
+            env_id=spec.env.id,
+            env_args=spec.env.wrapped_args,
+            stop=spec.stop,
+            evaluation=spec.evaluation,
+            checkpoints=spec.checkpoints,
+            evaluation_seeds=self.sweep.evaluation_seeds,
+            num_env_runners=spec.resources.num_env_runners,
+            num_gpus=spec.resources.num_gpus,
+            iteration_timeout_s=spec.iteration_timeout_s,
+            failure_penalty=spec.env.failure_penalty,
+            rl_module=spec.rl_module,
+            changes=trial.changes,
+        )
+
+
+@contextlib.contextmanager
+def watchdog(timeout_s: float, file: IO[bytes]) -> Iterator[None]:
+    """End this process, with a traceback in the log, if the block hangs: not even a thread could interrupt it.
+
+    A hung `env.step` has no time-out of its own with RLlib; Tune then starts a new process.
+    """
+    faulthandler.dump_traceback_later(timeout_s, exit=True, file=file)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def this_node() -> str:
+    """The node this process runs on, as records name it."""
+    return f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
+
+
+def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
+    """What schedulers compare a trial by.
+
+    Args:
+        progress: Where it stands.
+        grace: Env steps of a grace period.
+    """
+    score = progress.evaluation_return
+    return {
+        "evaluated": progress.evaluated,
+        "num_env_steps": progress.num_env_steps,
+        "grace_periods": progress.num_env_steps / grace,
+        METRIC: WORST_SCORE if score is None else score,
+    }
 
 
 def make_engine(algorithm: str) -> TrainingEngine:
@@ -114,7 +161,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         self._log = TrialLog()
         self._engine: TrainingEngine | None = None
         self._evaluators: dict[str, Evaluator] = {}
-        self._node = f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
+        self._node = this_node()
         self._take(config)
 
     def reset_config(self, new_config: Mapping[str, Any]) -> bool:
@@ -146,49 +193,32 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         return self._report(progress)
 
     def _open(self, folder: Path, trial_id: str) -> TrialLoop:
-        store = SweepStore(folder)
-        self._file = self._log.open(store.trial(trial_id).log_path)
-        task = read_task(folder, trial_id)
-        allow_modules(store.read_record().allowed_modules)
+        reader = TaskReader(folder)
+        self._file = self._log.open(reader.store.trial(trial_id).log_path)
+        task = reader.read(trial_id)
+        allow_modules(reader.sweep.allowed_modules)
         key = json.dumps([task.env_id, task.env_args, task.evaluation_seeds], sort_keys=True)
         if key not in self._evaluators:
             self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
-        spec = SweepSpec.model_validate(store.read_record().spec)
-        self._grace = grace_env_steps(spec.scheduler, spec.stop.num_env_steps)
+        self._grace = grace_env_steps(reader.spec.scheduler, reader.spec.stop.num_env_steps)
         if self._engine is None:
             # All trials of a sweep are of one algorithm, so this process never needs another engine.
             self._engine = make_engine(task.algorithm)
         loop = TrialLoop(task, self._engine, self._evaluators[key])
-        with self._watchdog(task.iteration_timeout_s):
+        with watchdog(task.iteration_timeout_s, self._file):
             loop.open()
         return loop
 
     def _watched(self, loop: TrialLoop) -> Progress:
-        with self._watchdog(loop.task.iteration_timeout_s + REPORT_INTERVAL_S):
+        with watchdog(loop.task.iteration_timeout_s + REPORT_INTERVAL_S, self._file):
             return loop.advance(REPORT_INTERVAL_S)
 
-    @contextlib.contextmanager
-    def _watchdog(self, timeout_s: float) -> Any:
-        """End this process, with a traceback in the log, if the block hangs: not even a thread could interrupt it.
-
-        A hung `env.step` has no time-out of its own with RLlib; Tune then retries the trial in a new process.
-        """
-        faulthandler.dump_traceback_later(timeout_s, exit=True, file=self._file)
-        try:
-            yield
-        finally:
-            faulthandler.cancel_dump_traceback_later()
-
     def _report(self, progress: Progress) -> dict[str, Any]:
-        score = progress.evaluation_return
         fields = dataclasses.asdict(progress)
         fields["checkpoints"] = [record.model_dump(mode="json") for record in progress.checkpoints]
         return {
             "done": progress.status != "running",
-            "evaluated": progress.evaluated,
-            "num_env_steps": progress.num_env_steps,
-            "grace_periods": progress.num_env_steps / self._grace,
-            METRIC: WORST_SCORE if score is None else score,
+            **compared_by(progress, self._grace),
             "progress": fields,
             "node": self._node,
             "host": socket.gethostname(),

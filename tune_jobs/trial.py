@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
-from policies.evaluate import Evaluator
-from policies.policy import NonFiniteWeightsError, policy_from_portable
+from policies.evaluate import Episodes, Evaluator
+from policies.files import write_plain
+from policies.policy import NonFiniteWeightsError, Policy, policy_from_portable
 from policies.portable import save_policy
 from tune_jobs.copies import pending_copy, remove_copies
 from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
@@ -38,7 +39,7 @@ class Progress:
     evaluated: bool
     """Whether `evaluation_return` is of this very iteration."""
     status: str
-    """running, paused (asked to stop), completed or failed."""
+    """running, paused (asked to stop), completed or failed; a pack says stopped of a member that was to be ended."""
     stop_reason: str | None = None
     error: str | None = None
     checkpoints: tuple[CheckpointRecord, ...] = ()
@@ -49,7 +50,10 @@ class Progress:
 
 
 class TrialLoop:
-    """Runs one trial.
+    """Runs one trial, by `advance`; or step by step, for a pack that trains and evaluates several together.
+
+    A step is `before_iteration`, `take` what the iteration gave, and `conclude`, with an evaluation if `take` asked for
+    one; `flush` now and then, and `leave` to end it early.
 
     Args:
         task: What to run.
@@ -77,6 +81,9 @@ class TrialLoop:
         self._checkpoints: list[CheckpointRecord] = []
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
+        # The iteration that is not concluded yet, and the stop rule that holds without its evaluation.
+        self._taken = self._last
+        self._reason: str | None = None
         # Whether the engine holds a copy of another trial's weights that has not been trained on yet.
         self._is_copy = False
         self._started = 0.0
@@ -120,7 +127,8 @@ class TrialLoop:
         The training return goes on from `changed_at`: episodes before it were played by other weights.
         """
         kept = [record for record in self._store.read_iterations() if record.iteration <= start]
-        self._store.keep_iterations(kept)
+        if self._store.results_path.exists():
+            self._store.keep_iterations(kept)
         for record in kept:
             if record.iteration > changed_at:
                 self._window.extend(record.episode_returns)
@@ -142,8 +150,7 @@ class TrialLoop:
                 if progress.status != "running" or progress.evaluated or self._clock() >= deadline:
                     return progress
         finally:
-            self._store.append_iterations(self._unwritten)
-            self._unwritten = []
+            self.flush()
 
     def pause(self) -> None:
         """Save a checkpoint of this very iteration, so that the trial can go on elsewhere."""
@@ -153,29 +160,53 @@ class TrialLoop:
             self._checkpoint(self._last.evaluation_return)
 
     def _one_iteration(self) -> Progress:
+        progress = self.before_iteration(stop=self._sweep.stop_requested())
+        if progress is not None:
+            return progress
+        evaluation: Episodes | NonFiniteWeightsError | None = None
+        if self.take(self._engine.train_iteration()):
+            try:
+                evaluation = self._evaluator.run(self.policy())
+            except NonFiniteWeightsError as error:
+                evaluation = error
+        return self.conclude(evaluation)
+
+    def before_iteration(self, *, stop: bool) -> Progress | None:
+        """How the trial ended, if no further iteration is to be trained; asked to stop, it saves and pauses."""
         # A trial that was opened at its end (its process was killed after the last checkpoint) is done already.
         reason = self._stop_reason(self._last, self._last.evaluation_return)
         if reason is not None and self._last.evaluation_return is not None:
             return self._progress("completed", evaluated=True, reason=reason)
-        if self._sweep.stop_requested():
-            self.pause()
-            return self._progress("paused", evaluated=False)
-        record = self._record(self._engine.train_iteration())
+        return self.leave() if stop else None
+
+    def take(self, stats: IterationStats) -> bool:
+        """Take what an iteration gave; returns whether `conclude` needs an evaluation of the policy as it is now."""
+        self._taken = self._record(stats)
         self._is_copy = False
-        every = self.task.evaluation.every_iterations
-        evaluated = record.iteration % every == 0
-        reason = self._stop_reason(record, None)
-        if evaluated or reason is not None:
-            try:
-                record = record.model_copy(update={"evaluation_return": self._evaluate()})
-            except NonFiniteWeightsError as error:
-                # Its later iterations would only repeat it, and a retry too: the trial is over.
-                self._last = record
-                self._unwritten.append(record)
-                return self._progress("failed", evaluated=False, error=f"{error} (iteration {record.iteration})")
-            evaluated = True
-            self._evaluation_return = record.evaluation_return
-            reason = reason or self._stop_reason(record, record.evaluation_return)
+        self._reason = self._stop_reason(self._taken, None)
+        return self._taken.iteration % self.task.evaluation.every_iterations == 0 or self._reason is not None
+
+    def policy(self) -> Policy:
+        """The current policy, as it is evaluated."""
+        return policy_from_portable(self._engine.policy())
+
+    def conclude(self, evaluation: Episodes | NonFiniteWeightsError | None) -> Progress:
+        """End the iteration: its record, its checkpoint if there is to be one, and whether the trial goes on.
+
+        Args:
+            evaluation: Greedy episodes of the policy, or that it cannot act; None: `take` asked for none.
+        """
+        record, reason = self._taken, self._reason
+        if isinstance(evaluation, NonFiniteWeightsError):
+            # Its later iterations would only repeat it, and a retry too: the trial is over.
+            self._last = record
+            self._unwritten.append(record)
+            return self._progress("failed", evaluated=False, error=f"{evaluation} (iteration {record.iteration})")
+        if evaluation is not None:
+            score = finite_or_none(sum(evaluation.returns) / len(evaluation.returns))
+            record = record.model_copy(update={"evaluation_return": score})
+            self._evaluation_return = score
+            reason = reason or self._stop_reason(record, score)
         self._last = record.model_copy(update={"time_s": self._clock() - self._started})
         self._unwritten.append(self._last)
         score = record.evaluation_return
@@ -186,7 +217,17 @@ class TrialLoop:
         ):
             self._checkpoint(score)
         status = "running" if reason is None else "completed"
-        return self._progress(status, evaluated=evaluated, reason=reason)
+        return self._progress(status, evaluated=evaluation is not None, reason=reason)
+
+    def flush(self) -> None:
+        """Write the iterations that were concluded to results.jsonl."""
+        self._store.append_iterations(self._unwritten)
+        self._unwritten = []
+
+    def leave(self) -> Progress:
+        """Save and stop here; the trial can go on elsewhere."""
+        self.pause()
+        return self._progress("paused", evaluated=False)
 
     def _record(self, stats: IterationStats) -> IterationRecord:
         returns = tuple(episode_return for episode_return, _ in stats.episodes)
@@ -201,10 +242,6 @@ class TrialLoop:
             episode_lengths=tuple(length for _, length in stats.episodes),
             learner=dict(stats.learner),
         )
-
-    def _evaluate(self) -> float | None:
-        episodes = self._evaluator.run(policy_from_portable(self._engine.policy()))
-        return finite_or_none(sum(episodes.returns) / len(episodes.returns))
 
     def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
         stop = self.task.stop
@@ -242,12 +279,11 @@ class TrialLoop:
             evaluation_return=score,
         )
         # The results first: a checkpoint whose iterations are not in results.jsonl would leave a hole in the curve.
-        self._store.append_iterations(self._unwritten)
-        self._unwritten = []
+        self.flush()
 
         def write(folder: Path) -> None:
             self._engine.save(folder)
-            save_policy(self._engine.policy(), folder)
+            save_policy(self._engine.policy(), folder, write=write_plain)
 
         self._store.write_checkpoint(record, write)
         self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]

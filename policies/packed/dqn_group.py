@@ -66,8 +66,8 @@ class DQNGroup:
         self._has_schedule = any(item.lr_final is not None for item in self._hyperparams)
         self._normalizes = self._hyperparams[0].normalize_observations
 
-    def _column(self, value: Callable[[DQNHyperparams], float]) -> Tensor:
-        return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=torch.float32)
+    def _column(self, value: Callable[[DQNHyperparams], float], dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=dtype)
 
     def _make_optimizer(self) -> StackedOptimizer:
         weights, epsilon = self._networks.weights, self._column(lambda item: item.optimizer_epsilon)
@@ -76,14 +76,14 @@ class DQNGroup:
             return StackedAdam(
                 weights,
                 lr,
-                beta1=self._column(lambda item: item.adam_beta1),
-                beta2=self._column(lambda item: item.adam_beta2),
+                beta1=self._column(lambda item: item.adam_beta1, torch.float64),
+                beta2=self._column(lambda item: item.adam_beta2, torch.float64),
                 epsilon=epsilon,
             )
         return StackedRMSprop(
             weights,
             lr,
-            rho=self._column(lambda item: item.rmsprop_rho),
+            rho=self._column(lambda item: item.rmsprop_rho, torch.float64),
             momentum=self._column(lambda item: item.rmsprop_momentum),
             epsilon=epsilon,
         )
@@ -183,15 +183,18 @@ class DQNGroup:
 
     def _stats(self, losses: Tensor, q_means: Tensor, norms: Tensor | None) -> list[dict[str, float]]:
         columns = {"total_loss": losses.tolist(), "q_mean": q_means.tolist(), "lr": self._optimizer.lr[:, 0].tolist()}
+        stats = [{name: values[index] for name, values in columns.items()} for index in range(len(self.members))]
         if norms is not None:
-            columns["gradient_norm"] = norms[:, 0].tolist()
-        return [
-            {name: values[index] for name, values in columns.items() if math.isfinite(values[index])}
-            for index in range(len(self.members))
-        ]
+            for found, norm, item in zip(stats, norms[:, 0].tolist(), self._hyperparams, strict=True):
+                if item.grad_clip is not None:  # the others' is computed beside it
+                    found["gradient_norm"] = norm
+        return [{name: value for name, value in found.items() if math.isfinite(value)} for found in stats]
 
     def write_back(self) -> None:
         """Give the members their weights and moments as they are now."""
         self._rows.write_back(self._optimizer)
+        for member, item in zip(self.members, self._hyperparams, strict=True):
+            if not item.rmsprop_momentum:  # the buffer is the last step itself, and nothing depends on it
+                member.moments.pop("momentum_buffer", None)
         if self._targets is not None:
             self._targets.write_back()

@@ -61,6 +61,7 @@ class DQNStack:
         self._replay: StackedReplay | None = None
         self._n_step: StackedNStep | None = None
         self._stale, self._is_written = False, True
+        self._updates_per_phase = 0.0
         # Env steps at which a restored member's replay memory is as full as it was when learning began.
         self._refilled_at: dict[str, int] = {}
         self._unlearned: list[Floats] = []
@@ -75,7 +76,11 @@ class DQNStack:
         if self._replay is None or self._n_step is None:
             self._replay = make_stacked_replay(hyperparams, self._num_inputs)
             self._n_step = StackedNStep(self.envs.num_envs, self._num_inputs, hyperparams.n_step)
-        self._replay.add_member(member.member_id, hyperparams)
+        try:
+            self._replay.add_member(member.member_id, hyperparams)
+        except MemoryError:
+            self.envs.remove(member.member_id)
+            raise
         self._n_step.add_member(member.member_id, hyperparams)
         self._episodes.add(member.member_id, self.envs.num_envs)
         if member.num_updates and hyperparams.replay != "none":
@@ -116,7 +121,11 @@ class DQNStack:
         """Make the groups anew: of members that learn at the same time, whatever their place among the rows."""
         self._write_back()
         assert self._replay is not None
-        groups = group_members(self.members, _MAX_GROUP, lambda item: (self._learns(item), round(item.due, 6)))
+        groups = group_members(
+            self.members,
+            _MAX_GROUP,
+            lambda item: (self._learns(item), self._num_updates(item), round(item.due, 6)),
+        )
         places = {member.member_id: index for index, member in enumerate(self.members)}
         self._groups = []
         for members in groups:
@@ -133,8 +142,9 @@ class DQNStack:
         self.members = [member for group in group_members(self.members) for member in group]
         self._ids = [member.member_id for member in self.members]
         self.envs.arrange(self._ids)
-        first = self.members[0].hyperparams
+        first = cast("DQNHyperparams", self.members[0].hyperparams)
         self._normalizes = first.normalize_observations
+        self._updates_per_phase = _steps_per_phase(first) * self.envs.num_envs * first.updates_per_env_step
         self._schedules = [EpsilonSchedule.of(cast("DQNHyperparams", item.hyperparams)) for item in self.members]
         self._observations = Observations(self.members, self.envs.num_envs, normalizes=self._normalizes)
         self._regroup()
@@ -149,16 +159,25 @@ class DQNStack:
         (size,) = self._replay.sizes(self._replay.slots([member.member_id]))
         return member.num_env_steps >= hyperparams.learning_starts and bool(size >= hyperparams.train_batch_size)
 
+    def _num_updates(self, member: Member) -> int:
+        """Updates of a member in a training phase now; 10 x 0.1 is a little less than 1 in binary."""
+        return math.floor(member.due + self._updates_per_phase + 1e-9)
+
+    def _is_mixed(self, group: DQNGroup) -> bool:
+        """Whether updates are due to some members of a group and not to others: sums of fractions drift apart."""
+        if not group.learns:
+            return any(map(self._learns, group.members))
+        return len(set(map(self._num_updates, group.members))) > 1
+
     def train_iteration(self) -> dict[str, MemberStats]:
         """See `Stack.train_iteration`."""
         if self._stale:
             self._arrange()
         first = cast("DQNHyperparams", self.members[0].hyperparams)
-        num_envs = self.envs.num_envs
-        steps_per_phase = math.ceil(first.train_freq / num_envs)
+        num_envs, updates_per_phase = self.envs.num_envs, self._updates_per_phase
+        steps_per_phase = _steps_per_phase(first)
         new_steps = steps_per_phase * num_envs
         num_phases = math.ceil(first.env_steps_per_iteration / new_steps)
-        updates_per_phase = new_steps * first.updates_per_env_step
         at_once = max(1, _NUMBERS_AT_ONCE // ((math.floor(updates_per_phase) + 1) * first.train_batch_size))
         stats: dict[str, dict[str, float]] = {}
         rewards, ended = [], []
@@ -172,7 +191,7 @@ class DQNStack:
                     ended.append(step.terminated | step.truncated)
                 # Updates may be rarer than phases: the numbers of the last that is made are wanted.
                 is_late = (num_phases - phase - 1) * updates_per_phase <= 1.0
-                self._learn(draws, phase - start, updates_per_phase, new_steps, stats if is_late else None)
+                self._learn(draws, phase - start, new_steps, stats if is_late else None)
         episodes = self._episodes.follow(self._ids, np.stack(rewards), np.stack(ended))
         for member in self.members:
             member.num_iterations += 1
@@ -232,25 +251,16 @@ class DQNStack:
             self._unlearned.append(observations)
         return step
 
-    def _learn(
-        self,
-        draws: _Draws,
-        phase: int,
-        updates_per_phase: float,
-        new_steps: int,
-        stats: dict[str, dict[str, float]] | None,
-    ) -> None:
+    def _learn(self, draws: _Draws, phase: int, new_steps: int, stats: dict[str, dict[str, float]] | None) -> None:
         """The training phase of every member that learns."""
-        if any(not group.learns and any(map(self._learns, group.members)) for group in self._groups):
+        if any(map(self._is_mixed, self._groups)):
             self._regroup()
         for group in self._groups:
             if not group.learns:
                 continue
-            due = group.members[0].due + updates_per_phase
-            # 10 x 0.1 is a little less than 1 in binary.
-            num_updates = math.floor(due + 1e-9)
+            num_updates = self._num_updates(group.members[0])
             for member in group.members:
-                member.due = due - num_updates
+                member.due = member.due + self._updates_per_phase - num_updates
             if not num_updates:
                 continue
             self._is_written = False
@@ -271,3 +281,8 @@ class DQNStack:
             if member.num_env_steps > self._refilled_at.get(member.member_id, 0):
                 merge_statistics(member, rows[:, index].reshape(-1, self._num_inputs))
         self._observations = Observations(self.members, self.envs.num_envs, normalizes=True)
+
+
+def _steps_per_phase(hyperparams: DQNHyperparams) -> int:
+    """Vector steps between two training phases."""
+    return math.ceil(hyperparams.train_freq / hyperparams.num_envs)

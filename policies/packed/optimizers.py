@@ -38,8 +38,8 @@ class StackedAdam:
     Args:
         weights: (K, P); moved in place.
         lr: (K, 1).
-        beta1: Decay of the mean gradient, (K, 1).
-        beta2: Decay of the squared gradient, (K, 1).
+        beta1: Decay of the mean gradient, (K, 1), float64: of one near 1, 1 - beta is exact only there.
+        beta2: Decay of the squared gradient, as beta1.
         epsilon: (K, 1).
     """
 
@@ -85,14 +85,15 @@ class StackedRMSprop:
     Args:
         weights: (K, P); moved in place.
         lr: (K, 1).
-        rho: Decay of the squared gradient, (K, 1).
+        rho: Decay of the squared gradient, (K, 1), float64.
         momentum: (K, 1).
         epsilon: (K, 1).
     """
 
     def __init__(self, weights: Tensor, lr: Tensor, rho: Tensor, momentum: Tensor, epsilon: Tensor) -> None:
         self.weights, self.lr = weights, lr
-        self._rho, self._weight, self._momentum, self._epsilon = rho, 1 - rho, momentum, epsilon
+        self._momentum, self._epsilon = momentum, epsilon
+        self._rho, self._weight = rho.float(), (1 - rho).float()
         self.state = {"square_avg": torch.zeros_like(weights), "momentum_buffer": torch.zeros_like(weights)}
         self.num_steps = torch.zeros_like(lr, dtype=torch.float64)
 

@@ -82,8 +82,8 @@ def gradients(
     ratio = (logp - batch.logp).exp_()
     surrogate = batch.advantages * ratio
     limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param).mul_(batch.advantages)
-    # The minimum passes a gradient where the ratio itself is the smaller one, or both are equal.
-    weight = torch.where(surrogate <= limited, surrogate, 0.0).mul_(1 / num_rows)
+    # The minimum passes a gradient where the ratio itself is the smaller one, or both are equal; and what is no number.
+    weight = torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / num_rows)
     out = (probabilities - batch.actions).mul_(weight.unsqueeze(-1))
     if bool(coefficients.entropy_coeff.any()):
         entropy = -(probabilities * logp_all).sum(dim=-1, keepdim=True)
@@ -100,7 +100,7 @@ def _value_gradient(values: Tensor, batch: Minibatch, coefficients: Coefficients
     factor = coefficients.vf_loss_coeff * (2 / values.shape[1])
     if bool(coefficients.vf_clip_param.isinf().all()):
         return errors.mul_(factor)
-    return torch.where(errors**2 <= coefficients.vf_clip_param, errors, 0.0).mul_(factor)
+    return torch.where(errors**2 > coefficients.vf_clip_param, 0.0, errors).mul_(factor)
 
 
 def _by_autograd(

@@ -73,8 +73,8 @@ class PPOGroup:
         self._optimizer = StackedAdam(
             self._networks.weights,
             lr=column(lambda member: member.hyperparams.lr),
-            beta1=column(lambda _: _BETA1),
-            beta2=column(lambda _: _BETA2),
+            beta1=column(lambda _: _BETA1, torch.float64),
+            beta2=column(lambda _: _BETA2, torch.float64),
             epsilon=column(lambda _: _EPSILON),
         )
         self._rows.read_moments(self._optimizer)
@@ -225,6 +225,8 @@ class PPOGroup:
                 member.kl_coeff = _next_kl_coeff(member.kl_coeff, found["kl"], item.kl_target)
             else:
                 del found["kl"]
+            if item.grad_clip is None:
+                found.pop("gradient_norm", None)  # computed because another member's is clipped
             stats.append({name: value for name, value in found.items() if math.isfinite(value)})
         return stats
 

@@ -45,14 +45,14 @@ class StackedRows:
                 row = number * len(self._members) + index
                 yield row, [layer[row] for layer in layers], member, layout
 
-    def per_row(self, value: Callable[[Member], float]) -> Tensor:
+    def per_row(self, value: Callable[[Member], float], dtype: torch.dtype = torch.float32) -> Tensor:
         """A number of each member as a column over all rows, (n * M, 1)."""
-        return self.per_member(value).repeat(self.networks_per_member, 1)
+        return self.per_member(value, dtype).repeat(self.networks_per_member, 1)
 
-    def per_member(self, value: Callable[[Member], float]) -> Tensor:
+    def per_member(self, value: Callable[[Member], float], dtype: torch.dtype = torch.float32) -> Tensor:
         """A number of each member, (M, 1)."""
         values = [[value(member)] for member in self._members]
-        return torch.tensor(values, dtype=torch.float32, device=self.networks.weights.device)
+        return torch.tensor(values, dtype=dtype, device=self.networks.weights.device)
 
     def read_moments(self, optimizer: StackedOptimizer) -> None:
         """Give the optimizer the members' moments and step counts."""

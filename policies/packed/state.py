@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 
 from policies.errors import CheckpointError
-from policies.files import write_atomic
+from policies.files import write_plain
 from policies.hyperparams import Algorithm, PPOHyperparams, make_hyperparams
-from policies.packed.member import Member, Weights
+from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
 
 STATE_FOLDER = "packed"
 _FORMAT_VERSION = 1
@@ -21,6 +21,9 @@ _COUNTERS = (
     "target_updates_at", "num_target_updates",
 )  # fmt: skip
 _WEIGHTS = "weights"
+_STATISTICS = (OBS_MEAN, OBS_VAR, OBS_COUNT)
+_MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"})
+"""Of Adam and of RMSprop."""
 _HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
 
 
@@ -34,9 +37,10 @@ def save_member(member: Member, folder: Path) -> None:
     from safetensors.numpy import save
 
     folder.mkdir(parents=True, exist_ok=True)
-    tensors = {f"{_WEIGHTS}/{name}": np.ascontiguousarray(value) for name, value in member.weights.items()}
+    # Not by ascontiguousarray, which makes one of a single number.
+    tensors = {f"{_WEIGHTS}/{name}": np.asarray(value, order="C") for name, value in member.weights.items()}
     for moment, weights in member.moments.items():
-        tensors |= {f"{moment}/{name}": np.ascontiguousarray(value) for name, value in weights.items()}
+        tensors |= {f"{moment}/{name}": np.asarray(value, order="C") for name, value in weights.items()}
     description = {
         "format_version": _FORMAT_VERSION,
         "algorithm": "ppo" if isinstance(member.hyperparams, PPOHyperparams) else "dqn",
@@ -45,8 +49,8 @@ def save_member(member: Member, folder: Path) -> None:
         "counters": {name: getattr(member, name) for name in _COUNTERS},
         "rng": member.rng.bit_generator.state,
     }
-    write_atomic(folder / _TENSORS, save(tensors))
-    write_atomic(folder / _JSON, json.dumps(description, indent=1) + "\n")
+    write_plain(folder / _TENSORS, save(tensors))
+    write_plain(folder / _JSON, json.dumps(description, indent=1) + "\n")
 
 
 def load_member(folder: Path, member_id: str) -> Member:
@@ -85,10 +89,16 @@ def load_member(folder: Path, member_id: str) -> Member:
             weights=parts.pop(_WEIGHTS),
             moments=parts,
             rng=rng,
-            **{name: description["counters"][name] for name in _COUNTERS},
+            **{name: _number(description["counters"][name]) for name in _COUNTERS},
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder} does not hold a member's state: {error!r}.", _HINT) from error
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{value!r} is no number")
+    return value
 
 
 def check_shapes(member: Member, expected: Weights) -> None:
@@ -109,6 +119,10 @@ def check_shapes(member: Member, expected: Weights) -> None:
                 raise CheckpointError(
                     f"The saved {part} {name} have shape {value.shape}, the network's have {shape}.", _HINT
                 )
-    missing = sorted(set(expected) - set(member.weights))
-    if missing:
-        raise CheckpointError(f"The saved weights lack {', '.join(missing)}.", _HINT)
+    trained = {name for name in expected if not name.startswith((*_STATISTICS, TARGET_PREFIX))}
+    for part, needed in {_WEIGHTS: set(expected), **dict.fromkeys(member.moments, trained)}.items():
+        found = member.weights if part == _WEIGHTS else member.moments[part]
+        if missing := sorted(needed - set(found)):
+            raise CheckpointError(f"The saved {part} lack {', '.join(missing)}.", _HINT)
+    if member.num_optimizer_steps and set(member.moments) not in _MOMENTS:
+        raise CheckpointError(f"The optimizer's moments are {', '.join(member.moments) or 'missing'}.", _HINT)

@@ -12,6 +12,7 @@ import torch
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
+from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
 from policies.dqn_algorithm import ReplayDQN
 from policies.errors import CheckpointError
@@ -129,14 +130,24 @@ def _take_over(algorithm: Algorithm, member: Member) -> None:
                 optimizer.state[param] = {"step": torch.tensor(float(member.num_optimizer_steps)), **moments}
     algorithm.env_runner_group.sync_weights(from_worker_or_learner_group=algorithm.learner_group, inference_only=True)
     algorithm._iteration = member.num_iterations  # noqa: SLF001 - RLlib sets it only from its own checkpoints
-    algorithm.metrics.log_value(
-        (ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME), member.num_env_steps, reduce="lifetime_sum"
-    )
+    _count_env_steps(algorithm, member.num_env_steps)
     if isinstance(algorithm, ReplayDQN):
         algorithm.num_env_steps, algorithm.num_episodes = member.num_env_steps, member.num_episodes
-        algorithm.num_updates = member.num_updates
+        algorithm.num_updates, algorithm._due = member.num_updates, member.due  # noqa: SLF001
         learner.target_updates_at = member.target_updates_at
         learner.num_target_updates = member.num_target_updates
     else:
-        for coefficient in learner.curr_kl_coeffs_per_module.values():
-            coefficient.data.fill_(member.kl_coeff)
+        # A dict that makes its values when they are first asked for: there is none to loop over yet.
+        learner.curr_kl_coeffs_per_module[DEFAULT_MODULE_ID].data.fill_(member.kl_coeff)
+
+
+def _count_env_steps(algorithm: Algorithm, num_env_steps: int) -> None:
+    """Have the Algorithm count env steps on from there, in the way that its algorithm counts them (RLlib 2.60)."""
+    if isinstance(algorithm, ReplayDQN):
+        key = (ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME)
+        algorithm.metrics.log_value(key, num_env_steps, reduce="lifetime_sum")
+        return
+    # What env runners report is merged, and nothing can be merged into what was logged: so as if one had reported it.
+    reported = MetricsLogger(root=False)
+    reported.log_value(NUM_ENV_STEPS_SAMPLED_LIFETIME, num_env_steps, reduce="lifetime_sum", with_throughput=True)
+    algorithm.metrics.aggregate([reported.reduce()], key=ENV_RUNNER_RESULTS)

@@ -7,9 +7,11 @@ import statistics
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from policies.hyperparams import DQNHyperparams, make_hyperparams
 from tests.benchmarks.measure import run
+from tests.benchmarks.ppo import pack_rows, pack_speed, speeds
 from tune_jobs.spec import SweepSpec
 from tune_jobs.spec_file import list_presets, load_spec
 
@@ -33,11 +35,9 @@ def ours(num_env_steps: int) -> float:
 
     It is evaluated at the end alone, over 20 episodes: the peer is not evaluated at all.
     """
-    from tests.benchmarks.__main__ import speeds
-
     storage = Path(tempfile.mkdtemp())
     changes = ["stop.evaluation_return=", "stop.training_return=", f"stop.num_env_steps={num_env_steps}"]
-    changes += ["seeds_per_point=1", "resources.max_concurrent=1"]
+    changes += ["seeds_per_point=1", "resources.max_concurrent=1", "engine=rllib"]
     changes += ["evaluation.every_iterations=1000", "evaluation.num_episodes=20"]
     command = [_CLI, "launch", PRESET, "--storage", str(storage), "--name", "dqn", "--no-finish"]
     run([*command, *(part for change in changes for part in ("--set", change))], cwd=ROOT)
@@ -59,14 +59,26 @@ def rows(repeats: int, num_env_steps: int, *, peers: bool) -> list[tuple[str, st
     if PRESET not in {preset.name for preset in list_presets()}:
         return [("DQN env steps/s a core", f"skipped: there is no preset {PRESET}", "2,500")]
     mine: list[float] = []
+    packs: list[dict[str, Any]] = []
     theirs: dict[str, list[float]] = {buffer: [] for buffer in (BUFFERS if peers else ())}
     for _ in range(repeats):
         mine.append(ours(num_env_steps))
+        packs.append(pack_speed("dqn", 20, 8))
         for buffer, values in theirs.items():
             values.append(stock(buffer, num_env_steps))
     speed = statistics.median(mine)
-    table = [(f"DQN env steps/s a core, {PRESET}", f"{speed:,.0f}", "2,500")]
+    table = [
+        *pack_rows(f"pack of 20, {PRESET}", packs, "20 x one RLlib DQN"),
+        (f"DQN env steps/s a core, {PRESET}, engine rllib", f"{speed:,.0f}", "2,500"),
+    ]
+    pack = statistics.median(float(item["env_steps_per_s"]) for item in packs)
     for buffer, values in theirs.items():
         peer = statistics.median(values)
-        table.append((f"the same, plain RLlib DQN, its {buffer} buffer", f"{peer:,.0f}, {peer / speed:.2f} x ours", ""))
+        table.append(
+            (
+                f"the same, plain RLlib DQN, its {buffer} buffer",
+                f"{peer:,.0f}; the pack of 20 makes {pack / peer:.0f} x",
+                "",
+            )
+        )
     return table

@@ -31,9 +31,33 @@ def points() -> list[dict[str, Any]]:
     ]
 
 
-def sweep_file(num_env_steps: int = NUM_ENV_STEPS) -> dict[str, Any]:
-    """The same work as a sweep file; evaluations, which the peers don't make, come on top."""
+def hyperparams(point: dict[str, Any]) -> dict[str, Any]:
+    """All that the work sets, for one point."""
     return {
+        "num_envs": NUM_ENVS,
+        "train_batch_size": BATCH_SIZE,
+        "minibatch_size": MINIBATCH_SIZE,
+        "num_epochs": NUM_EPOCHS,
+        "gamma": GAMMA,
+        "gae_lambda": GAE_LAMBDA,
+        "hidden_sizes": [point["hidden_size"]],
+        "activation": point["activation"],
+        "lr": point["lr"],
+    }
+
+
+def sweep_file(
+    num_env_steps: int = NUM_ENV_STEPS, *, engine: str = "auto", num_samples: int = NUM_SAMPLES
+) -> dict[str, Any]:
+    """The same work as a sweep file; evaluations, which the peers don't make, come on top.
+
+    Args:
+        num_env_steps: Of each trial.
+        engine: What trains them.
+        num_samples: Draws for each of the grid's four combinations.
+    """
+    return {
+        "engine": engine,
         "env": ENV_ID,
         "algorithm": "ppo",
         "hyperparams": {
@@ -49,8 +73,7 @@ def sweep_file(num_env_steps: int = NUM_ENV_STEPS) -> dict[str, Any]:
             "activation": {"grid": ["linear", "relu"]},
             "lr": {"uniform": [1e-7, 1e-2]},
         },
-        "num_samples": NUM_SAMPLES,
+        "num_samples": num_samples,
         "stop": {"num_env_steps": num_env_steps},
         "checkpoints": {"every_iterations": CHECKPOINT_EVERY, "keep": CHECKPOINTS_KEPT},
-        "resources": {"max_concurrent": NUM_CPUS},
     }

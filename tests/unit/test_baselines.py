@@ -21,7 +21,8 @@ from tune_jobs import finish, sweeps
 from tune_jobs.driving import write_new
 from tune_jobs.engines.baseline import BaselineEngine
 from tune_jobs.engines.protocol import TrialTask
-from tune_jobs.plan import Machine, make_plan
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
 from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.spec_file import load_spec
 from tune_jobs.store import SweepStore

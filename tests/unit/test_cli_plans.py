@@ -24,7 +24,9 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
     for part in (
         "CartPole-v0 (solved at 195)",
         "20: 20 points",
-        "1, each on 1 CPU",
+        "packed; environments: vectorised, ",
+        " us a step",
+        "1 in 1 pack of up to 1, each pack on 1 CPU",
         "at most 2,020,620",
         "MB",
         "t0019",
@@ -48,14 +50,40 @@ def test_a_dry_run_as_json_holds_spec_and_plan(run):
     assert document["spec"]["name"] == "mine"
     assert document["plan"]["num_trials"] == len(document["plan"]["trials"]) == 20
     assert document["plan"]["env"]["threshold"] == 195.0
+    assert document["plan"]["engines"] == {"packed": 20}
+    assert {trial["engine"] for trial in document["plan"]["trials"]} == {"packed"}
+    packs = document["plan"]["packs"]
+    assert packs["num_packs"] * packs["slots"] >= 20
+    assert packs["env_kind"] == "vectorised"
+    assert packs["trial_ids"][0] == "t0000"
+
+
+def test_a_dry_run_says_what_is_not_packed_and_why(run):
+    output = run("launch", "cartpole-ppo", "--dry-run", "--set", "scheduler=hyperband").stdout
+    assert "note: No trial is packed, RLlib trains them all: scheduler.type is hyperband" in output
+    document = json.loads(run("launch", "cartpole-ppo", "--dry-run", "--json", "--set", "engine=rllib").stdout)
+    planned = document["plan"]
+    assert (planned["engines"], planned["packs"], planned["notes"]) == ({"rllib": 20}, None, [])
+    # A baseline's engine is its own, which nobody has to be told.
+    output = run("launch", "cartpole-random", "--dry-run").stdout
+    assert any(line.split() == ["engine", "baseline"] for line in output.splitlines())
+    assert "note:" not in output
+
+
+def test_a_dry_run_says_that_memory_makes_packs_smaller(run, sweeps):
+    from tune_jobs.machine import Machine
+
+    sweeps.machine = lambda address: Machine(7, source=f"the cluster at {address}", memory_bytes=2e7)
+    output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
+    assert "note: Packs are planned smaller: 7 x 3 trials at once may take" in output
 
 
 def test_a_dry_run_for_a_cluster_plans_for_the_clusters_machine(run, sweeps):
-    from tune_jobs.plan import Machine
+    from tune_jobs.machine import Machine
 
     sweeps.machine = lambda address: Machine(7, source=f"the cluster at {address}")
     output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
-    assert "7, each on 1 CPU; the cluster at auto has 7 CPUs" in output
+    assert "20 in 7 packs of up to 3, each pack on 1 CPU; the cluster at auto has 7 CPUs" in output
 
 
 BAD_INPUT = {
@@ -92,6 +120,12 @@ BAD_INPUT = {
         {"set": "env=Pendulum-v1", "more": ["--set", "algorithm=dqn"]},
         2,
         ["Pendulum-v1", "continuous"],
+    ),
+    "engine": ({"set": "engine=packt"}, 2, ["engine: 'packt'", "Did you mean 'packed'?"]),
+    "engine that cannot": (
+        {"set": "engine=packed", "more": ["--set", "scheduler=hyperband"]},
+        2,
+        ["engine: packed", "scheduler.type is hyperband"],
     ),
     "no file": ({"spec": "nothing.yaml"}, 2, ["'nothing.yaml'", "cartpole-ppo"]),
     "no yaml": ({"text": "env: [\n"}, 2, ["sweep.yaml, line 2"]),

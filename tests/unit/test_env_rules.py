@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from policies.errors import EnvError, SpecError
-from tune_jobs.plan import Machine, make_plan
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
 from tune_jobs.spec_file import load_spec
 
 

@@ -7,8 +7,9 @@ import os
 import pytest
 
 from policies.errors import CannotRunError, EnvError, SpecError
-from tune_jobs import plan as plan_module
-from tune_jobs.plan import Machine, local_machine, make_plan, trial_id
+from tune_jobs import machine as machine_module
+from tune_jobs.machine import Machine, local_machine
+from tune_jobs.plan import make_plan, trial_id
 from tune_jobs.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec_file import load_spec
 
@@ -22,7 +23,8 @@ def plan(*overrides, machine=TWO_CORES, source="cartpole-ppo"):
 def test_the_tutorials_sweep():
     made = plan()
     assert (len(made.trials), made.num_points) == (20, 20)
-    assert (made.cpus_per_trial, made.gpus_per_trial, made.max_concurrent) == (1, 0, 2)
+    assert (made.cpus_per_trial, made.gpus_per_trial, made.max_concurrent) == (1, 0, 20)
+    assert made.engines == {"packed": 20}
     assert [trial.trial_id for trial in made.trials[:2]] == ["t0000", "t0001"]
     assert len(made.evaluation_seeds) == 20
     assert len(made.confirmation_seeds) == 100
@@ -83,7 +85,7 @@ def test_trials_do_not_depend_on_anything_else(change):
     ],
 )
 def test_as_many_trials_at_once_as_fit(overrides, machine, expected):
-    assert plan(*overrides, machine=machine).max_concurrent == expected
+    assert plan("engine=rllib", *overrides, machine=machine).max_concurrent == expected
 
 
 @pytest.mark.parametrize(
@@ -196,7 +198,7 @@ def test_disk_counts_what_convolutions_make_of_an_image():
 def test_notes_tell_what_may_not_be_meant():
     assert "repeats every point" in plan("space.lr=").notes[0]
     assert "below CartPole-v0's threshold 195" in plan("stop.training_return=100").notes[0]
-    assert "only 2 trials fit" in plan("resources.max_concurrent=8").notes[0]
+    assert "only 2 trials fit" in plan("resources.max_concurrent=8", "engine=rllib").notes[0]
     assert plan("space=", "num_samples=1").notes == ()
 
 
@@ -208,6 +210,9 @@ def test_this_machine_has_no_more_cpus_than_may_be_used():
     machine = local_machine()
     assert 1 <= machine.num_cpus <= len(os.sched_getaffinity(0))
     assert machine.num_cpus == math.floor(machine.num_cpus)
+    # /proc/meminfo is there wherever the affinity is.
+    assert machine.memory_bytes is not None
+    assert 1e6 < machine.memory_bytes < 1e15
 
 
 @pytest.mark.parametrize(
@@ -225,7 +230,40 @@ def test_container_limits_are_read(tmp_path, files, expected):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(text)
-    assert plan_module._cgroup_quota(tmp_path) == expected
+    assert machine_module._cgroup_quota(tmp_path) == expected
+
+
+V1 = {"memory/memory.limit_in_bytes": "5000\n", "memory/memory.usage_in_bytes": "4000\n"}
+V2 = {"memory.max": "5000\n", "memory.current": "4000\n"}
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (V2 | {"memory.stat": "anon 3000\ninactive_file 700\n"}, 1700),
+        (V2 | {"memory.max": "max\n", "memory.stat": "inactive_file 700\n"}, None),
+        (V2 | {"memory.current": "7000\n", "memory.stat": "inactive_file 700\n"}, 0),
+        (V1 | {"memory/memory.stat": "inactive_file 1\ntotal_inactive_file 700\n"}, 1700),
+        (V2, None),
+        ({}, None),
+    ],
+)
+def test_a_containers_limit_of_memory_is_read_without_the_files_it_keeps(tmp_path, files, expected):
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    assert machine_module._cgroup_memory(tmp_path) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("MemTotal: 9 kB\nMemAvailable:    3 kB\n", 3072), ("MemTotal: 9 kB\n", None), ("MemAvailable:\n", None)],
+)
+def test_available_memory_is_read(tmp_path, text, expected):
+    (tmp_path / "meminfo").write_text(text)
+    assert machine_module._available_memory(tmp_path / "meminfo") == expected
+    assert machine_module._available_memory(tmp_path / "none") is None
 
 
 @pytest.mark.parametrize(("visible", "expected"), [("", 0), ("-1", 0), ("0", 1), ("0,2", 2)])

@@ -6,7 +6,8 @@ from spec_errors import MINIMAL, errors
 from analysis.records import ChangeRecord
 from policies.errors import CannotRunError
 from tune_jobs.driving import check_same_trials, pending_record, write_new
-from tune_jobs.plan import Machine, make_plan
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
 from tune_jobs.spec_file import load_spec
 from tune_jobs.store import SweepStore
 
@@ -86,7 +87,7 @@ def test_a_grid_is_a_population_of_its_values():
 def test_a_tpe_plan_names_all_trials_and_the_points_of_the_first():
     spec = load_spec({**MINIMAL, **TPE, "seeds_per_point": 2, "search": {"type": "tpe", "num_startup_trials": 3}})
     plan = make_plan(spec, MACHINE)
-    assert (len(plan.trials), plan.num_points, plan.max_concurrent) == (40, 20, 2)
+    assert (len(plan.trials), plan.num_points, plan.max_concurrent) == (40, 20, 4)
     assert [trial.has_point for trial in plan.trials] == [True] * 6 + [False] * 34
     assert all(trial.point["lr"] == trial.hyperparams["lr"] for trial in plan.trials[:6])
     assert all(trial.point == trial.hyperparams == {} for trial in plan.trials[6:])

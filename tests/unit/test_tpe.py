@@ -10,7 +10,8 @@ import pytest
 
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.plan import Machine, make_plan
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
 from tune_jobs.search_space import draw_point
 from tune_jobs.spec_file import load_spec
 from tune_jobs.tpe import propose_point

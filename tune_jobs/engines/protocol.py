@@ -1,7 +1,8 @@
 """What an engine is: the one thing that knows how a trial's iterations are computed.
 
 Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is `tune_jobs.trial`'s and the same
-for all engines. This module imports no ray, so that both sides can import it.
+for all engines. There are two kinds: those that train one trial at a time, and those that train a pack of them together
+(`tune_jobs.pack_loop`). This module imports no ray, so that both sides can import it.
 """
 
 from __future__ import annotations
@@ -86,4 +87,42 @@ class TrainingEngine(Protocol):
 
     def close(self) -> None:
         """Free everything; `build` may follow."""
+        ...
+
+
+class PackEngine(Protocol):
+    """Trains many trials together, the members of a pack; they come and go."""
+
+    def add(self, task: TrialTask, checkpoint: Path | None) -> None:
+        """Take in a trial, fresh or exactly as a checkpoint folder holds it; the other members do not notice.
+
+        Raises:
+            CheckpointError: The checkpoint cannot be restored. Never starts afresh instead.
+            Exception: The trial cannot be built; it is no member then.
+        """
+        ...
+
+    def train_iteration(self) -> dict[str, IterationStats | Exception]:
+        """Train every member for one iteration.
+
+        Returns:
+            By trial id, of every member: what the iteration gave, or why the member failed. One that failed stays until
+            it is removed; the others have been trained.
+        """
+        ...
+
+    def policy(self, trial_id: str) -> PortablePolicy:
+        """The current greedy policy of a member."""
+        ...
+
+    def save(self, trial_id: str, folder: Path) -> None:
+        """Write what `add` needs into an empty folder."""
+        ...
+
+    def remove(self, trial_id: str) -> None:
+        """Forget a member; the others do not notice."""
+        ...
+
+    def close(self) -> None:
+        """Free everything."""
         ...

@@ -1,0 +1,214 @@
+"""The cases of DQN's hyperparameters in a pack: each changes training as it should, or fails.
+
+Here those of an update, which compare two members, one with the hyperparameter changed, with RLlib's Learner, and of
+the network; the others are in `packed_dqn_traces`.
+"""
+
+import numpy as np
+import pytest
+from packed_dqn import add, compare, differences, make_stack, q_values_of
+
+from policies.hyperparams import ACTIVATIONS, DQNHyperparams
+
+CASES = {}
+
+
+def arrives(*names):
+    """Make a function the case of these fields."""
+
+    def add_names(check):
+        for name in names:
+            assert name not in CASES
+            CASES[name] = check
+        return check
+
+    return add_names
+
+
+# -- of an update
+
+
+def updates(shared=None, **values):
+    """Training phases of two members, the second one with these values, and as RLlib's Learner makes them."""
+    shared = shared or {}
+    ((plain, _), (changed, theirs)), _ = compare([shared, {**shared, **values}], seeds=[3, 3], only=[1])
+    for what, value in differences(changed, theirs).items():
+        assert value < 1e-5, what
+    return plain, changed
+
+
+def other_weights(one, another, updates_before=0):
+    """The largest difference of the weights after an update."""
+    ours, theirs = one.weights[updates_before], another.weights[updates_before]
+    return max(np.abs(ours[name] - theirs[name]).max() for name in ours)
+
+
+def check_update(shared=None, **values):
+    """RLlib's update with these values is the pack's, and another one than without."""
+    plain, changed = updates(shared, **values)
+    assert other_weights(plain, changed) > 1e-4
+
+
+def check_shared(values, shared=None):
+    """The same of what all members of a stack have in common."""
+    ((plain, _),) = compare([shared or {}], seeds=[3], only=[])[0]
+    ((changed, expected),) = compare([{**(shared or {}), **values}], seeds=[3])[0]
+    assert max(differences(changed, expected).values()) < 1e-5
+    assert abs(plain.losses[0] - changed.losses[0]) > 1e-4
+
+
+@arrives("lr")
+def check_lr():
+    check_update(lr=5e-3)
+
+
+@arrives("grad_clip")
+def check_grad_clip():
+    plain, changed = updates(grad_clip=0.3)
+    norms = [np.sqrt(sum((value**2).sum() for value in one.gradients[0].values())) for one in (plain, changed)]
+    assert norms[0] > 0.5
+    assert norms[1] == pytest.approx(0.3, rel=1e-4)
+
+
+@arrives("optimizer")
+def check_optimizer():
+    for name, moments in (("adam", {"exp_avg", "exp_avg_sq"}), ("rmsprop", {"square_avg"})):
+        for ours, theirs in compare([{"optimizer": name}])[0]:
+            assert max(differences(ours, theirs).values()) < 1e-5
+            assert set(ours.moments) == moments
+
+
+@arrives("optimizer_epsilon")
+def check_optimizer_epsilon():
+    check_update(optimizer_epsilon=0.1)
+    check_update({"optimizer": "rmsprop"}, optimizer_epsilon=0.1)
+
+
+@arrives("adam_beta1")
+def check_adam_beta1():
+    check_update(adam_beta1=0.3)
+
+
+@arrives("adam_beta2")
+def check_adam_beta2():
+    check_update(adam_beta2=0.3)
+
+
+@arrives("rmsprop_rho")
+def check_rmsprop_rho():
+    check_update({"optimizer": "rmsprop"}, rmsprop_rho=0.5)
+
+
+@arrives("rmsprop_momentum")
+def check_rmsprop_momentum():
+    check_update({"optimizer": "rmsprop"}, rmsprop_momentum=0.8)
+
+
+@arrives("double_q")
+def check_double_q():
+    check_shared({"double_q": False})
+
+
+@arrives("dueling")
+def check_dueling():
+    check_shared({"dueling": False})
+
+
+@arrives("td_loss")
+def check_td_loss():
+    check_shared({"td_loss": "mse"})
+
+
+@arrives("target_network")
+def check_target_network():
+    check_shared({"target_network": False}, {"double_q": False})
+
+
+@arrives("tau")
+def check_tau():
+    plain, changed = updates({"tau": 0.1, "target_update_freq": 1}, tau=0.8)
+    assert other_weights(plain, changed) > 1e-2
+
+
+@arrives("prioritized_alpha")
+def check_prioritized_alpha():
+    stack = make_stack(replay="prioritized")
+    for name, alpha in (("a", 0.0), ("b", 1.0)):
+        add(stack, name, 0, replay="prioritized", prioritized_alpha=alpha)
+    replay = stack._replay
+    slots = replay.slots(["a", "b"])
+    replay.add(slots, np.zeros((2, 2, replay.num_columns), dtype=np.float32))
+    replay.set_priorities(slots, np.array([[0, 1]] * 2), np.array([[1.0, 100.0]] * 2, dtype=np.float32))
+    leaves = replay._sums[slots, replay._num_leaves : replay._num_leaves + 2]
+    np.testing.assert_allclose(leaves[:, 1] / leaves[:, 0], [1.0, 100.0], rtol=1e-4)
+    stack.envs.close()
+
+
+@arrives("prioritized_beta")
+def check_prioritized_beta():
+    plain, changed = updates({"replay": "prioritized", "prioritized_beta": 0.0}, prioritized_beta=1.0)
+    assert all(np.ptp(batch.weights) == 0 for batch in plain.batches)
+    assert all(np.ptp(batch.weights) > 0.01 for batch in changed.batches)
+
+
+# -- of the network
+
+
+def check_first_q_values(**values):
+    """A member's first Q-values are those of RLlib's module with the seed."""
+    from policies.rllib_config import build_algorithm_config
+
+    stack = make_stack(**values)
+    member = add(stack, "m", 1234, **values)
+    algorithm = build_algorithm_config(member.hyperparams, env_id="CartPole-v1", seed=1234).build_algo()
+    module = algorithm.learner_group._learner.module["default_policy"].unwrapped()
+    assert set(module.state_dict()) == set(member.weights)
+    for name, value in module.state_dict().items():
+        np.testing.assert_array_equal(member.weights[name], value.numpy())
+    stack._arrange()
+    observations = np.random.default_rng(0).normal(size=(1, 50, 4)).astype(np.float32)
+    found = stack._groups[0].act(observations)[0]
+    expected = q_values_of(module, observations[0])
+    # But for what all actions have in common.
+    np.testing.assert_allclose(found[:, 1] - found[:, 0], expected[:, 1] - expected[:, 0], atol=1e-6)
+    algorithm.stop()
+    stack.envs.close()
+    return member
+
+
+@arrives("hidden_sizes")
+def check_hidden_sizes():
+    for sizes in ((7,), (12, 5, 9)):
+        member = check_first_q_values(hidden_sizes=sizes)
+        found = [
+            value.shape[0] for name, value in member.weights.items() if name.startswith("encoder.mlp") and "w" in name
+        ]
+        assert tuple(found) == sizes
+
+
+@arrives("activation")
+def check_activation():
+    for activation in ACTIVATIONS:
+        check_first_q_values(activation=activation, hidden_sizes=(8, 6))
+
+
+@arrives("initializer")
+def check_initializer():
+    found = [check_first_q_values(initializer=name) for name in ("torch", "he_uniform", "orthogonal")]
+    first = [member.weights["encoder.mlp.0.weight"] for member in found]
+    assert not any(np.allclose(first[index], first[index - 1]) for index in range(3))
+
+
+@arrives("conv_filters")
+def check_conv_filters():
+    from tune_jobs.packs import why_not_packed
+    from tune_jobs.spec import SweepSpec
+
+    spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "dqn"})
+    assert why_not_packed(spec, DQNHyperparams()) is None
+    assert "conv_filters" in why_not_packed(spec, DQNHyperparams(conv_filters=((16, 4, 2),)))
+
+
+@arrives("normalize_observations")
+def check_normalize_observations():
+    check_shared({"normalize_observations": True})

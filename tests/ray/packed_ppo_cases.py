@@ -1,0 +1,366 @@
+"""The cases of PPO's hyperparameters in a pack: each changes an iteration as it should, or fails.
+
+Most compare a pack of two members, one with the hyperparameter changed, with RLlib's Learner: see `packed_rllib`.
+"""
+
+import numpy as np
+import pytest
+from packed_rllib import ROWS, compare, differences, make_stack, sample
+
+from policies.hyperparams import ACTIVATIONS, PPOHyperparams
+
+CASES = {}
+FIRST_LAYER = "encoder.actor_encoder.mlp.0.weight"
+
+
+def arrives(check):
+    """Make a function the case of the field that its name says."""
+    field = check.__name__.removeprefix("check_")
+    assert field not in CASES
+    CASES[field] = check
+    return check
+
+
+def updates(shared=None, **values):
+    """Two updates of two members, the second one with these values, which are those of RLlib's Learner.
+
+    Returns:
+        What became of each, and what was sampled.
+    """
+    shared = shared or {}
+    pairs, _, sampled = compare("CartPole-v1", [shared, {**shared, **values}], seeds=[3, 3], num_epochs=2)
+    for ours, theirs in pairs:
+        for what, value in differences(ours, theirs).items():
+            assert value < 1e-5, what
+    (plain, _), (changed, _) = pairs
+    return plain, changed, sampled
+
+
+def assert_other_gradients(plain, changed, at_least=1e-3):
+    scale = max(np.abs(value).max() for value in plain.last_gradients.values())
+    found = max(np.abs(changed.last_gradients[name] - value).max() for name, value in plain.last_gradients.items())
+    assert found > at_least * scale
+
+
+# -- the network
+
+
+@arrives
+def check_hidden_sizes():
+    for sizes in ((7,), (5, 9)):
+        pairs, stack, _ = compare("CartPole-v1", [{"hidden_sizes": (8,) * len(sizes)}, {"hidden_sizes": sizes}])
+        assert len(stack._groups) == (1 if len(sizes) == 1 else 2)
+        for ours, theirs in pairs:
+            assert max(differences(ours, theirs).values()) < 1e-5
+        layers = [
+            weight.shape[0] for name, weight in pairs[1][0].weights.items() if "actor" in name and "weight" in name
+        ]
+        assert tuple(layers) == sizes
+
+
+@arrives
+def check_activation():
+    pairs, stack, _ = compare("CartPole-v1", [{"activation": name} for name in ACTIVATIONS], seeds=[3] * 6)
+    assert len(stack._groups) == 6
+    for ours, theirs in pairs:
+        assert max(differences(ours, theirs).values()) < 1e-5
+    assert len({ours.losses["vf_loss"] for ours, _ in pairs}) == 6
+
+
+@arrives
+def check_initializer():
+    names = ("torch", "he_uniform", "orthogonal")
+    stack = make_stack("CartPole-v1", [{"initializer": name} for name in names], seeds=[3] * 3)
+    torchs, he_uniform, orthogonal = (member.weights for member in stack.members)
+    matrix, bias = FIRST_LAYER, FIRST_LAYER.replace("weight", "bias")
+    assert np.abs(torchs[matrix]).max() <= 0.5  # 1 / sqrt(4 inputs)
+    assert np.abs(torchs[bias]).max() > 0
+    assert 0.9 * np.sqrt(6 / 4) < np.abs(he_uniform[matrix]).max() <= np.sqrt(6 / 4)
+    np.testing.assert_allclose(orthogonal[matrix].T @ orthogonal[matrix], (5 / 3) ** 2 * np.eye(4), atol=1e-5)
+    assert not he_uniform[bias].any()
+    assert not orthogonal[bias].any()
+    stack.envs.close()
+
+
+@arrives
+def check_conv_filters():
+    """Packs have none: the plan leaves such trials to RLlib."""
+    from tune_jobs.packs import why_not_packed
+    from tune_jobs.spec import SweepSpec
+
+    spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "ppo"})
+    assert why_not_packed(spec, PPOHyperparams()) is None
+    assert "no convolutions" in why_not_packed(spec, PPOHyperparams(conv_filters=((4, 8, 4),)))
+
+
+@arrives
+def check_vf_share_layers():
+    _, changed, _ = updates(shared={"vf_share_layers": True}, vf_loss_coeff=2.0)
+    assert {name.split(".")[1] for name in changed.weights if name.startswith("encoder")} == {"encoder"}
+    plain, _, _ = updates()
+    assert {name.split(".")[1] for name in plain.weights if name.startswith("encoder")} == {
+        "actor_encoder",
+        "critic_encoder",
+    }
+
+
+@arrives
+def check_normalize_observations():
+    # compare() trains one iteration before the one it looks at.
+    plain, _, sampled = updates(shared={"normalize_observations": True})
+    assert int(plain.weights["obs_count"]) == 2 * ROWS
+    ((_, batch),) = sampled.groups
+    seen, raw = batch.observations[0], sampled.observations[0]
+    assert np.abs(seen).max(axis=0).min() > 1.0
+    assert np.abs(raw).max(axis=0).min() < 0.5
+    # By the statistics of the rows before, which are about those of these.
+    np.testing.assert_allclose(seen.std(axis=0), 1.0, atol=0.7)
+
+
+# -- the optimizer
+
+
+@arrives
+def check_lr():
+    """Adam's first step moves each weight by its learning rate."""
+    for lr in (1e-4, 3e-2):
+        stack = make_stack("CartPole-v1", [{}, {"lr": lr}])
+        before = {name: value.copy() for name, value in stack.members[1].weights.items()}
+        stack.train_iteration()
+        moved = [np.abs(value - before[name]).max() for name, value in stack.member("m1").weights.items()]
+        assert max(moved) == pytest.approx(lr, rel=1e-2)
+        stack.envs.close()
+
+
+@arrives
+def check_lr_final():
+    """The value at the env steps so far, this iteration's among them."""
+    stack = make_stack("CartPole-v1", [{}, {"lr": 4e-3, "lr_final": 1e-3, "lr_decay_steps": 150}])
+    for num_env_steps in (ROWS, 2 * ROWS, 3 * ROWS):
+        share = min(1.0, num_env_steps / 150)
+        assert stack.train_iteration()["m1"].learner["lr"] == pytest.approx(4e-3 - share * 3e-3, rel=1e-5)
+    stack.envs.close()
+    _, changed, _ = updates(lr=4e-3, lr_final=1e-3, lr_decay_steps=150)
+    assert changed.losses["lr"] == pytest.approx(4e-3 - 128 / 150 * 3e-3, rel=1e-5)
+
+
+@arrives
+def check_lr_decay_steps():
+    values = {"lr": 4e-3, "lr_final": 0.0, "lr_decay_steps": 2 * ROWS}
+    stack = make_stack("CartPole-v1", [{}, values])
+    stack.train_iteration()
+    before = {name: value.copy() for name, value in stack.member("m1").weights.items()}
+    stack.train_iteration()
+    for name, value in stack.member("m1").weights.items():
+        np.testing.assert_array_equal(value, before[name])
+    stack.envs.close()
+    _, changed, _ = updates(**{**values, "lr_decay_steps": 4 * ROWS})
+    assert changed.losses["lr"] == pytest.approx(2e-3)
+
+
+@arrives
+def check_grad_clip():
+    plain, changed, _ = updates(grad_clip=0.25)
+    norms = [np.sqrt(sum((g**2).sum() for g in found.last_gradients.values())) for found in (plain, changed)]
+    assert norms[0] > 1
+    assert norms[1] == pytest.approx(0.25, rel=1e-4)
+    assert changed.losses["gradient_norm"] > 1
+    # The member beside it, whose gradient is not clipped, does not report what was computed for this one.
+    assert "gradient_norm" not in plain.losses
+
+
+# -- the loss
+
+
+@arrives
+def check_clip_param():
+    plain, changed, _ = updates(clip_param=0.01)
+    assert_other_gradients(plain, changed)
+    assert changed.losses["policy_loss"] > plain.losses["policy_loss"]
+
+
+@arrives
+def check_vf_clip_param():
+    plain, changed, _ = updates(vf_clip_param=2.5)
+    assert_other_gradients(plain, changed)
+    assert changed.losses["vf_loss"] <= 2.5 < plain.losses["vf_loss"]
+
+
+@arrives
+def check_vf_loss_coeff():
+    plain, changed, _ = updates(vf_loss_coeff=2.0)
+    assert_other_gradients(plain, changed)
+    for found, coefficient in ((plain, 0.5), (changed, 2.0)):
+        parts = found.losses["policy_loss"] + coefficient * found.losses["vf_loss"]
+        assert found.losses["total_loss"] == pytest.approx(parts, rel=1e-5)
+
+
+def assert_entropy_weight(found, weight):
+    losses = found.losses
+    parts = losses["policy_loss"] + 0.5 * losses["vf_loss"] - weight * losses["entropy"]
+    assert losses["total_loss"] == pytest.approx(parts, rel=1e-5)
+
+
+@arrives
+def check_entropy_coeff():
+    plain, changed, _ = updates(entropy_coeff=5.0)
+    assert_other_gradients(plain, changed)
+    assert_entropy_weight(plain, 0.0)
+    assert_entropy_weight(changed, 5.0)
+
+
+@arrives
+def check_entropy_coeff_final():
+    values = {"entropy_coeff": 5.0, "entropy_coeff_final": 3.0, "entropy_decay_steps": 2 * ROWS}
+    _, changed, _ = updates(**values)
+    assert_entropy_weight(changed, 3.0)
+
+
+@arrives
+def check_entropy_decay_steps():
+    values = {"entropy_coeff": 5.0, "entropy_coeff_final": 1.0, "entropy_decay_steps": 4 * ROWS}
+    _, changed, _ = updates(**values)
+    assert_entropy_weight(changed, 3.0)
+
+
+@arrives
+def check_use_kl_loss():
+    plain, changed, _ = updates(shared={"use_kl_loss": True, "kl_target": 1e3}, kl_coeff=40.0)
+    assert_other_gradients(plain, changed)
+    for found, first in ((plain, 0.2), (changed, 40.0)):
+        losses = found.losses
+        # Halved after the iteration before, for the divergence is far below the target.
+        parts = losses["policy_loss"] + 0.5 * losses["vf_loss"] + first / 2 * losses["kl"]
+        assert losses["total_loss"] == pytest.approx(parts, rel=1e-5)
+        assert losses["kl"] > 0
+        assert found.kl_coeff == pytest.approx(first / 4)
+    plain, _, _ = updates()
+    assert "kl" not in plain.losses
+
+
+@arrives
+def check_kl_coeff():
+    stack = make_stack("CartPole-v1", [{"use_kl_loss": True}, {"use_kl_loss": True, "kl_coeff": 0.7}])
+    assert [member.kl_coeff for member in stack.members] == [0.2, 0.7]
+    stack.envs.close()
+    plain, changed, _ = updates(shared={"use_kl_loss": True}, kl_coeff=40.0)
+    assert_other_gradients(plain, changed)
+
+
+@arrives
+def check_kl_target():
+    for target, factor in ((1e-6, 1.5), (1e3, 0.5)):
+        base = {"use_kl_loss": True, "lr": 1e-2, "num_epochs": 4}
+        stack = make_stack("CartPole-v1", [base, {**base, "kl_target": target}])
+        for number in (1, 2):
+            stack.train_iteration()
+            assert stack.member("m1").kl_coeff == pytest.approx(0.2 * factor**number)
+        stack.envs.close()
+    # As RLlib's Learner does it, of what the last update has found.
+    _, changed, _ = updates(shared={"use_kl_loss": True}, kl_target=1e-9)
+    assert changed.kl_coeff >= 0.2 * 1.5
+
+
+# -- the batch
+
+
+def targets_by_definition(values, fragment, row, gamma, gae_lambda):
+    """Value targets of a row, from the formula: only for rows of terminated episodes and the fragment's end."""
+    targets, advantage = [], 0.0
+    for step in reversed(range(len(values) - 1)):
+        ended = fragment.ended[step, row]
+        following = 0.0 if ended else values[step + 1]
+        advantage = (
+            fragment.rewards[step, row]
+            + gamma * following
+            - values[step]
+            + (0.0 if ended else gamma * gae_lambda * advantage)
+        )
+        targets.insert(0, advantage + values[step])
+    return targets
+
+
+def check_targets(**values):
+    stack = make_stack("CartPole-v1", [{"gamma": 0.5, "gae_lambda": 0.5}, values])
+    sampled = sample(stack)
+    ((group, batch),) = sampled.groups
+    value, _ = stack._values(group, sampled.fragment, batch.observations, 0, 2)
+    last = stack._evaluate(group, sampled.fragment.last.reshape(2, 4, 4))
+    hyperparams = stack.members[1].hyperparams
+    assert not sampled.fragment.cuts
+    for place in range(4):
+        own = [*value[:, 4 + place], last[1, place]]
+        expected = targets_by_definition(own, sampled.fragment, 4 + place, hyperparams.gamma, hyperparams.gae_lambda)
+        np.testing.assert_allclose(batch.value_targets[1].reshape(-1, 4)[:, place], expected, rtol=1e-4)
+    stack.envs.close()
+
+
+@arrives
+def check_gamma():
+    for gamma in (0.0, 0.3, 1.0):
+        check_targets(gamma=gamma)
+
+
+@arrives
+def check_gae_lambda():
+    for gae_lambda in (0.0, 0.3, 1.0):
+        check_targets(gae_lambda=gae_lambda)
+
+
+def rows_of_updates(**values):
+    """(stack, the advantages of each update's rows of the second member, all advantages) of an iteration."""
+    stack = make_stack("CartPole-v1", [values, values])
+    sampled = sample(stack)
+    ((group, batch),) = sampled.groups
+    update, seen = group._update, []
+
+    def reading(outputs, value, minibatch):
+        seen.append(minibatch.advantages[1].numpy().copy())
+        return update(outputs, value, minibatch)
+
+    group._update = reading
+    group.learn(batch)
+    stack.envs.close()
+    return stack, seen, batch.advantages[1]
+
+
+@arrives
+def check_minibatch_size():
+    _, seen, rows = rows_of_updates(minibatch_size=16)
+    assert [len(found) for found in seen] == [16] * 4
+    # A pass is over every row once.
+    np.testing.assert_array_equal(np.sort(np.concatenate(seen)), np.sort(rows))
+    assert not np.array_equal(np.concatenate(seen), rows)
+    # The last one is filled up with rows of a further pass.
+    _, seen, _ = rows_of_updates(minibatch_size=40)
+    assert [len(found) for found in seen] == [40] * 2
+
+
+@arrives
+def check_num_epochs():
+    stack, seen, rows = rows_of_updates(minibatch_size=32, num_epochs=3)
+    assert stack.members[1].num_updates == len(seen) == 6
+    orders = [np.concatenate(seen[start : start + 2]) for start in (0, 2, 4)]
+    for order in orders:
+        np.testing.assert_array_equal(np.sort(order), np.sort(rows))
+    assert not np.array_equal(orders[0], orders[1])
+
+
+@arrives
+def check_train_batch_size():
+    for size, steps in ((96, 96), (97, 100)):
+        stack = make_stack("CartPole-v1", [{"train_batch_size": size}, {"train_batch_size": size}])
+        assert [stats.num_env_steps for stats in stack.train_iteration().values()] == [steps] * 2
+        # All sub-environments step together.
+        assert stack.train_iteration()["m1"].num_env_steps == 2 * steps
+        stack.envs.close()
+
+
+@arrives
+def check_num_envs():
+    stack = make_stack("CartPole-v1", [{"num_envs": 16}, {"num_envs": 16}])
+    fragment = sample(stack).fragment
+    assert fragment.rewards.shape == (ROWS // 16, 2 * 16)
+    # Each from a start of its own.
+    assert len(np.unique(fragment.observations[0], axis=0)) == 32
+    stack.envs.close()

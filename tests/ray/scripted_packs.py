@@ -1,0 +1,141 @@
+"""Packs whose members do as scripts say, run by Ray Tune as a sweep runs its own: no training, a few seconds."""
+
+import signal
+from pathlib import Path
+from unittest import mock
+
+from analysis.records import SweepRecord, TrialRecord
+from tune_jobs.packs import PackPlan
+from tune_jobs.spec_file import load_spec
+from tune_jobs.store import SweepStore
+
+STEPS = 100
+
+
+def make_sweep(folder: Path, num_trials: int, **changes) -> SweepStore:
+    """The folder of a sweep that has not begun; an iteration is 100 env steps."""
+    spec = load_spec(
+        {
+            "env": "CartPole-v1",
+            "algorithm": "ppo",
+            "space": {"lr": {"loguniform": [1e-4, 1e-2]}},
+            "num_samples": num_trials,
+            "stop": {"num_env_steps": 1_000},
+            "evaluation": {"every_iterations": 2, "num_episodes": 1},
+            "checkpoints": {"every_iterations": 2, "keep": 1},
+        }
+        | changes
+    )
+    store = SweepStore(folder)
+    store.create()
+    for index in range(num_trials):
+        record = TrialRecord(trial_id=f"t{index:04d}", index=index, point_index=index, seed=1024 * index, point={})
+        store.trial(record.trial_id).write_record(record)
+    store.write_record(
+        SweepRecord(
+            name=store.name, state="running", spec=spec.model_dump(mode="json"), evaluation_seeds=(1,),
+            confirmation_seeds=(2,), num_trials=num_trials, created_at=0.0,
+        )
+    )  # fmt: skip
+    return store
+
+
+def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 (a class in a function)
+    """A `PackTrainable` whose members do as scripts say.
+
+    Args:
+        scripts: Of a trial, by its id: `score`, its evaluation return (the iteration, if it has none); `raise_at`, the
+            iteration that always raises; `kill_at`, the iteration that kills the process, for the first `kills` times;
+            `after`, a file of the sweep folder that it waits for.
+        pause_s: Seconds that an iteration of the pack takes.
+    """
+    # Defined in here, or the worker processes would look for a module that only this one has.
+    import gymnasium as gym
+    import numpy as np
+
+    from policies.evaluate import Episodes
+    from policies.portable import Layer, PolicyNetwork, PortablePolicy, describe_space
+    from tune_jobs.engines.protocol import IterationStats
+    from tune_jobs.pack_trainable import PackTrainable
+
+    steps, kill = STEPS, signal.SIGKILL
+    observation_space = describe_space(gym.make("CartPole-v1").observation_space)
+    action_space = describe_space(gym.spaces.Discrete(2))
+
+    class Engine:
+        def __init__(self):
+            self.tasks, self.iterations = {}, {}
+
+        def add(self, task, checkpoint):
+            assert task.trial_id not in self.tasks
+            self.tasks[task.trial_id] = task
+            self.iterations[task.trial_id] = 0
+            if checkpoint is not None:
+                self.iterations[task.trial_id] = int((checkpoint / "state.txt").read_text())
+
+        def train_iteration(self):
+            import os
+            import time
+
+            time.sleep(pause_s)
+            results = {}
+            for trial_id, task in self.tasks.items():
+                self.iterations[trial_id] += 1
+                iteration, script = self.iterations[trial_id], scripts.get(trial_id, {})
+                while "after" in script and not (task.sweep_folder / script["after"]).exists():
+                    time.sleep(0.01)
+                marker = task.sweep_folder / f"{trial_id}.kills"
+                kills = int(marker.read_text()) if marker.exists() else 0
+                if iteration == script.get("kill_at") and kills < script.get("kills", 1):
+                    marker.write_text(str(kills + 1))
+                    print("about to die", flush=True)
+                    os.kill(os.getpid(), kill)
+                    time.sleep(60)
+                if iteration == script.get("raise_at"):
+                    results[trial_id] = ZeroDivisionError("the cart left the track")
+                else:
+                    results[trial_id] = IterationStats(iteration * steps, ((1.0, 5),))
+            return results
+
+        def policy(self, trial_id):
+            layer = Layer(np.zeros((2, 4), np.float32), np.zeros(2, np.float32), "linear")
+            return PortablePolicy(
+                network=PolicyNetwork("categorical", (layer,)), algorithm="ppo", env_id="CartPole-v1", env_args={},
+                observation_space=observation_space, action_space=action_space, action_transform="none",
+                training={"trial_id": trial_id, "iteration": self.iterations[trial_id]},
+            )  # fmt: skip
+
+        def save(self, trial_id, folder):
+            (folder / "state.txt").write_text(str(self.iterations[trial_id]))
+
+        def remove(self, trial_id):
+            del self.tasks[trial_id], self.iterations[trial_id]
+
+        def close(self):
+            pass
+
+    class Scripted(PackTrainable):
+        def make_engine(self):
+            return Engine()
+
+        def evaluate(self, evaluator, policies):
+            told = [policy.portable.training for policy in policies]
+            scores = [scripts.get(one["trial_id"], {}).get("score", float(one["iteration"])) for one in told]
+            return [Episodes((1,), (float(score),), (5,)) for score in scores]
+
+    return Scripted
+
+
+def run_packs(store: SweepStore, scripts=None, *, num_packs=2, slots=2, pause_s=0.0, listener=None, trial_ids=None):
+    """Run the trials of a sweep that have not ended, in packs; returns their records."""
+    from tune_jobs.runner import RunJob, run_trials
+
+    todo = tuple(record.trial_id for record in store.read_trials() if record.status in ("pending", "paused", "running"))
+    packs = PackPlan(
+        num_packs=num_packs, slots=slots, cpus_per_pack=1.0, gpus_per_pack=0.0, trial_ids=trial_ids or todo,
+        env_kind="scalar", env_step_us=None, num_env_processes=0,
+    )  # fmt: skip
+    job = RunJob(store.folder, todo, 1.0, 0.0, 2, packs=packs)
+    with mock.patch("tune_jobs.runner.PackTrainable", scripted_trainable(scripts or {}, pause_s)):
+        run_trials(job, listener or (lambda record: None))
+    return store.read_trials()

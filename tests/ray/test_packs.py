@@ -1,0 +1,255 @@
+"""Whole runs in packs, with scripted members: who trains where, who is ended, and what becomes of a dead pack's."""
+
+import dataclasses
+import threading
+import time
+
+import pytest
+from scripted_packs import STEPS, make_sweep, run_packs
+from test_schedulers import MIXED
+
+from tune_jobs.pack_files import PackFiles
+from tune_jobs.schedulers import build_scheduler
+from tune_jobs.spec import SchedulerSpec
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+ASHA = {"type": "asha", "grace_env_steps": 200, "reduction_factor": 2}
+
+
+def assert_whole(store, record, num_iterations=10):
+    """Every iteration once, and what the record says is on disk."""
+    assert [one.iteration for one in store.trial(record.trial_id).read_iterations()] == list(
+        range(1, num_iterations + 1)
+    )
+    assert record.num_iterations == num_iterations
+    assert list(record.checkpoints) == store.trial(record.trial_id).checkpoints()
+
+
+def test_trials_are_spread_over_packs_and_take_the_slots_that_become_free(tmp_path):
+    store = make_sweep(tmp_path / "mine", 9)
+    seen = []
+    records = run_packs(store, listener=seen.append, slots=2, pause_s=0.02)
+    for record in records:
+        assert (record.status, record.stop_reason) == ("completed", "num_env_steps 1000 >= 1000")
+        assert (record.num_failures, record.error) == (0, None)
+        assert record.started_at < record.ended_at
+        assert_whole(store, record)
+        assert "built from seed" in store.trial(record.trial_id).log_path.read_text()
+        assert list((store.trial(record.trial_id).folder / "tensorboard").glob("events.*"))
+    # Two processes, and never more than two trials at once in each.
+    running, most = set(), 0
+    for record in seen:
+        (running.add if record.status == "running" else running.discard)(record.trial_id)
+        most = max(most, len(running))
+    assert most == 4
+    by_process = {}
+    for record in records:
+        by_process.setdefault(record.pid, []).append(record.trial_id)
+    assert len(by_process) == 2
+    assert {"t0000", "t0001"} <= set(by_process[records[0].pid])
+    assert {"t0002", "t0003"} <= set(by_process[records[2].pid])
+    assert store.read_trials() == records
+
+
+def test_fewer_trials_than_slots_are_spread_evenly(tmp_path):
+    records = run_packs(make_sweep(tmp_path / "mine", 5), slots=64)
+    pids = [record.pid for record in records]
+    assert pids[0] == pids[1] == pids[2] != pids[3] == pids[4]
+
+
+def test_trials_that_are_not_packed_run_too(tmp_path):
+    store = make_sweep(tmp_path / "mine", 3, stop={"num_iterations": 1}, hyperparams={"hidden_sizes": [4]})
+    records = run_packs(store, trial_ids=("t0000", "t0002"))
+    assert [record.status for record in records] == ["completed"] * 3
+    # RLlib's are the iterations of a batch.
+    assert [record.num_env_steps == STEPS for record in records] == [True, False, True]
+
+
+# -- schedulers
+
+
+@dataclasses.dataclass(frozen=True)
+class _Trial:
+    trial_id: str
+
+
+class _Controller:
+    def get_live_trials(self):
+        return []
+
+
+def expected_steps(scores, scheduler, max_env_steps, *, slots):
+    """Env steps each trial comes to, by the scheduler itself: one pack, its members in lockstep, evaluated each 200."""
+    judge = build_scheduler(scheduler, max_env_steps)
+    waiting = {str(index): score for index, score in enumerate(scores)}
+    steps, members = {}, {}
+    while waiting or members:
+        while waiting and len(members) < slots:
+            name = next(iter(waiting))
+            members[name] = waiting.pop(name)
+            judge.on_trial_add(_Controller(), _Trial(name))
+        for name, score in list(members.items()):
+            steps[name] = steps.get(name, 0) + 200
+            result = {"evaluated": True, "num_env_steps": steps[name], "score": score}
+            over = steps[name] >= max_env_steps
+            if over or judge.on_trial_result(_Controller(), _Trial(name), result) == "STOP":
+                judge.on_trial_complete(_Controller(), _Trial(name), result)
+                del members[name]
+    return [steps[str(index)] for index in range(len(scores))]
+
+
+def run_scheduled(folder, scores, scheduler, **kwargs):
+    store = make_sweep(folder, len(scores), scheduler=scheduler, stop={"num_env_steps": 1600})
+    scripts = {f"t{index:04d}": {"score": score} for index, score in enumerate(scores)}
+    return store, run_packs(store, scripts, **kwargs)
+
+
+def test_asha_decides_as_with_single_trials(tmp_path):
+    store, records = run_scheduled(tmp_path / "mine", MIXED, ASHA, num_packs=1, slots=1)
+    # As in test_schedulers.
+    assert [record.num_env_steps for record in records] == [1600, 1600, 200, 1600, 200, 400, 200, 400]
+    for record in records:
+        assert_whole(store, record, record.num_env_steps // STEPS)
+        if record.num_env_steps == 1600:
+            assert record.status == "completed"
+        else:
+            assert (record.status, record.stop_reason) == ("stopped", f"scheduler, at {record.num_env_steps} env steps")
+            assert record.ended_at is not None
+            # It may still be the best.
+            assert record.checkpoints[-1].iteration == record.num_iterations
+
+
+@pytest.mark.parametrize("kind", ["asha", "median"])
+def test_a_scheduler_ends_members_inside_a_pack_before_their_next_iteration(tmp_path, kind):
+    scheduler = {**ASHA, "type": kind}
+    scores = (*MIXED, None, 9.0, 0.5, 3.5)
+    told = [float("nan") if score is None else score for score in scores]
+    store, records = run_scheduled(tmp_path / "mine", told, scheduler, num_packs=1, slots=4)
+    expected = expected_steps(
+        [-1e300 if score is None else score for score in scores], SchedulerSpec(**scheduler), 1600, slots=4
+    )
+    assert [record.num_env_steps for record in records] == expected
+    assert {200, 1600} <= set(expected)
+    for record in records:
+        assert_whole(store, record, record.num_env_steps // STEPS)
+
+
+def test_asha_compares_members_of_all_packs(tmp_path):
+    # Within its own pack no member is worse than another. The second begins when the first has ended.
+    store = make_sweep(tmp_path / "mine", 4, scheduler=ASHA, stop={"num_env_steps": 1600})
+    scripts = {f"t000{index}": {"score": score} for index, score in enumerate((5.0, 5.0, 1.0, 1.0))}
+    scripts["t0003"]["after"] = "trials/t0000/checkpoints/000016"
+    records = run_packs(store, scripts)
+    assert [record.num_env_steps for record in records] == [1600, 1600, 200, 200]
+    assert records[0].pid == records[1].pid != records[2].pid == records[3].pid
+
+
+# -- failures
+
+
+def test_a_member_that_always_fails_fails_alone(tmp_path):
+    store = make_sweep(tmp_path / "mine", 4, max_retries=1)
+    records = run_packs(store, {"t0001": {"raise_at": 5}}, slots=4, num_packs=1)
+    assert [record.status for record in records] == ["completed", "failed", "completed", "completed"]
+    assert [record.num_failures for record in records] == [0, 2, 0, 0]
+    assert records[1].error.startswith("ZeroDivisionError: the cart left the track")
+    assert records[1].ended_at is not None
+    assert len({record.pid for record in records}) == 1
+    for record in records:
+        if record.status == "completed":
+            assert_whole(store, record)
+
+
+def test_the_members_of_a_pack_that_is_killed_go_on_from_their_checkpoints(tmp_path):
+    store = make_sweep(tmp_path / "mine", 4, max_retries=0)
+    seen = []
+    records = run_packs(store, {"t0001": {"kill_at": 5}}, num_packs=1, slots=3, listener=seen.append)
+    assert [record.status for record in records] == ["completed"] * 4
+    # The fourth had not begun.
+    assert [record.num_failures for record in records] == [1, 1, 1, 0]
+    errors = {record.trial_id: record.error for record in seen if record.error}
+    assert set(errors) == {"t0000", "t0001", "t0002"}
+    assert errors["t0000"].startswith("The process of the pack died.")
+    # The end of the pack's log.
+    assert "about to die" in errors["t0000"]
+    for record in records:
+        assert_whole(store, record)
+        assert record.error is None
+        log = store.trial(record.trial_id).log_path.read_text()
+        assert ("built from checkpoint 000004" in log) == (record.trial_id != "t0003")
+
+
+def test_members_of_a_pack_that_dies_again_go_on_alone(tmp_path):
+    store = make_sweep(tmp_path / "mine", 5, max_retries=1)
+    # It kills two packs, and fails twice by itself: the others finish.
+    scripts = {"t0001": {"kill_at": 5, "kills": 99}}
+    records = run_packs(store, scripts, num_packs=2, slots=3)
+    assert [record.status for record in records] == ["completed", "failed", "completed", "completed", "completed"]
+    assert [record.num_failures for record in records] == [2, 4, 2, 0, 0]
+    assert records[1].error.startswith("The process of the pack died.")
+    for record in records:
+        if record.status == "completed":
+            assert_whole(store, record)
+    assert int((store.folder / "t0001.kills").read_text()) == 4
+    # Nobody else is given to a pack in which somebody is alone.
+    assert PackFiles(store.folder, "p00").read().trial_ids == ()
+
+
+# -- interrupted
+
+
+def stop_when(store, condition):
+    def wait():
+        deadline = time.monotonic() + 60
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        store.request_stop()
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    return thread
+
+
+def test_a_stopped_run_pauses_all_and_goes_on_where_it_was(tmp_path):
+    store = make_sweep(tmp_path / "mine", 7, stop={"num_env_steps": 100_000})
+    thread = stop_when(store, lambda: any(store.trial("t0003").checkpoints()))
+    records = run_packs(store, slots=2, pause_s=0.02)
+    thread.join()
+    assert [record.status for record in records] == ["paused"] * 4 + ["pending"] * 3
+    for record in records[:4]:
+        assert record.checkpoints[-1].iteration == record.num_iterations > 0
+        assert_whole(store, record, record.num_iterations)
+    store.clear_stop_request()
+    sweep = store.read_record()
+    goal = max(record.num_iterations for record in records) + 2
+    sweep.spec["stop"]["num_iterations"] = goal
+    store.write_record(sweep)
+    resumed = run_packs(store, slots=2)
+    assert [record.status for record in resumed] == ["completed"] * 7
+    for before, record in zip(records, resumed, strict=True):
+        assert_whole(store, record, goal)
+        if before.num_iterations:
+            log = store.trial(record.trial_id).log_path.read_text()
+            assert f"built from checkpoint {before.num_iterations:06d}" in log
+
+
+# -- points chosen when a trial is handed out
+
+
+def test_points_are_chosen_when_trials_are_handed_to_packs(tmp_path):
+    pytest.importorskip("optuna")
+    store = make_sweep(tmp_path / "mine", 8, search={"type": "tpe", "num_startup_trials": 2})
+    for record in store.read_trials():
+        store.trial(record.trial_id).write_record(record.model_copy(update={"has_point": False}))
+    records = run_packs(store, slots=2)
+    assert [record.status for record in records] == ["completed"] * 8
+    assert all(record.has_point and record.hyperparams["lr"] == record.point["lr"] for record in records)
+    from tune_jobs.search_space import draw_point
+    from tune_jobs.spec import SweepSpec
+
+    spec = SweepSpec.model_validate(store.read_record().spec)
+    random = [draw_point(spec.space, index, spec.seed) for index in range(8)]
+    # Four are handed out before any has ended; the others know those.
+    assert [record.point for record in records[:4]] == random[:4]
+    assert all(record.point != point for record, point in zip(records[4:], random[4:], strict=True))

@@ -1,0 +1,26 @@
+"""Plans of small sweeps whose trials are packed."""
+
+from spec_errors import MINIMAL
+
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec_file import load_spec
+
+LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
+DQN = {"algorithm": "dqn"}
+TPE = {"search": "tpe", "space": LR, "num_samples": 30}
+
+
+def plan(machine=2, records=(), **fields):
+    """Of ten trials on a machine with so many CPUs, unless told otherwise."""
+    spec = load_spec({**MINIMAL, "num_samples": 10, "space": LR, **fields})
+    return make_plan(spec, machine if isinstance(machine, Machine) else Machine(machine), records)
+
+
+def fake_reasons(monkeypatch, wide):
+    """Let trials with these learning rates be such as no pack holds."""
+
+    def why(spec, hyperparams, env):
+        return "its lr is odd" if hyperparams.lr in wide else None
+
+    monkeypatch.setattr("tune_jobs.packs.why_not_packed", why)

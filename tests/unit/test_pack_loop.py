@@ -1,0 +1,332 @@
+"""The life of a pack's members: trained and evaluated together, ended, failed and retried each for itself."""
+
+import contextlib
+import dataclasses
+import itertools
+import math
+
+import pytest
+from fake_engine import FakeClock, FakeEngine
+from fake_pack import Pack
+from trial_runs import Trial
+
+from policies.errors import CheckpointError, EnvError
+
+
+def statuses(pack):
+    return {report.trial_id: report.progress.status for report in pack.reports if report.progress is not None}
+
+
+def without_times(progress):
+    return dataclasses.replace(progress, started_at=None, ended_at=None)
+
+
+def results(pack, trial_id):
+    return [record.iteration for record in pack.store(trial_id).read_iterations()]
+
+
+# -- together
+
+
+def test_each_member_is_told_of_as_a_trial_of_its_own(tmp_path):
+    """Score, stop rule, checkpoints and results are those of the same trial without a pack."""
+    task = {"stop": {"evaluation_return": 8.0, "num_iterations": 30}, "evaluation": {"every_iterations": 4}}
+    alone = Trial(tmp_path / "alone", **task)
+    expected = alone.run()
+    pack = Pack(tmp_path / "pack", **task).add("t0000", "t0001", "t0002").run()
+    for trial_id in ("t0000", "t0001", "t0002"):
+        progress = pack.last(trial_id)
+        assert (progress.status, progress.stop_reason) == ("completed", "evaluation_return 8 >= 8")
+        assert [record.iteration for record in progress.checkpoints] == alone.kept
+        assert without_times(dataclasses.replace(progress, checkpoints=())) == without_times(
+            dataclasses.replace(expected, checkpoints=())
+        )
+        assert pack.store(trial_id).read_iterations() == alone.results
+        assert [record.iteration for record in pack.store(trial_id).checkpoints()] == alone.kept
+    assert pack.loop.trial_ids == ()
+    assert pack.engine.members == {}
+
+
+def test_members_are_evaluated_together_when_it_is_their_turn(tmp_path):
+    pack = Pack(tmp_path, stop={"num_iterations": 6}, evaluation={"every_iterations": 3}).add("t0000", "t0001")
+    pack.advance()
+    # It comes later, and so do its evaluations.
+    pack.add("t0002").run()
+    assert pack.batches == [2, 1, 2, 1]
+    assert [statuses(pack)[name] for name in ("t0000", "t0001", "t0002")] == ["completed"] * 3
+    assert [results(pack, name) for name in ("t0000", "t0002")] == [list(range(1, 7))] * 2
+
+
+def test_evaluations_are_reported_each_and_of_the_others_where_they_stand(tmp_path):
+    pack = Pack(tmp_path, evaluation={"every_iterations": 2}, stop={"num_iterations": 9}, clock=FakeClock(step=0.001))
+    reports = pack.add("t0000").advance(0.2)
+    told = [(report.progress.iteration, report.progress.evaluated) for report in reports]
+    iterations = [iteration for iteration, evaluated in told if evaluated]
+    assert iterations[:3] == [2, 4, 6]
+    assert told == sorted(told)
+    # One report of the running iteration at most.
+    assert sum(not evaluated for _, evaluated in told) <= 1
+
+
+def test_a_scheduler_hears_of_an_evaluation_before_the_next_iteration(tmp_path):
+    pack = Pack(tmp_path, evaluation={"every_iterations": 3}).add("t0000", "t0001")
+    reports = pack.advance(math.inf, until_evaluated=True)
+    assert [(report.trial_id, report.progress.iteration) for report in reports] == [("t0000", 3), ("t0001", 3)]
+    assert pack.engine.num_iterations == 3
+
+
+def test_a_report_comes_after_so_many_seconds_and_is_on_disk(tmp_path):
+    pack = Pack(tmp_path, clock=FakeClock(step=0.1), evaluation={"every_iterations": 99}).add("t0000", "t0001")
+    reports = pack.advance(3.0)
+    (first, second) = [report.progress for report in reports]
+    assert 1 < first.iteration == second.iteration < 99
+    assert not first.evaluated
+    assert results(pack, "t0001") == list(range(1, first.iteration + 1))
+
+
+def test_it_returns_when_a_quarter_has_ended_so_that_others_can_have_their_slots(tmp_path):
+    scripts = {f"t000{index}": FakeEngine(steps=100 * (8 - index)) for index in range(8)}
+    pack = Pack(tmp_path, scripts.get, stop={"num_env_steps": 4_000}, evaluation={"every_iterations": 999})
+    pack.add(*scripts).advance(math.inf)
+    assert pack.loop.trial_ids == tuple(f"t000{index}" for index in range(2, 8))
+
+
+# -- come and go
+
+
+def test_members_come_and_go_and_the_others_do_not_notice(tmp_path):
+    pack = Pack(tmp_path, stop={"num_iterations": 10}).add("t0000", "t0001")
+    for _ in range(4):
+        pack.advance()
+    pack.loop.end("t0000")
+    pack.add("t0002")
+    pack.run()
+    assert pack.engine.builds == [("t0000", None), ("t0001", None), ("t0002", None)]
+    ended = pack.last("t0000")
+    assert (ended.status, ended.iteration, ended.stop_reason) == ("stopped", 4, None)
+    assert ended.ended_at is not None
+    assert ended.checkpoints[-1].iteration == 4
+    assert results(pack, "t0000") == [1, 2, 3, 4]
+    for trial_id in ("t0001", "t0002"):
+        assert results(pack, trial_id) == list(range(1, 11))
+        assert pack.last(trial_id).status == "completed"
+
+
+def test_a_member_that_is_ended_saves_where_it_is_unless_it_has(tmp_path):
+    pack = Pack(tmp_path, evaluation={"every_iterations": 3}).add("t0000", "t0001", "t0002")
+    for _ in range(3):
+        pack.advance()
+    before = {path: path.stat().st_mtime_ns for path in pack.store("t0000").checkpoints_folder.rglob("*")}
+    pack.loop.end("t0000")
+    assert {path: path.stat().st_mtime_ns for path in pack.store("t0000").checkpoints_folder.rglob("*")} == before
+    pack.advance()
+    pack.loop.end("t0001")
+    assert [record.iteration for record in pack.store("t0001").checkpoints()] == [3, 4]
+    # The driver ended it before it was ever built.
+    pack.add("t0009")
+    pack.loop.end("t0009")
+    assert pack.loop.trial_ids == ("t0002",)
+
+
+def test_an_empty_pack_reports_at_once(tmp_path):
+    assert Pack(tmp_path).advance(math.inf) == []
+
+
+# -- stop requests
+
+
+def test_a_stop_request_saves_and_pauses_all(tmp_path):
+    pack = Pack(tmp_path, evaluation={"every_iterations": 3}).add("t0000", "t0001")
+    for _ in range(4):
+        pack.advance()
+    pack.add("t0002")
+    pack.stop = True
+    reports = pack.advance(math.inf)
+    assert [(report.progress.status, report.progress.iteration) for report in reports] == [
+        ("paused", 4),
+        ("paused", 4),
+        ("paused", 0),
+    ]
+    assert [record.iteration for record in pack.store("t0001").checkpoints()] == [3, 4]
+    assert pack.engine.num_iterations == 4
+    again = Pack(tmp_path, evaluation={"every_iterations": 3}, stop={"num_iterations": 6}).add("t0000", "t0001").run()
+    assert again.engine.builds == [("t0000", 4), ("t0001", 4)]
+    assert results(again, "t0000") == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_member_that_cannot_save_when_all_stop_can_still_go_on_later(tmp_path):
+    class Full(FakeEngine):
+        def save(self, folder):
+            raise OSError("No space left on device")
+
+    scripts = {"t0000": Full(), "t0001": FakeEngine()}
+    pack = Pack(tmp_path, scripts.get, evaluation={"every_iterations": 99}).add(*scripts)
+    pack.advance()
+    pack.stop = True
+    failed, paused = pack.advance(math.inf)
+    assert (failed.trial_id, failed.retried) == ("t0000", True)
+    assert "No space left" in failed.error
+    assert (paused.trial_id, paused.progress.status) == ("t0001", "paused")
+    assert pack.loop.trial_ids == ()
+
+
+# -- failures
+
+
+def test_a_member_that_always_fails_fails_alone(tmp_path):
+    scripts = {"t0001": lambda: FakeEngine(raise_at=3)}
+    pack = Pack(tmp_path, lambda name: scripts.get(name, FakeEngine)(), max_retries=2, stop={"num_iterations": 9})
+    pack.add("t0000", "t0001", "t0002").run()
+    failures = [report for report in pack.of("t0001") if report.error is not None]
+    assert [report.retried for report in failures] == [True, True, False]
+    assert failures[-1].error.startswith("ZeroDivisionError: the cart left the track")
+    # And where, from its own log; a message on purpose comes without the name of its class.
+    assert "fake_engine.py" in failures[-1].error
+    log = pack.store("t0001").log_path.read_text()
+    assert log.count("ZeroDivisionError: the cart left the track") == 3
+    assert "built from seed 1024" in log
+    assert "built from checkpoint 000002" in log
+    # From its checkpoint of iteration 2, each time; the others were built once.
+    assert [build for build in pack.engine.builds if build[0] == "t0001"] == [("t0001", None)] + [("t0001", 2)] * 2
+    for trial_id in ("t0000", "t0002"):
+        assert results(pack, trial_id) == list(range(1, 10))
+        assert not any(report.error for report in pack.of(trial_id))
+        assert "ZeroDivisionError" not in pack.store(trial_id).log_path.read_text()
+    assert pack.engine.num_iterations < 9 + 4
+
+
+def test_a_member_that_failed_once_ends_as_if_it_had_not(tmp_path):
+    counts = itertools.count()
+    scripts = {"t0001": lambda: FakeEngine(raise_at=5 if next(counts) == 0 else None)}
+    pack = Pack(
+        tmp_path, lambda name: scripts.get(name, FakeEngine)(), max_retries=1, stop={"num_iterations": 9},
+        checkpoints={"every_iterations": 2, "keep": 9}, scores=lambda _: 0.0,
+    )  # fmt: skip
+    pack.add("t0000", "t0001").run()
+    assert [report.retried for report in pack.of("t0001") if report.error] == [True]
+    assert ("t0001", 4) in pack.engine.builds
+    assert (pack.last("t0001").status, results(pack, "t0001")) == ("completed", list(range(1, 10)))
+    assert results(pack, "t0000") == list(range(1, 10))
+
+
+def test_failures_before_the_pack_was_started_again_count(tmp_path):
+    pack = Pack(tmp_path, lambda name: FakeEngine(raise_at=1), max_retries=2).add("t0000", num_failures=2).run()
+    assert [report.retried for report in pack.reports] == [False]
+
+
+def test_a_member_that_cannot_be_built_is_retried_and_given_up(tmp_path):
+    class Refuses(FakeEngine):
+        def build(self, task, checkpoint):
+            raise CheckpointError("Checkpoint 000003 cannot be restored.", "Use another one.")
+
+    scripts = {"t0000": Refuses(), "t0001": FakeEngine()}
+    pack = Pack(tmp_path, scripts.get, max_retries=1, stop={"num_iterations": 2}).add(*scripts).run()
+    first, second = pack.of("t0000")
+    assert (first.retried, second.retried) == (True, False)
+    assert first.error.startswith("Checkpoint 000003 cannot be restored.")
+    assert pack.last("t0001").status == "completed"
+
+
+def test_a_damaged_checkpoint_fails_its_member_and_nobody_starts_afresh(tmp_path):
+    Pack(tmp_path, stop={"num_iterations": 3}).add("t0000", "t0001").run()
+    (pack_folder,) = [path for path in (tmp_path / "trials/t0000/checkpoints").iterdir() if path.name == "000003"]
+    (pack_folder / "engine.json").write_text("{}")
+    pack = Pack(tmp_path, stop={"num_iterations": 5}).add("t0000", "t0001").run()
+    assert "engine.json" in pack.of("t0000")[-1].error
+    assert pack.last("t0001").status == "completed"
+    assert pack.engine.builds == [("t0001", 3)]
+
+
+def test_an_evaluation_that_fails_is_its_members_failure(tmp_path):
+    def scores(iteration):
+        if iteration == 4:
+            raise EnvError("CartPole-v1 raised an error in step().", "Mend the env.")
+        return float(iteration)
+
+    # The first is evaluated at iteration 4, the second at 3 and 5.
+    pack = Pack(tmp_path, scores=scores, stop={"num_iterations": 5}, evaluation={"every_iterations": 4}).add("t0000")
+    pack.task = {**pack.task, "evaluation": {"every_iterations": 3}}
+    pack.add("t0001").run()
+    assert "raised an error in step()" in pack.of("t0000")[-1].error
+    assert pack.last("t0001").status == "completed"
+
+
+def test_nan_weights_end_a_member_as_failed_and_it_is_not_retried(tmp_path):
+    scripts = {"t0001": lambda: FakeEngine(nan_from=4)}
+    pack = Pack(tmp_path, lambda name: scripts.get(name, FakeEngine)(), max_retries=5, stop={"num_iterations": 6})
+    pack.add("t0000", "t0001").run()
+    ended = pack.last("t0001")
+    assert (ended.status, ended.iteration) == ("failed", 4)
+    assert "NaN" in ended.error
+    assert ended.best_iteration == 3
+    assert pack.engine.builds.count(("t0001", None)) == 1
+    assert results(pack, "t0000") == [1, 2, 3, 4, 5, 6]
+
+
+def test_what_concerns_no_single_member_is_raised_and_what_was_done_is_on_disk(tmp_path):
+    pack = Pack(tmp_path, evaluation={"every_iterations": 99}).add("t0000", "t0001")
+    train = pack.engine.train_iteration
+
+    def out_of_memory():
+        if pack.engine.num_iterations == 3:
+            raise MemoryError("the stack does not fit")
+        return train()
+
+    pack.engine.train_iteration = out_of_memory
+    with pytest.raises(MemoryError):
+        pack.loop.advance(math.inf, until_evaluated=False)
+    assert results(pack, "t0000") == results(pack, "t0001") == [1, 2, 3]
+
+
+# -- killed
+
+
+def test_a_killed_pack_goes_on_from_its_members_checkpoints(tmp_path):
+    task = {"stop": {"num_iterations": 9}, "evaluation": {"every_iterations": 99},
+            "checkpoints": {"every_iterations": 3, "keep": 1}}  # fmt: skip
+    first = Pack(tmp_path, **task).add("t0000", "t0001")
+    for _ in range(4):
+        first.advance()
+    first.add("t0002").advance()
+    assert results(first, "t0000") == [1, 2, 3, 4, 5]
+    # Nobody told it: the process is gone, and another one opens the same trials.
+    second = Pack(tmp_path, **task).add("t0000", "t0001", "t0002").run()
+    assert second.engine.builds == [("t0000", 3), ("t0001", 3), ("t0002", None)]
+    for trial_id in ("t0000", "t0001", "t0002"):
+        assert results(second, trial_id) == list(range(1, 10))
+        assert second.last(trial_id).status == "completed"
+
+
+def test_a_member_that_had_reached_its_end_is_done_at_once(tmp_path):
+    Pack(tmp_path, stop={"num_iterations": 3}).add("t0000").run()
+    pack = Pack(tmp_path, stop={"num_iterations": 3}).add("t0000")
+    (report,) = pack.advance()
+    assert (report.progress.status, report.progress.iteration) == ("completed", 3)
+    assert pack.engine.num_iterations == 0
+
+
+def test_everything_that_may_hang_is_watched_by_the_longest_time_limit(tmp_path):
+    entered, open_now = [], []
+
+    @contextlib.contextmanager
+    def watch(seconds):
+        assert not open_now
+        open_now.append(seconds)
+        entered.append(seconds)
+        yield
+        open_now.clear()
+
+    class Watched(FakeEngine):
+        def build(self, task, checkpoint):
+            assert open_now
+            super().build(task, checkpoint)
+
+        def train_iteration(self):
+            assert open_now
+            return super().train_iteration()
+
+    pack = Pack(tmp_path, lambda name: Watched(), watch=watch, stop={"num_iterations": 1}, iteration_timeout_s=7.0)
+    pack.add("t0000")
+    pack.task = {**pack.task, "iteration_timeout_s": 9.0}
+    pack.add("t0001").run()
+    assert entered == [7.0, 9.0, 9.0]

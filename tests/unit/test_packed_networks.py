@@ -1,0 +1,301 @@
+"""Stacked networks and optimizers compute what separate torch modules and torch.optim compute, padding included."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
+
+from policies.hyperparams import ACTIVATIONS
+from policies.packed.member import MAX_GROUP, group_members, network_layouts, size_class
+from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
+from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm
+from policies.packed.rows import StackedRows
+
+# Of the members of one stack, by the number of layers: the second is padded in every layer, the third in one.
+SIZES = {1: [(12,), (7,), (9,)], 2: [(12, 9), (5, 4), (11, 9)], 3: [(8, 12, 6), (7, 5, 4), (8, 12, 3)]}
+ROWS = 10
+
+
+def close(found, expected, tolerance=1e-5):
+    torch.testing.assert_close(found, torch.as_tensor(expected), rtol=tolerance, atol=tolerance)
+
+
+def make_stack(num_layers, activation, *, shares):
+    members = [
+        random_member(f"m{index}", index, hidden_sizes=sizes, activation=activation, vf_share_layers=shares)
+        for index, sizes in enumerate(SIZES[num_layers])
+    ]
+    return members, StackedRows(members, NUM_INPUTS, NUM_OUTPUTS, "cpu")
+
+
+def observations(num_members, seed=0):
+    return torch.randn(num_members, ROWS, NUM_INPUTS, generator=torch.Generator().manual_seed(seed))
+
+
+def stacked_inputs(rows, x):
+    return torch.from_numpy(with_ones(x.numpy())).repeat(rows.networks_per_member, 1, 1)
+
+
+def outputs_of(rows, x):
+    """(M, B, policy outputs and value), like the references'."""
+    out = rows.networks.forward(stacked_inputs(rows, x))
+    if rows.networks_per_member == 1:
+        return out
+    return torch.cat((out[: len(x)], out[len(x) :, :, :1]), dim=-1)
+
+
+def backward(rows, gradient):
+    """As `outputs_of`, the other way round."""
+    networks, num_members = rows.networks, len(gradient)
+    if rows.networks_per_member == 1:
+        networks.backward(gradient)
+        return
+    full = torch.zeros(networks.num_networks, ROWS, networks.sizes[-1])
+    full[:num_members] = gradient[..., :-1]
+    full[num_members:, :, 0] = gradient[..., -1]
+    networks.backward(full)
+
+
+def by_name(rows, flat, members, index):
+    """A member's part of a tensor over all weights, (K, P)."""
+    found = {}
+    for number, layout in enumerate(network_layouts(members[index].hyperparams, NUM_OUTPUTS)):
+        row = number * len(members) + index
+        found |= layout.read([layer[row] for layer in rows.networks.views_of(flat)], NUM_INPUTS)
+    return found
+
+
+def is_padding(rows, members):
+    """Which of all weights, (K, P), no member has."""
+    flat = torch.zeros_like(rows.networks.weights)
+    views = rows.networks.views_of(flat)
+    for index, member in enumerate(members):
+        ones = {name: np.ones_like(value) for name, value in member.weights.items()}
+        for number, layout in enumerate(network_layouts(member.hyperparams, NUM_OUTPUTS)):
+            layout.write([layer[number * len(members) + index] for layer in views], ones)
+    return flat == 0
+
+
+@pytest.mark.parametrize("shares", [False, True])
+@pytest.mark.parametrize("num_layers", sorted(SIZES))
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_outputs_and_gradients_are_those_of_separate_modules(activation, num_layers, shares):
+    members, rows = make_stack(num_layers, activation, shares=shares)
+    x = observations(len(members))
+    upstream = torch.randn(len(members), ROWS, NUM_OUTPUTS + 1, generator=torch.Generator().manual_seed(1))
+    found = outputs_of(rows, x)
+    acting = ActingNetworks(rows.networks, len(members))(x.numpy())
+    evaluated = rows.networks.evaluate(stacked_inputs(rows, x)[: len(members)], 0, len(members))
+    backward(rows, upstream)
+    for index, member in enumerate(members):
+        reference = Reference(member)
+        expected = reference(x[index])
+        close(found[index], expected.detach())
+        for other in (torch.from_numpy(acting[index]), evaluated[index]):
+            close(other[:, :NUM_OUTPUTS], expected[:, :NUM_OUTPUTS].detach())
+        expected.backward(upstream[index])
+        gradients = by_name(rows, rows.networks.gradients, members, index)
+        assert set(gradients) == set(member.weights)
+        for name, weight in reference.named():
+            assert weight.grad.abs().max() > 1e-3
+            close(torch.from_numpy(gradients[name]), weight.grad)
+
+
+def test_weights_that_are_written_into_a_stack_come_back():
+    members, rows = make_stack(2, "tanh", shares=True)
+    before = [dict(member.weights) for member in members]
+    rows.networks.weights.mul_(2.0)
+    rows.write_back()
+    for member, weights in zip(members, before, strict=True):
+        assert set(member.weights) == set(weights)
+        for name, value in weights.items():
+            np.testing.assert_array_equal(member.weights[name], 2 * value)
+
+
+@pytest.mark.parametrize("kind", ["adam", "rmsprop"])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_padding_stays_zero(activation, kind):
+    members, rows = make_stack(3, activation, shares=False)
+    networks, column = rows.networks, torch.full((2 * len(members), 1), 0.9)
+    if kind == "adam":
+        optimizer = StackedAdam(networks.weights, column * 0.01, column.double(), column.double(), column * 1e-8)
+    else:
+        optimizer = StackedRMSprop(networks.weights, column * 0.01, column.double(), column, column * 1e-8)
+    padding = is_padding(rows, members)
+    assert 0.1 < padding.float().mean() < 0.9
+    first = networks.weights.clone()
+    for seed in range(5):
+        out = outputs_of(rows, observations(len(members), seed))
+        backward(rows, torch.sin(3 * out))
+        optimizer.step(networks.gradients)
+        for values in (networks.gradients, networks.weights, *optimizer.state.values()):
+            assert (values[padding] == 0).all()
+            assert values.isfinite().all()
+    # Some units of ReLUs are dead.
+    assert (networks.weights != first)[~padding].float().mean() > 0.8
+
+
+# -- optimizers
+
+NUM_WEIGHTS = 17
+
+
+class Separate:
+    """A row's weights with an optimizer of torch's own, which has made some steps before."""
+
+    def __init__(self, make, num_steps, rng, settings):
+        self.weight = torch.nn.Parameter(torch.randn(NUM_WEIGHTS, generator=rng))
+        self.optimizer = make([self.weight], **settings)
+        for _ in range(num_steps):
+            self.step(torch.randn(NUM_WEIGHTS, generator=rng))
+
+    def step(self, gradient):
+        self.weight.grad = gradient
+        self.optimizer.step()
+
+    def set_lr(self, lr):
+        self.optimizer.param_groups[0]["lr"] = lr
+
+    @property
+    def state(self):
+        return self.optimizer.state.get(self.weight, {})
+
+
+def take_over(optimizer, rows):
+    for index, row in enumerate(rows):
+        for name in optimizer.state.keys() & row.state.keys():
+            optimizer.state[name][index] = row.state[name]
+        optimizer.num_steps[index] = 3 * index
+
+
+def compare_with_torch(stacked, make_separate, columns):
+    """Two stretches of four steps beside torch.optim; row k has made 3 * k steps before."""
+    rng = torch.Generator().manual_seed(0)
+    settings = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    rows = [Separate(make_separate, 3 * index, rng, found) for index, found in enumerate(settings)]
+    weights = torch.stack([row.weight.detach().clone() for row in rows])
+    optimizer = stacked(weights)
+    take_over(optimizer, rows)
+    for change in (1.0, 0.3):
+        optimizer.lr = torch.tensor(columns["lr"])[:, None] * change
+        for row, found in zip(rows, settings, strict=True):
+            row.set_lr(found["lr"] * change)
+        optimizer.begin(4)
+        for _ in range(4):
+            # Of sizes that differ as much as networks' gradients do.
+            gradients = torch.randn(len(rows), NUM_WEIGHTS, generator=rng) * torch.logspace(-5, 2, NUM_WEIGHTS)
+            optimizer.step(gradients)
+            for index, row in enumerate(rows):
+                row.step(gradients[index].clone())
+                torch.testing.assert_close(weights[index], row.weight.detach(), rtol=1e-6, atol=1e-7)
+    for index, row in enumerate(rows):
+        for name in optimizer.state.keys() & row.state.keys():
+            if row.state[name] is not None:
+                # Of both signs, so that sums can cancel.
+                atol = 1e-6 if name in ("exp_avg", "momentum_buffer") else 0.0
+                torch.testing.assert_close(optimizer.state[name][index], row.state[name], rtol=3e-6, atol=atol)
+        assert optimizer.num_steps[index].item() == 3 * index + 8
+
+
+def as_columns(values, dtype=torch.float32):
+    return torch.tensor(values, dtype=dtype)[:, None]
+
+
+def test_adam_is_torchs_row_by_row():
+    values = {
+        "lr": [1e-3, 0.02, 0.3], "betas": [(0.9, 0.999), (0.0, 0.99), (0.95, 0.9)], "eps": [1e-8, 1e-3, 0.5],
+    }  # fmt: skip
+    beta1, beta2 = (as_columns([pair[at] for pair in values["betas"]], torch.float64) for at in (0, 1))
+    compare_with_torch(
+        lambda weights: StackedAdam(weights, as_columns(values["lr"]), beta1, beta2, as_columns(values["eps"])),
+        torch.optim.Adam,
+        values,
+    )
+
+
+@pytest.mark.parametrize("momentum", [[0.0, 0.0, 0.0], [0.9, 0.0, 0.5]])
+def test_rmsprop_is_torchs_row_by_row(momentum):
+    values = {"lr": [1e-3, 0.02, 0.3], "alpha": [0.99, 0.9, 0.5], "momentum": momentum, "eps": [1e-8, 1e-3, 0.5]}
+    columns = {name: as_columns(column) for name, column in values.items()}
+    compare_with_torch(
+        lambda weights: StackedRMSprop(
+            weights, columns["lr"], columns["alpha"].double(), columns["momentum"], columns["eps"]
+        ),
+        torch.optim.RMSprop,
+        values,
+    )
+
+
+def test_the_norm_of_all_of_a_members_networks_is_clipped():
+    rng = torch.Generator().manual_seed(0)
+    before = torch.randn(6, NUM_WEIGHTS, generator=rng)
+    before[[0, 3]] *= 0.01
+    limits = torch.tensor([[1.0], [0.5], [math.inf]])
+    after = before.clone()
+    norms = clip_by_global_norm(after, limits, 2)
+    for member in range(3):
+        own = [member, 3 + member]
+        norm = before[own].square().sum().sqrt()
+        close(norms[member, 0], norm)
+        # Below the limit, above it, and without one.
+        factor = [1.0, 0.5 / float(norm + 1e-6), 1.0][member]
+        close(after[own], before[own] * factor, 1e-7)
+    assert float(norms[1]) > 2.0
+
+
+def test_what_is_no_number_stays_so_under_clipping_and_stays_where_it_is():
+    gradients = torch.ones(2, NUM_WEIGHTS)
+    gradients[0, 3] = math.nan
+    clip_by_global_norm(gradients, torch.tensor([[1.0], [1.0]]), 1)
+    assert gradients[0].isnan().all()
+    close(gradients[1].norm(), 1.0)
+
+
+# -- groups
+
+
+def test_sizes_are_padded_by_a_third_at_most():
+    sizes = sorted({size_class(number) for number in range(1, 2000)})
+    assert sizes[:7] == [8, 12, 16, 24, 32, 48, 64]
+    for number in range(1, 2000):
+        padded = size_class(number)
+        assert padded >= number
+        # The next smaller class would not have been enough.
+        assert padded == 8 or sizes[sizes.index(padded) - 1] < number
+        assert size_class(padded) == padded
+
+
+def test_groups_are_of_one_activation_and_like_sizes():
+    rng = np.random.default_rng(0)
+    members = [
+        random_member(f"m{index}", hidden_sizes=(int(rng.choice([9, 12, 30])), 8), activation=str(activation))
+        for index, activation in enumerate(rng.choice(["relu", "tanh"], size=60))
+    ]
+    groups = group_members(members)
+    assert sorted(member.member_id for group in groups for member in group) == sorted(m.member_id for m in members)
+    for group in groups:
+        assert len({member.hyperparams.activation for member in group}) == 1
+        assert len({size_class(member.hyperparams.hidden_sizes[0]) for member in group}) == 1
+    sizes = [len(group) for group in groups]
+    assert max(sizes) <= MAX_GROUP
+    # As few as there can be, and of even sizes.
+    assert len(groups) == sum(math.ceil(n / MAX_GROUP) for n in _members_by_key(members))
+    assert min(sizes) >= MAX_GROUP // 2
+
+
+def _members_by_key(members):
+    keys = [(m.hyperparams.activation, size_class(m.hyperparams.hidden_sizes[0])) for m in members]
+    return [keys.count(key) for key in set(keys)]
+
+
+def test_networks_of_other_depth_are_not_grouped():
+    one, two = random_member("a", hidden_sizes=(8,)), random_member("b", hidden_sizes=(8, 8))
+    assert len(group_members([one, two])) == 2
+
+
+def test_a_stack_starts_without_weights():
+    networks = StackedNetworks(2, (3, 4, 1), "relu")
+    assert networks.weights.shape == (2, 4 * 4 + 5)
+    assert (networks.weights == 0).all()

@@ -1,0 +1,262 @@
+"""PPO's gradients by hand, episodes over fragments, advantages, and observation statistics of many members."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from packed_members import random_member
+from torch import nn
+
+from policies.network_layers import ObservationStatistics
+from policies.packed import ppo
+from policies.packed.gae import advantages_and_targets, standardise
+from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR
+from policies.packed.ppo_group import scheduled
+from policies.packed.sampling import EpisodeTracker, Observations, action_transform, one_hot
+
+M, B = 4, 200
+
+
+def column(*values):
+    return torch.tensor(values)[:, None]
+
+
+def make_case(num_actions, *, with_kl, seed=0):
+    """(outputs, values, minibatch) with ratios far from 1 and values far from their targets."""
+    rng = torch.Generator().manual_seed(seed)
+    outputs = 2 * torch.randn(M, B, num_actions, generator=rng)
+    old_outputs = outputs + torch.randn(M, B, num_actions, generator=rng)
+    actions = nn.functional.one_hot(torch.randint(num_actions, (M, B), generator=rng), num_actions).float()
+    batch = ppo.Minibatch(
+        actions=actions,
+        logp=(torch.log_softmax(old_outputs, dim=-1) * actions).sum(dim=-1),
+        advantages=torch.randn(M, B, generator=rng),
+        value_targets=3 * torch.randn(M, B, generator=rng),
+        old_outputs=old_outputs if with_kl else None,
+    )
+    return outputs, torch.randn(M, B, generator=rng), batch
+
+
+COEFFICIENTS = ppo.Coefficients(
+    clip_param=column(0.1, 0.2, 0.3, 0.05),
+    vf_clip_param=column(math.inf, 4.0, 0.5, 10.0),
+    vf_loss_coeff=column(0.5, 1.0, 0.0, 2.0),
+    entropy_coeff=column(0.01, 0.0, 0.2, 0.0),
+    kl_coeff=column(0.2, 0.0, 1.0, 3.0),
+)
+
+
+@pytest.mark.parametrize("with_kl", [False, True])
+@pytest.mark.parametrize("num_actions", [2, 3, 6])
+def test_gradients_by_hand_are_those_of_the_loss(num_actions, with_kl):
+    outputs, values, batch = make_case(num_actions, with_kl=with_kl)
+    ratio = (ppo.log_probabilities(outputs, batch.actions, is_gaussian=False) - batch.logp).exp()
+    for limited in (ratio > 1.3, ratio < 0.7):
+        for sign in (-1, 1):
+            # Clipped and not clipped, on both sides.
+            assert (limited & (sign * batch.advantages > 0)).sum() > M * B / 20
+    errors = (values - batch.value_targets) ** 2
+    assert 0.1 < (errors > COEFFICIENTS.vf_clip_param).float().mean() < 0.9
+    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
+    outputs.requires_grad_()
+    values.requires_grad_()
+    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
+    parts.total_loss.sum().backward()
+    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
+    assert (parts.kl > 0).all() == with_kl
+
+
+@pytest.mark.parametrize("entropy_coeff", [0.0, 0.01])
+def test_gradients_without_a_value_clip(entropy_coeff):
+    outputs, values, batch = make_case(2, with_kl=False)
+    coefficients = ppo.Coefficients(
+        **{
+            **vars(COEFFICIENTS),
+            "vf_clip_param": column(*[math.inf] * M),
+            "entropy_coeff": column(*[entropy_coeff] * M),
+        }
+    )
+    found = ppo.gradients(outputs, values, batch, coefficients, is_gaussian=False)
+    outputs.requires_grad_()
+    values.requires_grad_()
+    ppo.loss(outputs, values, batch, coefficients, is_gaussian=False).total_loss.sum().backward()
+    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("is_gaussian", [False, True])
+@pytest.mark.parametrize("name", ["advantages", "value_targets"])
+def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name, is_gaussian):
+    outputs, values, batch = make_case(4, with_kl=False)
+    if is_gaussian:
+        batch.actions = batch.actions[..., :2]
+    getattr(batch, name)[1, 7] = math.nan
+    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, is_gaussian=is_gaussian)
+    gradient = found[0 if name == "advantages" else 1]
+    assert gradient[1, 7].isnan().all()
+    assert gradient[[0, 2, 3]].isfinite().all()
+
+
+def test_ratios_begin_at_one():
+    outputs, values, batch = make_case(3, with_kl=True)
+    batch.logp = ppo.log_probabilities(outputs, batch.actions, is_gaussian=False)
+    batch.old_outputs = outputs
+    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
+    torch.testing.assert_close(parts.policy_loss, -batch.advantages.mean(dim=1))
+    torch.testing.assert_close(parts.kl, torch.zeros(M), rtol=0, atol=1e-6)
+
+
+def test_schedules():
+    assert scheduled(0.3, None, None, 50) == 0.3
+    assert scheduled(0.3, 0.1, 100, 50) == pytest.approx(0.2)
+    assert scheduled(0.3, 0.0, 100, 0) == 0.3
+    assert scheduled(0.3, 0.0, 100, 500) == 0.0
+
+
+# -- advantages
+
+
+def test_no_advantage_flows_back_over_an_end():
+    """Two sub-environments of other discounts; the first one's episodes end in steps 1 (truncated) and 3."""
+    rewards = np.array([[1, 1], [2, 1], [3, 1], [4, 1]], dtype=np.float32)
+    values = np.array([[10, 0], [20, 0], [30, 0], [40, 0]], dtype=np.float32)
+    next_values = np.array([[20, 0], [25, 0], [40, 0], [99, 7]], dtype=np.float32)
+    terminated, ended = np.zeros((4, 2), dtype=bool), np.zeros((4, 2), dtype=bool)
+    terminated[3, 0] = ended[1, 0] = ended[3, 0] = True
+    gamma, gae_lambda = np.array([0.5, 1.0], dtype=np.float32), np.array([0.8, 0.5], dtype=np.float32)
+    advantages, targets = advantages_and_targets(
+        rewards, values, next_values, terminated=terminated, ended=ended, gamma=gamma, gae_lambda=gae_lambda
+    )
+    last = 4 - 40
+    second = 2 + 0.5 * 25 - 20  # bootstrapped from what the cut episode would have gone on with
+    first = [1 + 0.5 * 20 - 10 + 0.4 * second, second, 3 + 0.5 * 40 - 30 + 0.4 * last, last]
+    other = 1 + 7.0
+    np.testing.assert_allclose(advantages[:, 0], first, rtol=1e-6)
+    np.testing.assert_allclose(advantages[:, 1], [1.75 + other / 8, 1.5 + other / 4, 1 + other / 2, other])
+    np.testing.assert_allclose(targets, advantages + values)
+
+
+def test_advantages_are_standardised_member_by_member():
+    rng = np.random.default_rng(0)
+    rows = (rng.normal(size=(3, 50)) * [[1.0], [100.0], [1e-6]] + [[5.0], [0.0], [1.0]]).astype(np.float32)
+    out = standardise(rows)
+    np.testing.assert_allclose(out.mean(axis=1), 0, atol=1e-3)
+    np.testing.assert_allclose(out.std(axis=1)[:2], 1, rtol=1e-5)
+    # Those that hardly differ are not blown up.
+    assert out[2].std() < 0.1
+
+
+# -- episodes
+
+
+class Loops:
+    """What the tracker does, step by step."""
+
+    def __init__(self, member_ids, num_envs):
+        self.running = {name: [[0.0, 0] for _ in range(num_envs)] for name in member_ids}
+
+    def follow(self, member_ids, rewards, ended):
+        found = {name: [] for name in member_ids}
+        for step in range(len(rewards)):
+            row = 0
+            for name in member_ids:
+                for stream in self.running[name]:
+                    stream[0] += float(rewards[step, row])
+                    stream[1] += 1
+                    if ended[step, row]:
+                        found[name].append(tuple(stream))
+                        stream[:] = [0.0, 0]
+                    row += 1
+        return [found[name] for name in member_ids]
+
+
+def test_episodes_go_on_over_fragments_and_changes_of_the_pack():
+    rng = np.random.default_rng(0)
+    num_envs, names = 3, ["a", "b", "c"]
+    tracker, loops = EpisodeTracker(), Loops([*names, "d"], num_envs)
+    for name in names:
+        tracker.add(name, num_envs)
+    for order, num_steps in ((["a", "b", "c"], 20), (["c", "a", "b"], 7), (["b", "c"], 1), (["d", "c", "b"], 30)):
+        for name in {"a", "b", "c"} - set(order):
+            if name in names:
+                tracker.remove(name)
+                names.remove(name)
+        if "d" in order:
+            tracker.add("d", num_envs)
+        rewards = rng.normal(size=(num_steps, len(order) * num_envs)).astype(np.float32)
+        ended = rng.random(rewards.shape) < 0.2
+        found = tracker.follow(order, rewards, ended)
+        expected = loops.follow(order, rewards, ended)
+        assert sum(map(len, expected)) > 0 or num_steps == 1
+        for ours, theirs in zip(found, expected, strict=True):
+            assert [length for _, length in ours] == [length for _, length in theirs]
+            np.testing.assert_allclose([r for r, _ in ours], [r for r, _ in theirs], rtol=0, atol=1e-9)
+
+
+# -- observations and actions
+
+
+class Statistics(ObservationStatistics, nn.Module):
+    def __init__(self, size):
+        super().__init__()
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.model_config = {"normalize_observations": True}
+        self.add_statistics()
+
+
+def test_observations_are_normalised_as_rlmodules_do_it():
+    rng = np.random.default_rng(0)
+    num_envs, size = 2, 3
+    members = [random_member(f"m{index}", normalize_observations=True) for index in range(3)]
+    for member in members:
+        member.weights |= {
+            OBS_MEAN: np.zeros(size, np.float32), OBS_VAR: np.ones(size, np.float32), OBS_COUNT: np.array(0)
+        }  # fmt: skip
+    references = [Statistics(size) for _ in members]
+    observations = Observations(members, num_envs, normalizes=True)
+    for num_steps in (1, 5, 40):
+        rows = rng.normal(size=(num_steps, len(members) * num_envs, size)) * [1e-3, 1.0, 100.0] + [0.0, 5.0, 300.0]
+        rows = rows.astype(np.float32)
+        rows[-1, :, 0] = 1e3 * num_steps**2  # far outside
+        prepared = observations.prepare(rows)
+        assert prepared.shape == (num_steps, len(members), num_envs, size)
+        np.testing.assert_array_equal(observations.prepare(rows[0]), prepared[0])
+        np.testing.assert_array_equal(observations.part(1, 3).prepare(rows[:, num_envs:]), prepared[:, 1:])
+        observations.learn(rows)
+        for index, reference in enumerate(references):
+            own = rows[:, index * num_envs : (index + 1) * num_envs]
+            expected = reference.prepare(torch.from_numpy(own)).numpy()
+            np.testing.assert_allclose(prepared[:, index], expected, rtol=1e-5, atol=1e-5)
+            assert np.abs(prepared[:, index]).max() == 10.0
+            reference.update_observation_statistics(own.reshape(-1, size))
+            for name, value in members[index].weights.items():
+                if name in (OBS_MEAN, OBS_VAR, OBS_COUNT):
+                    known = reference.state_dict()[name].numpy()
+                    assert value.dtype == known.dtype
+                    assert value.shape == known.shape
+                    np.testing.assert_allclose(value, known, rtol=1e-6)
+
+
+def test_observations_as_they_are():
+    members = [random_member(f"m{index}") for index in range(2)]
+    rows = np.arange(2 * 3 * 4, dtype=np.float32).reshape(6, 4)
+    observations = Observations(members, 3, normalizes=False)
+    np.testing.assert_array_equal(observations.prepare(rows), rows.reshape(2, 3, 4))
+    observations.learn(rows[None])
+    assert OBS_MEAN not in members[0].weights
+
+
+def test_one_hot():
+    np.testing.assert_array_equal(one_hot(np.array([[2, 0]]), 3), [[[0, 0, 1], [1, 0, 0]]])
+
+
+def test_actions_are_stretched_over_bounds_and_clipped():
+    transform = action_transform(gym.spaces.Box(np.float32([-2, 0]), np.float32([2, 1])))
+    np.testing.assert_allclose(transform(np.float32([[-1, -1], [0, 0], [0.5, 3], [-7, 1]])), [
+        [-2, 0], [0, 0.5], [1, 1], [-2, 1],
+    ])  # fmt: skip
+    unbounded = action_transform(gym.spaces.Box(-np.inf, np.inf, (2,)))
+    np.testing.assert_array_equal(unbounded(np.float32([[-7, 3]])), [[-7, 3]])

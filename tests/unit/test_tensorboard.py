@@ -1,0 +1,67 @@
+"""TensorBoard's files, read back by a package that reads them."""
+
+import math
+import struct
+
+import pytest
+from synthetic_sweep import make_sweep
+
+from tune_jobs.tensorboard import ScalarWriter
+
+event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
+crc32c = pytest.importorskip("tensorboardX.crc32c")
+
+
+def masked(data):
+    crc = crc32c.crc32c(data)
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def read(path):
+    """Every event of a file, its checksums checked."""
+    data, events = path.read_bytes(), []
+    while data:
+        (length,) = struct.unpack("<Q", data[:8])
+        assert struct.unpack("<I", data[8:12]) == (masked(data[:8]),)
+        body = data[12 : 12 + length]
+        assert struct.unpack("<I", data[12 + length : 16 + length]) == (masked(body),)
+        events.append(event_pb2.Event.FromString(body))
+        data = data[16 + length :]
+    return events
+
+
+def files(folder, trial_id):
+    return sorted((folder / "trials" / trial_id / "tensorboard").glob("events.out.tfevents.*"))
+
+
+def test_scalars_are_read_back(tmp_path):
+    first, second = make_sweep().trials[:2]
+    first = first.model_copy(update={"num_env_steps": 300_000, "time_s": 2.0, "training_return": -3.5})
+    writer = ScalarWriter(tmp_path)
+    writer.write(first, evaluated=False)
+    writer.write(
+        second.model_copy(update={"num_env_steps": 0, "time_s": 0.0, "training_return": None}), evaluated=False
+    )
+    assert files(tmp_path, first.trial_id) == []
+    writer.flush()
+    writer.write(first.model_copy(update={"num_env_steps": 300_100, "evaluation_return": 1e300}), evaluated=True)
+    writer.flush()
+    (path,) = files(tmp_path, first.trial_id)
+    version, *events = read(path)
+    assert version.file_version == "brain.Event:2"
+    assert [event.step for event in events] == [300_000, 300_100]
+    assert all(abs(event.wall_time - version.wall_time) < 60 for event in events)
+    told = [{value.tag: value.simple_value for value in event.summary.value} for event in events]
+    assert told[0] == {"training_return": -3.5, "num_episodes": first.num_episodes, "env_steps_per_s": 150_000.0}
+    assert told[1]["evaluation_return"] == math.inf
+    (path,) = files(tmp_path, second.trial_id)
+    assert [value.tag for value in read(path)[1].summary.value] == ["num_episodes"]
+
+
+def test_a_run_that_goes_on_writes_a_file_of_its_own(tmp_path):
+    trial = make_sweep().trials[0]
+    for _ in range(2):
+        writer = ScalarWriter(tmp_path)
+        writer.write(trial, evaluated=True)
+        writer.flush()
+    assert [len(read(path)) for path in files(tmp_path, trial.trial_id)] == [2, 2]

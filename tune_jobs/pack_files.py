@@ -1,0 +1,70 @@
+"""What lies in a sweep's `packs` folder: whom each pack is to train, and what its process printed.
+
+The process that drives the sweep writes `<pack>.json`, the pack reads it before every step and writes `<pack>.log`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from policies.errors import CheckpointError
+from policies.files import write_atomic
+
+_TAIL_BYTES = 20_000
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Whom a pack is to train."""
+
+    trial_ids: tuple[str, ...] = ()
+    """Its members, in the order in which they came; whom it trains and who is not named is to be ended."""
+    num_failures: Mapping[str, int] = field(default_factory=dict)
+    """How often a member has failed by itself in this run; those that have not are not named."""
+
+
+class PackFiles:
+    """The files of one pack.
+
+    Args:
+        sweep_folder: The sweep's folder.
+        pack_id: `p00` and so on.
+    """
+
+    def __init__(self, sweep_folder: Path, pack_id: str) -> None:
+        self.pack_id = pack_id
+        self.assignment_path = sweep_folder / "packs" / f"{pack_id}.json"
+        self.log_path = sweep_folder / "packs" / f"{pack_id}.log"
+
+    def write(self, assignment: Assignment) -> None:
+        """Replace the assignment."""
+        data = {"trial_ids": list(assignment.trial_ids), "num_failures": dict(assignment.num_failures)}
+        write_atomic(self.assignment_path, json.dumps(data) + "\n")
+
+    def read(self) -> Assignment:
+        """The assignment.
+
+        Raises:
+            CheckpointError: It is not there, or cannot be read.
+        """
+        try:
+            data = json.loads(self.assignment_path.read_bytes())
+            return Assignment(tuple(data["trial_ids"]), dict(data["num_failures"]))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(
+                f"{self.assignment_path} does not tell whom pack {self.pack_id} is to train: {error!r}.",
+                "Check that all nodes see the sweep folder, and resume the sweep.",
+            ) from error
+
+    def log_tail(self, num_lines: int = 15) -> str:
+        """The last lines of the pack's log; empty if there is none."""
+        try:
+            with self.log_path.open("rb") as file:
+                file.seek(max(0, self.log_path.stat().st_size - _TAIL_BYTES))
+                lines = file.read().decode("utf-8", errors="replace").splitlines()
+        except OSError:
+            return ""
+        return "\n".join(lines[-num_lines:])
