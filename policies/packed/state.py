@@ -95,7 +95,7 @@ def load_member(folder: Path, member_id: str) -> Member:
         raise CheckpointError(f"{folder} does not hold a member's state: {error!r}.", _HINT) from error
 
 
-def _number(value: Any) -> float:
+def _number(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{value!r} is no number")
     return value

@@ -89,7 +89,7 @@ class Learned:
 def learn_in_pack(stack, sampled):
     """Learn, and give what became of each member, by id."""
     stack._regroup()
-    found, place = {}, 0
+    found = {}
     for group, (old, batch) in zip(stack._groups, sampled.groups, strict=True):
         assert [m.member_id for m in group.members] == [m.member_id for m in old.members]
         stats = group.learn(batch)
@@ -103,7 +103,6 @@ def learn_in_pack(stack, sampled):
             found[member.member_id] = Learned(
                 stats[index], gradients, dict(member.weights), copy.deepcopy(member.moments), member.kl_coeff
             )
-            place += 1
     stack._observations.learn(sampled.fragment.observations)
     for member in stack.members:
         found[member.member_id].weights = copy.deepcopy(member.weights)

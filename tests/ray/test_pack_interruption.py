@@ -1,6 +1,7 @@
 """A sweep in packs that is killed or interrupted goes on where it was: the real command, engine and signals."""
 
 import json
+import re
 import signal
 import subprocess
 
@@ -63,4 +64,5 @@ def test_members_go_on_from_their_checkpoints(tmp_path, number):
     for index, iteration in enumerate(latest):
         if iteration:
             log = (folder / f"trials/t000{index}/log.txt").read_text()
-            assert f"built from checkpoint {iteration:06d}" in log
+            # A killed driver's packs train on for a moment.
+            assert int(re.findall(r"built from checkpoint (\d+)", log)[-1]) >= iteration
