@@ -65,6 +65,7 @@ class DQNStack:
         # Env steps at which a restored member's replay memory is as full as it was when learning began.
         self._refilled_at: dict[str, int] = {}
         self._unlearned: list[Floats] = []
+        self._stats: dict[str, MemberStats] = {}
         self._num_actions = int(cast("gym.spaces.Discrete[Any]", envs.action_space).n)
         self._num_inputs = math.prod(envs.observation_space.shape or ())
 
@@ -171,6 +172,11 @@ class DQNStack:
 
     def train_iteration(self) -> dict[str, MemberStats]:
         """See `Stack.train_iteration`."""
+        self.begin_iteration()
+        return self.finish_iteration()
+
+    def begin_iteration(self) -> None:
+        """See `Stack.begin_iteration`: all of it, since sampling waits for the updates of every phase."""
         if self._stale:
             self._arrange()
         first = cast("DQNHyperparams", self.members[0].hyperparams)
@@ -195,10 +201,14 @@ class DQNStack:
         episodes = self._episodes.follow(self._ids, np.stack(rewards), np.stack(ended))
         for member in self.members:
             member.num_iterations += 1
-        return {
+        self._stats = {
             member.member_id: MemberStats(member.num_env_steps, found, stats.get(member.member_id, {}))
             for member, found in zip(self.members, episodes, strict=True)
         }
+
+    def finish_iteration(self) -> dict[str, MemberStats]:
+        """See `Stack.finish_iteration`."""
+        return self._stats
 
     def _draw(self, num_phases: int, steps_per_phase: int, updates_per_phase: float) -> _Draws:
         """Each member's numbers for some phases, in an order that does not depend on the members beside it."""

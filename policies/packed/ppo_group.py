@@ -80,6 +80,7 @@ class PPOGroup:
         self._rows.read_moments(self._optimizer)
         self._acting = ActingNetworks(self._networks, len(members))
         self._hyperparams = [cast("PPOHyperparams", member.hyperparams) for member in members]
+        self._unfinished: tuple[ppo.Parts, Tensor | None, int]
         self._grad_clip = self._per_member(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
         self._clips = any(item.grad_clip is not None for item in self._hyperparams)
         self._coefficients = ppo.Coefficients(
@@ -105,12 +106,8 @@ class PPOGroup:
             return self._networks.forward(observations)[..., -1]
         return self._networks.evaluate(observations, num_members, 2 * num_members)[..., 0]
 
-    def learn(self, batch: Batch) -> list[dict[str, float]]:
-        """Make the updates of one iteration.
-
-        Returns:
-            For each member, numbers of the last update.
-        """
+    def learn(self, batch: Batch) -> None:
+        """Make the updates of one iteration; on a GPU, only ask for them. `finish` comes next."""
         first = self._hyperparams[0]
         num_rows = batch.advantages.shape[1]
         num_updates = math.ceil(num_rows * first.num_epochs / first.minibatch_size)
@@ -127,9 +124,17 @@ class PPOGroup:
             if number == num_updates - 1:
                 parts = ppo.loss(outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian)
             norms = self._update(outputs, values, minibatch)
-        self._acting.refresh()
         assert parts is not None
-        return self._stats(parts, norms, num_updates)
+        self._unfinished = parts, norms, num_updates
+
+    def finish(self) -> list[dict[str, float]]:
+        """Wait for the updates of `learn`, and act with the new weights from now on.
+
+        Returns:
+            For each member, numbers of the last update.
+        """
+        self._acting.refresh()
+        return self._stats(*self._unfinished)
 
     def _columns(self, batch: Batch) -> Tensor:
         """All that a minibatch needs side by side, so that one gather brings it; (M * R, columns)."""

@@ -6,7 +6,9 @@ A outputs of the policy.
 
 from __future__ import annotations
 
+import contextlib
 import math
+from contextlib import AbstractContextManager
 from typing import Any, cast
 
 import gymnasium as gym
@@ -57,6 +59,8 @@ class PPOStack:
         self._groups: list[PPOGroup] = []
         self._episodes = EpisodeTracker()
         self._stale, self._is_written = False, True
+        self._ended: list[tuple[tuple[float, int], ...]] = []
+        self._stream = torch.cuda.Stream() if device.startswith("cuda") else None  # type: ignore[no-untyped-call]
         space = envs.action_space
         self._is_gaussian = isinstance(space, gym.spaces.Box)
         if isinstance(space, gym.spaces.Box):
@@ -111,7 +115,12 @@ class PPOStack:
         self._stale = False
 
     def train_iteration(self) -> dict[str, MemberStats]:
-        """Sample a batch of each member and learn from it."""
+        """See `Stack.train_iteration`."""
+        self.begin_iteration()
+        return self.finish_iteration()
+
+    def begin_iteration(self) -> None:
+        """See `Stack.begin_iteration`: sample a batch of each member and ask for the updates."""
         if self._stale:
             self._regroup()
         self._is_written = False
@@ -125,17 +134,27 @@ class PPOStack:
             member.num_env_steps += num_steps * self.envs.num_envs
             member.num_episodes += len(ended)
             member.num_iterations += 1
-        stats = []
         start = 0
-        for group in self._groups:
-            stop = start + len(group.members)
-            stats += group.learn(self._batch(group, fragment, start, stop))
-            start = stop
+        with self._on_own_stream():
+            for group in self._groups:
+                stop = start + len(group.members)
+                group.learn(self._batch(group, fragment, start, stop))
+                start = stop
         self._observations.learn(fragment.observations)
+        self._ended = episodes
+
+    def finish_iteration(self) -> dict[str, MemberStats]:
+        """See `Stack.finish_iteration`."""
+        with self._on_own_stream():
+            stats = [found for group in self._groups for found in group.finish()]
         return {
             member.member_id: MemberStats(member.num_env_steps, ended, found)
-            for member, ended, found in zip(self.members, episodes, stats, strict=True)
+            for member, ended, found in zip(self.members, self._ended, stats, strict=True)
         }
+
+    def _on_own_stream(self) -> AbstractContextManager[Any]:
+        """Where a GPU works on other stacks too, each waits for its own work alone."""
+        return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
 
     def _sample(self, num_steps: int) -> Fragment:
         envs, num_members, num_envs = self.envs, len(self.members), self.envs.num_envs

@@ -36,7 +36,18 @@ class Stack(Protocol):
         ...
 
     def train_iteration(self) -> dict[str, MemberStats]:
-        """One iteration of every member, by id. Members in `envs.errors` have failed."""
+        """An iteration of every member from beginning to end."""
+        ...
+
+    def begin_iteration(self) -> None:
+        """Begin an iteration of every member.
+
+        On a GPU the updates may go on when this returns: time for another stack to sample.
+        """
+        ...
+
+    def finish_iteration(self) -> dict[str, MemberStats]:
+        """End the iteration that was begun; what it gave, by id. Members in `envs.errors` have failed."""
         ...
 
 

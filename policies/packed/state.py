@@ -89,7 +89,7 @@ def load_member(folder: Path, member_id: str) -> Member:
             weights=parts.pop(_WEIGHTS),
             moments=parts,
             rng=rng,
-            **{name: _number(description["counters"][name]) for name in _COUNTERS},
+            **cast("Any", {name: _number(description["counters"][name]) for name in _COUNTERS}),
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder} does not hold a member's state: {error!r}.", _HINT) from error

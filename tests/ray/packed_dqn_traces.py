@@ -175,6 +175,9 @@ def check_learning_starts():
 def check_target_update_freq():
     found = check_trace("target_updates", target_update_freq=7)
     assert len(found.target_updates) > 15
+    # The updates of a phase are spread over the env steps before it.
+    found = check_trace("target_updates", target_update_freq=5, shared={"train_freq": 20})
+    assert len(set(found.target_updates)) > 15
     check_trace("target_updates", target_update_freq=1)
     # Null: every 500 env steps if hard, every update if soft.
     assert pack_trace(3, TRACED).target_updates == []

@@ -14,7 +14,7 @@ PACKS = {
         {"target_update_freq": 10},
         {"hidden_sizes": (5,), "lr": 5e-3, "target_update_freq": 20},
         {"hidden_sizes": (7,), "grad_clip": 0.5, "target_update_freq": 500},
-        {"activation": "tanh", "grad_clip": 20.0, "optimizer_epsilon": 1e-3},
+        {"activation": "tanh", "grad_clip": 20.0, "optimizer_epsilon": 1e-3, "adam_beta2": 0.99999},
     ]),
     "squared, no target network": ({"double_q": False, "dueling": False, "td_loss": "mse", "target_network": False}, [
         {"activation": "silu", "hidden_sizes": (12, 7)},

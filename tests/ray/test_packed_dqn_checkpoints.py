@@ -57,6 +57,7 @@ def trained(request, tmp_path, engine):
         engine.train_iteration()
     folder = tmp_path / "000003"
     policy = write_checkpoint(engine, folder)
+    assert_same_member(load(folder), member_of(engine))
     for name in ("t0000", "t0001"):
         engine.remove(name)
     return folder, task, policy, values

@@ -30,12 +30,21 @@ class PackedEngine:
         env_kind: How environments are stepped; None: what `choose_kind` measures.
         num_env_processes: Processes for environments, where the kind has them.
         device: Of the updates; None: a GPU if this process has been given one, else the CPU.
+        num_turns: Stacks that trials of one kind are spread over: one samples on the CPU while another's updates run on
+            the GPU. None: two where there is a GPU, else one.
     """
 
-    def __init__(self, env_kind: EnvKind | None = None, num_env_processes: int = 0, device: str | None = None) -> None:
+    def __init__(
+        self,
+        env_kind: EnvKind | None = None,
+        num_env_processes: int = 0,
+        device: str | None = None,
+        num_turns: int | None = None,
+    ) -> None:
         # Small networks run up to several times slower on more than one thread, and packs share the cores.
         torch.set_num_threads(1)
         self._env_kind, self._num_env_processes, self._device = env_kind, num_env_processes, device
+        self._num_turns = num_turns
         self._stacks: dict[Hashable, Stack] = {}
         self._tasks: dict[str, tuple[TrialTask, Hashable]] = {}
 
@@ -43,9 +52,10 @@ class PackedEngine:
         """See `PackEngine.add`."""
         # Validated where the values came from, the sweep file; this turns JSON back into the typed object.
         hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
-        key: Hashable = (pack_key(hyperparams), task.env_id, json.dumps(task.env_args), task.failure_penalty)
+        device = self._device or ("cuda" if task.num_gpus and torch.cuda.is_available() else "cpu")
+        key = self._place(task, hyperparams, device)
         is_new = key not in self._stacks
-        stack = self._stacks.get(key) or self._make_stack(task, hyperparams)
+        stack = self._stacks.get(key) or self._make_stack(task, hyperparams, device)
         try:
             space, action_space = stack.envs.observation_space, stack.envs.action_space
             member = new_member(task.trial_id, hyperparams, task.seed, space, action_space)
@@ -63,7 +73,18 @@ class PackedEngine:
         self._stacks[key] = stack
         self._tasks[task.trial_id] = (task, key)
 
-    def _make_stack(self, task: TrialTask, hyperparams: TrainedHyperparams) -> Stack:
+    def _place(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Hashable:
+        """The key of the stack that a new member goes to: of those of its kind, the one with fewest."""
+        kind = (pack_key(hyperparams), task.env_id, json.dumps(task.env_args), task.failure_penalty)
+        num_turns = self._num_turns or (2 if device.startswith("cuda") else 1)
+
+        def num_members(key: Hashable) -> int:
+            stack = self._stacks.get(key)
+            return 0 if stack is None else len(stack.members)
+
+        return min(((*kind, turn) for turn in range(num_turns)), key=num_members)
+
+    def _make_stack(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Stack:
         kind = self._env_kind or choose_kind(task.env_id, task.env_args, spare_cpus=0).kind
         envs = make_packed_envs(
             task.env_id,
@@ -73,14 +94,15 @@ class PackedEngine:
             kind=kind,
             num_processes=self._num_env_processes,
         )
-        device = self._device or ("cuda" if task.num_gpus and torch.cuda.is_available() else "cpu")
         return make_stack(hyperparams, envs, device)
 
     def train_iteration(self) -> dict[str, IterationStats | Exception]:
         """See `PackEngine.train_iteration`."""
         results: dict[str, IterationStats | Exception] = {}
         for stack in self._stacks.values():
-            for trial_id, stats in stack.train_iteration().items():
+            stack.begin_iteration()
+        for stack in self._stacks.values():
+            for trial_id, stats in stack.finish_iteration().items():
                 error = stack.envs.errors.get(trial_id)
                 results[trial_id] = error or IterationStats(stats.num_env_steps, stats.episodes, stats.learner)
         return results
