@@ -126,6 +126,8 @@ def test_a_member_that_is_ended_saves_where_it_is_unless_it_has(tmp_path):
     pack.add("t0009")
     pack.loop.end("t0009")
     assert pack.loop.trial_ids == ("t0002",)
+    pack.advance()
+    assert pack.of("t0009") == []
 
 
 def test_an_empty_pack_reports_at_once(tmp_path):
@@ -260,6 +262,7 @@ def test_nan_weights_end_a_member_as_failed_and_it_is_not_retried(tmp_path):
     assert "NaN" in ended.error
     assert ended.best_iteration == 3
     assert pack.engine.builds.count(("t0001", None)) == 1
+    assert results(pack, "t0001") == [1, 2, 3, 4]
     assert results(pack, "t0000") == [1, 2, 3, 4, 5, 6]
 
 
