@@ -70,7 +70,7 @@ class Mp4Writer:
         """Add a picture, or hold it for several frames."""
         if self._process is None:
             self._process = self._start(picture.size)
-        data = picture.convert("RGB").tobytes()
+        data = (picture if picture.mode == "RGB" else picture.convert("RGB")).tobytes()
         assert self._process.stdin is not None
         try:
             for _ in range(times):

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -36,9 +36,9 @@ _TEXT = (240, 242, 246)
 _DIM = (158, 164, 176)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Panel:
-    """A frame and what its caption strip says."""
+    """A frame and what its caption strip says; one that is held is the very same object."""
 
     frame: Image.Image
     title: str
@@ -93,33 +93,33 @@ def record_video(
     return Episodes(filmed, tuple(end.total for end in ends), tuple(end.steps for end in ends))
 
 
-def record_side_by_side(
+def record_comparison(
     left: Policy,
     right: Policy,
     *,
     env_id: str,
     env_args: Mapping[str, Any] | None = None,
-    seeds: int | Sequence[int],
-    mp4: Path | None = None,
-    gif: Path | None = None,
-    captions: tuple[str | None, str | None] = (None, None),
-    fps: float | None = None,
+    seed: int,
+    captions: tuple[str, str],
+    left_mp4: Path,
+    right_mp4: Path,
+    right_gif: Path,
+    both_mp4: Path,
     max_steps: int | None = None,
 ) -> tuple[Episodes, Episodes]:
-    """Film the episodes of two policies on the same seeds, next to each other.
-
-    The shorter one holds its last frame.
+    """Film one episode of each of two policies, alone and next to each other, drawing each frame once.
 
     Args:
         left: What acts on the left.
         right: What acts on the right.
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
-        seeds: One seed or several.
-        mp4: File to write (H.264); None: no MP4.
-        gif: File to write (looping, half the size, at most about 3 MB); None: no GIF.
-        captions: Of the left and the right; None: the policy's description.
-        fps: Frames a second; None: the env's `render_fps`, so that it plays in real time.
+        seed: Of both episodes.
+        captions: Of the left and the right.
+        left_mp4: File of the left one alone.
+        right_mp4: File of the right one alone.
+        right_gif: The same as a GIF.
+        both_mp4: File of the two side by side; the shorter one holds its last frame.
         max_steps: Cap on the env steps of an episode; None: as `evaluate_policy`.
 
     Returns:
@@ -130,24 +130,25 @@ def record_side_by_side(
         NonFiniteWeightsError: A policy's weights are NaN or infinite.
         CannotRunError: A file cannot be written, or there is no video encoder.
     """
-    filmed = check_seeds([seeds] if isinstance(seeds, int | np.integer) else seeds)
-    ends: list[list[_Panel]] = []
+    (seed,) = check_seeds([seed])
     with ExitStack() as stack:
-        stages = []
-        for policy, caption in zip((left, right), captions, strict=True):
-            title = policy.description if caption is None else caption
-            stages.append(stack.enter_context(_Stage(policy, env_id, env_args, title, max_steps)))
-        film = stack.enter_context(_Film(mp4, gif, stages[0].fps if fps is None else fps))
-        for seed in filmed:
-            panels: list[_Panel] = []
-            for panels in _in_step([stage.play(seed) for stage in stages]):
-                film.add(panels, last=all(panel.over for panel in panels))
-            ends.append(panels)
-    results = [
-        Episodes(filmed, tuple(panels[side].total for panels in ends), tuple(panels[side].steps for panels in ends))
-        for side in (0, 1)
-    ]
-    return results[0], results[1]
+        stages = [
+            stack.enter_context(_Stage(policy, env_id, env_args, title, max_steps))
+            for policy, title in zip((left, right), captions, strict=True)
+        ]
+        fps = stages[0].fps
+        alone = [stack.enter_context(_Film(mp4, gif, fps)) for mp4, gif in ((left_mp4, None), (right_mp4, right_gif))]
+        both = stack.enter_context(_Film(both_mp4, None, fps))
+        before: list[_Panel | None] = [None, None]
+        panels: list[_Panel] = []
+        for panels in _in_step([stage.play(seed) for stage in stages]):
+            for film, panel, known in zip(alone, panels, before, strict=True):
+                if panel is not known:
+                    film.add([panel], last=panel.over)
+            both.add(panels, last=all(panel.over for panel in panels))
+            before = list(panels)
+    first, second = (Episodes((seed,), (panel.total,), (panel.steps,)) for panel in panels)
+    return first, second
 
 
 class _Stage:
@@ -269,13 +270,15 @@ def _picture(panels: Sequence[_Panel], scale: float) -> Image.Image:
     return picture
 
 
+# Both panels at both scales: the same ones go into several films, or are held.
+@lru_cache(maxsize=4)
 def _captioned(panel: _Panel, scale: float) -> Image.Image:
     width, height = (max(1, round(length * scale)) for length in panel.frame.size)
     # Text is drawn at the final size: scaled down it could not be read in a GIF.
     strip = min(44, max(26, round(width * 0.066)))
     strip += (height + strip) % 2  # H.264 wants even heights
     picture = Image.new("RGB", (width, height + strip), _BACKGROUND)
-    frame = panel.frame if scale == 1.0 else panel.frame.resize((width, height), Image.Resampling.LANCZOS)
+    frame = panel.frame if scale == 1.0 else panel.frame.resize((width, height), _filter(scale))
     picture.paste(frame, (0, strip))
     draw = ImageDraw.Draw(picture)
     font = _font(round(strip * 0.46))
@@ -288,6 +291,11 @@ def _captioned(panel: _Panel, scale: float) -> Image.Image:
         right -= max(draw.textlength(f"{label} {digits}", font) for digits in ("000", number)) + pad
     draw.text((pad, middle), _shorten(panel.title, draw, font, right - pad), font=font, fill=_TEXT, anchor="lm")
     return picture
+
+
+def _filter(scale: float) -> Image.Resampling:
+    # The mean of whole pixels is as good where it goes out even, and four times as fast.
+    return Image.Resampling.BOX if (1.0 / scale).is_integer() else Image.Resampling.LANCZOS
 
 
 @cache

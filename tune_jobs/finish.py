@@ -20,7 +20,7 @@ from policies.evaluate import evaluate_policy
 from policies.hyperparams import ConstantHyperparams
 from policies.policy import Policy, RandomPolicy, load_policy, policy_from_portable
 from policies.portable import PolicyNetwork, read_policy, save_policy
-from policies.video import record_side_by_side, record_video
+from policies.video import record_comparison, record_video
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
@@ -298,19 +298,21 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
         "before_after_mp4": "before_after.mp4",
     }
     paths = {key: store.best_folder / name for key, name in names.items()}
-    env: dict[str, Any] = {"env_id": source.env_id, "env_args": source.env_args, "seeds": chosen}
     # A baseline has not been trained: it is shown as what it is.
     trained = not isinstance(source.policy, RandomPolicy | ConstantPolicy)
     first = "before training: random" if trained else before.description
     second = f"after training: {best.checkpoint.trial_id}" if trained else source.policy.description
-    record_video(before, **env, mp4=paths["before_mp4"], caption=first)
-    record_video(source.policy, **env, mp4=paths["after_mp4"], gif=paths["after_gif"], caption=second)
-    record_side_by_side(
+    record_comparison(
         before,
         source.policy,
-        **env,
-        mp4=paths["before_after_mp4"],
-        captions=("before: random", "after training") if trained else (first, second),
+        env_id=source.env_id,
+        env_args=source.env_args,
+        seed=chosen,
+        captions=(first, second),
+        left_mp4=paths["before_mp4"],
+        right_mp4=paths["after_mp4"],
+        right_gif=paths["after_gif"],
+        both_mp4=paths["before_after_mp4"],
     )
     return paths
 

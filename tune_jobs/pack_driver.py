@@ -119,7 +119,8 @@ class PackDriver:
     @property
     def is_finished(self) -> bool:
         """Whether there is nothing to do any more."""
-        return not self._waiting and not self._alone and not any(pack.members for pack in self._packs.values())
+        # As long as somebody waits, no pack is empty, unless the sweep is asked to stop.
+        return not any(pack.members for pack in self._packs.values())
 
     def log_tail(self, pack_id: str) -> str:
         """The end of what a pack's process printed."""
@@ -148,9 +149,9 @@ class PackDriver:
         """A pack's process died, or what concerns no single member went wrong; it is started again."""
         pack = self._packs[pack_id]
         pack.is_up = False
+        in_company = len(pack.members) > 1
         for trial_id in list(pack.ending):
             self._stopped(pack, trial_id)
-        in_company = len(pack.members) > 1
         for trial_id in list(pack.members):
             if in_company:
                 self._num_deaths[trial_id] += 1
@@ -210,7 +211,7 @@ class PackDriver:
     def _stopped(self, pack: _Pack, trial_id: str) -> None:
         """A member that was to be ended is gone without a word: its checkpoints are those on disk."""
         checkpoints = tuple(self._store.trial(trial_id).checkpoints())
-        self._keeper.change(trial_id, status="running", checkpoints=checkpoints)
+        self._keeper.change(trial_id, checkpoints=checkpoints)
         self._keeper.ended(trial_id)
         self._leave(pack, trial_id)
 

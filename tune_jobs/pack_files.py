@@ -6,6 +6,7 @@ The process that drives the sweep writes `<pack>.json`, the pack reads it before
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,8 @@ from policies.errors import CheckpointError
 from policies.files import write_atomic
 
 _TAIL_BYTES = 20_000
+TIMEOUT_MARK = "Timeout ("
+"""How the traceback of a process begins that was ended because it hung."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +62,23 @@ class PackFiles:
                 "Check that all nodes see the sweep folder, and resume the sweep.",
             ) from error
 
+    def begin_log(self) -> None:
+        """Print what tells the output of this process, which goes to the log, from that of earlier ones."""
+        print(f"{self._log_mark}{os.getpid()}", flush=True)
+
+    @property
+    def _log_mark(self) -> str:
+        return f"-- pack {self.pack_id}, process "
+
     def log_tail(self, num_lines: int = 15) -> str:
-        """The last lines of the pack's log; empty if there is none."""
+        """The last lines of the pack's last process, after one that says if it was ended because it hung."""
         try:
             with self.log_path.open("rb") as file:
                 file.seek(max(0, self.log_path.stat().st_size - _TAIL_BYTES))
                 lines = file.read().decode("utf-8", errors="replace").splitlines()
         except OSError:
             return ""
-        return "\n".join(lines[-num_lines:])
+        begun = max((index for index, line in enumerate(lines) if line.startswith(self._log_mark)), default=0)
+        above, tail = lines[begun:-num_lines], lines[begun:][-num_lines:]
+        # The traceback of every thread comes after it.
+        return "\n".join([line for line in above if line.startswith(TIMEOUT_MARK)][-1:] + tail)

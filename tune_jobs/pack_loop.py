@@ -255,12 +255,10 @@ class PackLoop:
 
     def _conclude(self, evaluations: Mapping[_Member, Episodes | Exception | None]) -> None:
         acts = {}
-        # In the order of the members, whoever was evaluated: schedulers hear of them in this order.
-        for member in self._all:
-            evaluation = evaluations.get(member)
+        for member, evaluation in evaluations.items():
             if isinstance(evaluation, Exception) and not isinstance(evaluation, NonFiniteWeightsError):
                 self._failed(member, evaluation)
-            elif member in evaluations:
+            else:
                 acts[member] = functools.partial(member.trial.conclude, evaluation)
         self._attempt(acts, saves=any(member.may_save for member in acts))
 

@@ -7,6 +7,7 @@ train is in the sweep folder, so a pack that is started again goes on from what 
 from __future__ import annotations
 
 import functools
+import os
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,9 +47,11 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error comes from there."""
         self._config = config
+        self._parent = os.getppid()
         self._files = PackFiles(Path(config["sweep_folder"]), config["pack_id"])
         self._log = TrialLog()
         self._file: IO[bytes] = self._log.open(self._files.log_path)
+        self._files.begin_log()
         self._engine: PackEngine | None = None
         self._evaluator: Evaluator | None = None
         self._loop: PackLoop | None = None
@@ -92,10 +95,17 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
             self._engine,
             self._evaluator,
             self.evaluate,
-            stop_requested=reader.store.stop_requested,
+            stop_requested=self._stop_requested,
             max_retries=spec.max_retries,
             watch=functools.partial(watchdog, file=self._file),
         )
+
+    def _stop_requested(self) -> bool:
+        if os.getppid() != self._parent:
+            # The Ray that started this process is gone, and the driver with it: what is done from here on would get in
+            # the way of whoever goes on with the sweep.
+            os._exit(1)
+        return self._reader.store.stop_requested()
 
     def _arrange(self, loop: PackLoop) -> None:
         """Make the members those that are assigned."""

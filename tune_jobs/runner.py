@@ -22,6 +22,7 @@ from ray.tune.schedulers import TrialScheduler
 from analysis.records import CheckpointRecord
 from policies.errors import TuneJobsError
 from tune_jobs.pack_driver import PackDriver, PackScheduler
+from tune_jobs.pack_files import TIMEOUT_MARK
 from tune_jobs.pack_trainable import PackTrainable
 from tune_jobs.packs import PackPlan
 from tune_jobs.population import PopulationScheduler
@@ -308,7 +309,7 @@ def describe_failure(error: BaseException | None, log_tail: str, what: str = "tr
         message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {cause}"
     elif isinstance(error, RayActorError):
         message = f"The process of the {what} died"
-        if "Timeout (" in log_tail:
+        if TIMEOUT_MARK in log_tail:
             message += ": an iteration took longer than iteration_timeout_s"
         elif error.preempted:
             message += ": its node was taken away"

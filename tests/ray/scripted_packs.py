@@ -46,7 +46,7 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
     Args:
         scripts: Of a trial, by its id: `score`, its evaluation return (the iteration, if it has none); `raise_at`, the
             iteration that always raises; `kill_at`, the iteration that kills the process, for the first `kills` times;
-            `after`, a file of the sweep folder that it waits for.
+            `hang_at`, the iteration that hangs, the first time; `after`, a file of the sweep folder that it waits for.
         pause_s: Seconds that an iteration of the pack takes.
     """
     # Defined in here, or the worker processes would look for a module that only this one has.
@@ -90,6 +90,9 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
                     marker.write_text(str(kills + 1))
                     print("about to die", flush=True)
                     os.kill(os.getpid(), kill)
+                    time.sleep(60)
+                if iteration == script.get("hang_at") and kills == 0:
+                    marker.write_text("1")
                     time.sleep(60)
                 if iteration == script.get("raise_at"):
                     results[trial_id] = ZeroDivisionError("the cart left the track")

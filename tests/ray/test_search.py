@@ -130,7 +130,8 @@ def most_at_once(trials):
 
 def test_tpe_runs_as_many_trials_at_once_as_the_machine_allows_and_goes_on_when_extended(ray_session, tmp_path):
     pytest.importorskip("optuna")
-    result = launch(tmp_path, **TPE)
+    # In packs there are more at once; see test_packs.
+    result = launch(tmp_path, **TPE, engine="rllib")
     assert [trial.status for trial in result.trials] == ["completed"] * 5
     assert most_at_once(result.trials) == 2
     spec = load_spec(result.sweep.spec)

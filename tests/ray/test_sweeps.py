@@ -229,9 +229,10 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
         str(seeds[3]): {"how": "exit", "marker": str(tmp_path / "died")},
         str(seeds[4]): {"how": "hang", "at": 70, "marker": str(tmp_path / "hung")},
     }
+    # In a pack some would be tried again because others died.
     spec = make_spec(
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
-        iteration_timeout_s=12,
+        iteration_timeout_s=12, engine="rllib",
     )  # fmt: skip
     result = launch(tmp_path, spec, finish=True)
     assert [trial.status for trial in result.trials] == ["completed", "failed", "completed", "completed", "completed"]

@@ -16,7 +16,7 @@ from policies.errors import CannotRunError, EnvError, SpecError
 from policies.evaluate import evaluate_policy
 from policies.movies import GifWriter, Mp4Writer
 from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
-from policies.video import record_side_by_side, record_video
+from policies.video import record_comparison, record_video
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
@@ -80,27 +80,37 @@ def test_a_random_policy_is_filmed_as_it_is_evaluated(tmp_path):
     assert filmed == evaluate_policy(policy, env_id="CartPole-v1", seeds=[8])
 
 
-def test_side_by_side_the_shorter_one_holds_its_last_frame(tmp_path):
+def test_two_episodes_are_filmed_alone_and_side_by_side(tmp_path):
     left, right = balancing_policy(skill="poor"), balancing_policy()
-    results = record_side_by_side(
+    results = record_comparison(
         left,
         right,
         env_id="CartPole-v0",
-        seeds=4,
-        mp4=tmp_path / "a.mp4",
-        gif=tmp_path / "a.gif",
+        seed=4,
+        captions=("poor", "good"),
+        left_mp4=tmp_path / "left.mp4",
+        right_mp4=tmp_path / "right.mp4",
+        right_gif=tmp_path / "right.gif",
+        both_mp4=tmp_path / "both.mp4",
         max_steps=80,
     )
     for policy, result in zip((left, right), results, strict=True):
         assert result == evaluate_policy(policy, env_id="CartPole-v0", seeds=[4], max_episode_steps=80)
     short, long = results[0].lengths[0], results[1].lengths[0]
     assert short < long == 80
-    meta, frames = read_mp4(tmp_path / "a.mp4")
+    meta, frames = read_mp4(tmp_path / "both.mp4")
     assert len(frames) == long + 1 + 50
     assert meta["size"][0] == 600 + 12 + 600
     film = np.stack(frames).astype(int)
+    # The shorter one holds its last frame.
     assert np.abs(film[short, :, :600] - film[-1, :, :600]).mean() < 0.5
     assert np.abs(film[short, :, 612:] - film[-1, :, 612:]).mean() > 0.5
+    for side, name, length in ((slice(0, 600), "left", short), (slice(612, None), "right", long)):
+        alone = np.stack(read_mp4(tmp_path / f"{name}.mp4")[1]).astype(int)
+        assert len(alone) == length + 1 + 50
+        assert np.abs(alone[: length + 1] - film[: length + 1, :, side]).mean() < 2  # H.264 is not exact
+    record_video(right, env_id="CartPole-v0", seeds=4, gif=tmp_path / "alone.gif", caption="good", max_steps=80)
+    assert (tmp_path / "right.gif").read_bytes() == (tmp_path / "alone.gif").read_bytes()
 
 
 def test_tiny_frames_are_enlarged(tmp_path):

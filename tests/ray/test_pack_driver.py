@@ -1,0 +1,224 @@
+"""Who trains in which pack, decided without any process: what packs report is made up here."""
+
+import pytest
+from scripted_packs import make_sweep
+
+from analysis.records import CheckpointRecord
+from tune_jobs.pack_driver import PackDriver
+from tune_jobs.pack_files import PackFiles
+from tune_jobs.pack_loop import MemberReport
+from tune_jobs.packs import PackPlan
+from tune_jobs.record_keeper import RecordKeeper
+from tune_jobs.schedulers import build_scheduler
+from tune_jobs.spec import SweepSpec
+from tune_jobs.trial import Progress
+
+pytestmark = pytest.mark.ray
+
+
+class Driven:
+    """A driver whose packs are up, and what they would report."""
+
+    def __init__(self, folder, num_trials, *, num_packs=2, slots=2, choose=None, **spec):
+        self.store = make_sweep(folder / "mine", num_trials, **spec)
+        names = [f"t{index:04d}" for index in range(num_trials)]
+        self.spec = SweepSpec.model_validate(self.store.read_record().spec)
+        self.keeper = RecordKeeper(self.store, names, lambda record: None)
+        plan = PackPlan(num_packs, slots, 1.0, 0.0, tuple(names), "scalar", None, 0)
+        scheduler = build_scheduler(self.spec.scheduler, self.spec.stop.num_env_steps)
+        self.driver = PackDriver(
+            self.store, self.spec, plan, names, scheduler=scheduler, keeper=self.keeper, choose=choose
+        )
+        for pack_id in self.driver.pack_ids:
+            self.driver.started(pack_id)
+
+    def assigned(self, pack_id="p00"):
+        """Trial numbers in a pack's file."""
+        return [int(name[1:]) for name in PackFiles(self.store.folder, pack_id).read().trial_ids]
+
+    def tell(self, pack_id="p00", /, **reports):
+        """Reports of a pack, by trial id: env steps, with a score, or a status, or a failure."""
+        return self.driver.take(pack_id, [self.report(*item) for item in reports.items()], node="here", pid=1)
+
+    def report(self, trial_id, what):
+        if isinstance(what, MemberReport):
+            return what
+        steps, told = what
+        status, score = (told, 1.0) if isinstance(told, str) else ("running", told)
+        progress = Progress(
+            iteration=steps // 100, num_env_steps=steps, num_episodes=1, time_s=1.0, training_return=None,
+            evaluation_return=score, best_evaluation_return=score, best_iteration=None, evaluated=True, status=status,
+        )  # fmt: skip
+        return MemberReport(trial_id, progress)
+
+    def status(self, number):
+        record = self.keeper.record(f"t{number:04d}")
+        return record.status, record.num_failures
+
+
+def failure(number, *, retried):
+    return MemberReport(f"t{number:04d}", error="it broke", retried=retried)
+
+
+# -- handing out
+
+
+@pytest.mark.parametrize(
+    ("num_trials", "slots", "shares"),
+    [(5, 64, [[0, 1, 2], [3, 4]]), (9, 2, [[0, 1], [2, 3]]), (1, 8, [[0]]), (2, 1, [[0], [1]])],
+)
+def test_trials_are_spread_evenly_in_their_order(tmp_path, num_trials, slots, shares):
+    driven = Driven(tmp_path, num_trials, slots=slots)
+    assert [driven.assigned(pack_id) for pack_id in driven.driver.pack_ids] == shares
+    assert not driven.driver.is_finished
+
+
+def test_free_slots_are_filled_until_nobody_waits(tmp_path):
+    driven = Driven(tmp_path, 6)
+    assert driven.tell(t0000=(1000, "completed")) is False
+    assert driven.assigned() == [1, 4]
+    assert driven.status(4) == ("running", 0)
+    driven.tell("p01", t0002=(1000, "completed"), t0003=(1000, "failed"))
+    assert driven.assigned("p01") == [5]
+    assert driven.tell("p01", t0005=(1000, "completed")) is True
+    assert not driven.driver.is_finished
+    assert driven.tell(t0001=(1000, "completed"), t0004=(1000, "completed")) is True
+    assert driven.driver.is_finished
+    assert [driven.status(number)[0] for number in (0, 3)] == ["completed", "failed"]
+
+
+def test_points_are_chosen_when_trials_are_handed_out_and_once(tmp_path):
+    chosen = []
+    driven = Driven(tmp_path, 6, choose=chosen.append)
+    assert chosen == ["t0000", "t0001", "t0002", "t0003"]
+    driven.tell(t0000=(1000, "completed"))
+    driven.driver.died("p00", "killed")
+    assert chosen[4:] == ["t0004"]
+
+
+# -- schedulers
+
+
+ASHA = {"type": "asha", "grace_env_steps": 200, "reduction_factor": 2}
+
+
+def test_who_is_ended_makes_room_before_it_has_left(tmp_path):
+    driven = Driven(tmp_path, 4, num_packs=1, scheduler=ASHA)
+    driven.tell(t0000=(200, 9.0), t0001=(200, 1.0))
+    # The pack lets 1 go first; it is no member any more to whoever reads the file.
+    assert driven.assigned() == [0, 2]
+    assert driven.status(1) == ("running", 0)
+    driven.tell(t0001=(200, "stopped"), t0002=(100, 3.0))
+    assert driven.keeper.record("t0001").stop_reason == "scheduler, at 200 env steps"
+    assert driven.assigned() == [0, 2]
+
+
+@pytest.mark.parametrize("how", ["fails", "dies"])
+def test_who_is_ended_and_cannot_save_is_ended_all_the_same(tmp_path, how):
+    driven = Driven(tmp_path, 2, num_packs=1, scheduler=ASHA, max_retries=0)
+    driven.tell(t0000=(200, 9.0), t0001=(200, 1.0))
+    saved = CheckpointRecord(
+        trial_id="t0001", iteration=2, num_env_steps=200, path="trials/t0001/checkpoints/000002", evaluation_return=1.0
+    )
+    driven.store.trial("t0001").write_checkpoint(saved, lambda folder: None)
+    if how == "fails":
+        driven.tell(t0001=failure(1, retried=True))
+    else:
+        driven.driver.died("p00", "killed")
+    record = driven.keeper.record("t0001")
+    assert (record.status, record.num_failures, record.checkpoints) == ("stopped", 0, (saved,))
+    # It may have been the ended one that ended the process: the other is tried again, without any retries left.
+    assert driven.status(0) == (("running", 0) if how == "fails" else ("pending", 1))
+    assert driven.assigned() == [0]
+
+
+def test_whoever_has_ended_is_compared_with_too(tmp_path):
+    driven = Driven(tmp_path, 5, num_packs=1, slots=5, scheduler=ASHA)
+    # With what it had at its end.
+    driven.tell(t0000=(200, "completed"), t0001=(200, 0.5))
+    assert driven.assigned() == [2, 3, 4]
+    # 1, which is ended at the second rung, counts at the first one too, where it was never seen.
+    driven = Driven(tmp_path / "b", 3, num_packs=1, slots=3, scheduler=ASHA)
+    driven.tell(t0000=(400, 9.0), t0001=(400, 1.0))
+    assert driven.assigned() == [0, 2]
+    driven.tell(t0002=(200, 0.5))
+    assert driven.assigned() == [0]
+
+
+def test_a_report_without_an_evaluation_is_compared_with_nothing(tmp_path):
+    driven = Driven(tmp_path, 2, num_packs=1, scheduler=ASHA)
+    driven.tell(t0000=(200, 9.0))
+    report = driven.report("t0001", (200, 1.0))
+    silent = MemberReport("t0001", progress=Progress(**{**vars(report.progress), "evaluated": False}))
+    driven.tell(t0001=silent)
+    assert driven.assigned() == [0, 1]
+
+
+# -- failures
+
+
+def test_failures_of_its_own_are_known_to_the_next_process(tmp_path):
+    driven = Driven(tmp_path, 2, num_packs=1, max_retries=3)
+    driven.tell(t0001=failure(1, retried=True))
+    assert driven.status(1) == ("running", 1)
+    assert PackFiles(driven.store.folder, "p00").read().num_failures == {"t0001": 1}
+    driven.tell(t0001=failure(1, retried=False))
+    assert driven.status(1) == ("failed", 2)
+    assert driven.assigned() == [0]
+
+
+def test_who_was_in_two_packs_that_died_goes_on_alone(tmp_path):
+    chosen = []
+    driven = Driven(tmp_path, 5, num_packs=1, slots=2, max_retries=0, choose=chosen.append)
+    driven.driver.died("p00", "killed")
+    # Once may be anybody's fault: all are tried again.
+    assert driven.assigned() == [0, 1]
+    assert [driven.status(number) for number in (0, 1, 2)] == [("pending", 1), ("pending", 1), ("pending", 0)]
+    driven.driver.started("p00")
+    driven.tell(t0000=(1000, "completed"))
+    assert driven.assigned() == [1, 2]
+    driven.driver.died("p00", "killed")
+    # 2 was in one such pack only, and 3 takes the other's slot.
+    assert driven.assigned() == [2, 3]
+    assert driven.status(1) == ("pending", 2)
+    driven.driver.started("p00")
+    driven.tell(t0002=(1000, "completed"), t0003=(1000, "completed"))
+    # The pack is empty: now 1 has it for itself, though somebody waits.
+    assert driven.assigned() == [1]
+    driven.tell(t0001=(100, 1.0))
+    assert driven.assigned() == [1]
+    driven.driver.died("p00", "killed by 1")
+    # It was nobody else.
+    assert driven.status(1) == ("failed", 3)
+    assert driven.assigned() == [4]
+    driven.driver.started("p00")
+    assert driven.tell(t0004=(1000, "completed")) is True
+    assert driven.driver.is_finished
+    assert chosen == [f"t000{number}" for number in range(5)]
+
+
+def test_a_pack_of_one_has_the_retries_of_a_trial(tmp_path):
+    driven = Driven(tmp_path, 1, num_packs=1, max_retries=2)
+    statuses = []
+    for _ in range(3):
+        assert not driven.driver.is_finished
+        driven.driver.died("p00", "killed")
+        statuses.append(driven.status(0))
+    assert statuses == [("pending", 1), ("pending", 2), ("failed", 3)]
+    assert driven.driver.is_finished
+    assert driven.keeper.record("t0000").error == "killed"
+
+
+# -- the end of the run
+
+
+def test_nobody_is_handed_out_any_more_when_the_sweep_stops(tmp_path):
+    driven = Driven(tmp_path, 6)
+    driven.store.request_stop()
+    assert driven.tell(t0000=(300, "paused"), t0001=failure(1, retried=True)) is True
+    assert [driven.status(number) for number in (0, 1, 4)] == [("paused", 0), ("pending", 1), ("pending", 0)]
+    assert driven.keeper.running == {"t0002", "t0003"}
+    # The other did not save in time.
+    driven.driver.closed("p01")
+    assert [driven.status(number)[0] for number in (2, 3)] == ["paused", "paused"]
+    assert driven.keeper.running == set()

@@ -1,0 +1,118 @@
+"""The records of a run: told at once, on disk at once where it matters, and not more often than the disk allows."""
+
+import pytest
+from fake_engine import FakeClock
+
+from analysis.records import CheckpointRecord, TrialRecord
+from tune_jobs.record_keeper import RecordKeeper
+from tune_jobs.store import SweepStore
+from tune_jobs.trial import Progress
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """(store, keeper, its clock, everything the listener was told) of 50 trials; the last was done before this run."""
+    store, clock, told = SweepStore(tmp_path / "mine"), FakeClock(), []
+    store.create()
+    for index in range(50):
+        record = TrialRecord(trial_id=f"t{index:04d}", index=index, point_index=index, seed=index, point={})
+        store.trial(record.trial_id).write_record(record)
+    names = [record.trial_id for record in store.read_trials()][:49]
+    return store, RecordKeeper(store, names, told.append, clock), clock, told
+
+
+def progress(iteration=1, *, evaluated=True, status="running", **changes):
+    values = {
+        "num_env_steps": 100 * iteration, "num_episodes": iteration, "time_s": 1.0, "training_return": 5.0,
+        "evaluation_return": 7.0, "best_evaluation_return": 7.0, "best_iteration": 1,
+    } | changes  # fmt: skip
+    return Progress(iteration=iteration, evaluated=evaluated, status=status, **values)
+
+
+def on_disk(store, trial_id):
+    return store.trial(trial_id).read_record()
+
+
+def test_what_a_trial_tells_is_in_its_record(kept):
+    store, keeper, _, told = kept
+    checkpoint = CheckpointRecord(trial_id="t0003", iteration=4, num_env_steps=400, path="trials/t0003/checkpoints/4")
+    keeper.started("t0003")
+    assert told[-1].status == "running"
+    keeper.progressed("t0003", progress(4, checkpoints=(checkpoint,)), node="here", pid=12)
+    keeper.flush()
+    record = on_disk(store, "t0003")
+    assert record == keeper.record("t0003") == told[-1]
+    assert (record.num_iterations, record.num_env_steps, record.checkpoints) == (4, 400, (checkpoint,))
+    assert (record.node, record.pid, record.evaluation_return) == ("here", 12, 7.0)
+    assert [one.trial_id for one in keeper.all_records()] == [f"t{index:04d}" for index in range(50)]
+    assert list((store.trial("t0003").folder / "tensorboard").iterdir())
+
+
+def test_running_trials_are_written_as_often_as_there_is_time_for_and_the_others_at_once(kept):
+    store, keeper, clock, _ = kept
+    names = [f"t{index:04d}" for index in range(49)]
+    for name in names:
+        keeper.started(name)
+        keeper.progressed(name, progress(1), node="here", pid=1)
+    keeper.progressed("t0048", progress(1, status="completed"), node="here", pid=1)
+    keeper.flush()
+
+    def written(iteration):
+        return [name for name in names if on_disk(store, name).num_iterations == iteration]
+
+    # Twenty a second, and the one that has ended.
+    assert written(1) == [*names[:20], "t0048"]
+    clock.now += 0.5
+    keeper.flush()
+    keeper.flush()
+    assert written(1) == [*names[:30], "t0048"]
+    for name in names[:48]:
+        keeper.progressed(name, progress(2), node="here", pid=1)
+    clock.now += 1.0
+    keeper.flush()
+    # First those that were never written, then what was written longest ago.
+    assert sorted(written(1)) == [*names[2:30], "t0048"]
+    assert written(2) == [*names[:2], *names[30:48]]
+    for name in names[:48]:
+        keeper.progressed(name, progress(3), node="here", pid=1)
+    clock.now += 100.0
+    keeper.flush()
+    # No more at once after a while without any.
+    assert len(written(3)) == 20
+    keeper.close()
+    assert written(3) == names[:48]
+
+
+def test_what_a_process_reads_is_on_disk_at_once(kept):
+    store, keeper, _, told = kept
+    for index in range(40):
+        keeper.change(f"t{index:04d}", point={"lr": 0.1}, has_point=True)
+        assert on_disk(store, f"t{index:04d}").point == {"lr": 0.1}
+    assert len(told) == 40
+
+
+def test_how_trials_end(kept):
+    store, keeper, _, _ = kept
+    for index in range(5):
+        keeper.started(f"t000{index}")
+    assert keeper.running == {f"t000{index}" for index in range(5)}
+    keeper.progressed("t0000", progress(3, status="completed", stop_reason="time_s 3 >= 3"), node="here", pid=1)
+    keeper.ended("t0000")
+    keeper.failed("t0001", "it broke", retried=True)
+    keeper.failed("t0002", "it broke", retried=False)
+    keeper.progressed("t0003", progress(3), node="here", pid=1)
+    keeper.ended("t0003")
+    store.request_stop()
+    keeper.ended("t0004")
+    assert keeper.running == set()
+    keeper.flush()
+    told = [(one.status, one.stop_reason, one.error, one.num_failures) for one in store.read_trials()[:5]]
+    assert told == [
+        ("completed", "time_s 3 >= 3", None, 0),
+        ("pending", None, "it broke", 1),
+        ("failed", None, "it broke", 1),
+        ("stopped", "scheduler, at 300 env steps", None, 0),
+        ("paused", None, None, 0),
+    ]
+    keeper.started("t0001")
+    assert (keeper.record("t0001").error, keeper.record("t0001").num_failures) == (None, 1)
