@@ -264,8 +264,8 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
     return folder
 
 
-def find_rllib_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, PolicyNetwork]:
-    """RLlib's own folder in a verified checkpoint, and the network that was saved beside it.
+def find_trained_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, PolicyNetwork]:
+    """A verified checkpoint that can be trained on, and the network that was saved in it.
 
     Raises:
         NotFoundError: There is no such checkpoint.
@@ -278,7 +278,7 @@ def find_rllib_checkpoint(source: str | Path, storage: str | Path | None = None)
             f"{folder} is of the baseline {saved.algorithm}, which is no RLlib algorithm: there is nothing to restore.",
             "Load its policy with load_policy, or restore a trial of ppo or dqn.",
         )
-    return folder / "rllib", saved.network
+    return folder, saved.network
 
 
 def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:

@@ -370,7 +370,7 @@ def report(sweep: str | Path, *, storage: str | Path | None = None) -> Path:
 def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorithm:
     """Restore a checkpoint as an RLlib `Algorithm` that can train on.
 
-    RLlib's checkpoints are pickles: restore only sweeps you trust.
+    Checkpoints of the rllib engine are pickles: restore only sweeps you trust.
 
     Args:
         source: A sweep (its best checkpoint), `SWEEP/TRIAL` (the trial's best), or a checkpoint folder.
@@ -380,12 +380,14 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
         NotFoundError: There is no such checkpoint.
         CheckpointError: It is damaged, of a baseline, or does not restore to the very weights that were saved.
     """
-    from tune_jobs.finish import find_rllib_checkpoint
+    from tune_jobs.finish import find_trained_checkpoint
 
-    folder, network = find_rllib_checkpoint(source, storage)
-    from policies.restore import restore_algorithm
+    folder, network = find_trained_checkpoint(source, storage)
+    from policies import restore
+    from policies.packed.to_rllib import algorithm_from_checkpoint
 
-    return restore_algorithm(folder, network)
+    is_packed = (folder / "packed").is_dir()
+    return algorithm_from_checkpoint(folder) if is_packed else restore.restore_algorithm(folder / "rllib", network)
 
 
 def machine(address: str) -> Machine:

@@ -49,6 +49,8 @@ class Member:
     target_updates_at: float = 0.0
     """DQN: env steps or episodes at the last target update."""
     num_target_updates: int = 0
+    failure_penalty: float | None = None
+    """Of its environments: reward of steps that end by failure; None: their own."""
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
     """Draws actions, permutations and batches."""
 

@@ -47,6 +47,7 @@ def save_member(member: Member, folder: Path) -> None:
         "hyperparams": member.hyperparams.model_dump(mode="json"),
         "seed": member.seed,
         "counters": {name: getattr(member, name) for name in _COUNTERS},
+        "failure_penalty": member.failure_penalty,
         "rng": member.rng.bit_generator.state,
     }
     write_plain(folder / _TENSORS, save(tensors))
@@ -89,6 +90,7 @@ def load_member(folder: Path, member_id: str) -> Member:
             weights=parts.pop(_WEIGHTS),
             moments=parts,
             rng=rng,
+            failure_penalty=None if description["failure_penalty"] is None else _number(description["failure_penalty"]),
             **cast("Any", {name: _number(description["counters"][name]) for name in _COUNTERS}),
         )
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:

@@ -47,9 +47,7 @@ def portable_policy(
     )
 
 
-def algorithm_from_checkpoint(
-    checkpoint: Path, *, failure_penalty: float | None = None, num_env_runners: int = 0, num_gpus: float = 0.0
-) -> Algorithm:
+def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num_gpus: float = 0.0) -> Algorithm:
     """A checkpoint of the packed engine as an RLlib Algorithm that trains on from it.
 
     Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's;
@@ -57,7 +55,6 @@ def algorithm_from_checkpoint(
 
     Args:
         checkpoint: A checkpoint folder of a trial.
-        failure_penalty: As `build_algorithm_config`.
         num_env_runners: As `build_algorithm_config`.
         num_gpus: As `build_algorithm_config`.
 
@@ -72,7 +69,7 @@ def algorithm_from_checkpoint(
         env_id=saved.env_id,
         env_args=saved.env_args,
         expected=saved.network,
-        failure_penalty=failure_penalty,
+        failure_penalty=member.failure_penalty,
         num_env_runners=num_env_runners,
         num_gpus=num_gpus,
     )

@@ -5,6 +5,7 @@ import pytest
 from trials import make_task
 
 from policies.errors import EnvError
+from policies.portable import save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -68,3 +69,20 @@ def test_a_trial_whose_environment_cannot_be_made_is_no_member(tmp_path):
         engine.add(make_task(tmp_path, trial_id="bad", env_args={"max_episode_steps": 0}), None)
     assert set(engine.train_iteration()) == {"t0000"}
     engine.close()
+
+
+def test_a_restored_algorithm_trains_with_the_failure_penalty_of_its_trial(tmp_path):
+    from policies.envs import FAILURE_PENALTY
+    from policies.packed.to_rllib import algorithm_from_checkpoint
+
+    penalties = {}
+    for name, penalty in (("with", -7.0), ("without", None)):
+        engine = engine_of(tmp_path, [{"failure_penalty": penalty}])
+        engine.train_iteration()
+        engine.save("t0000", tmp_path / name)
+        save_policy(engine.policy("t0000"), tmp_path / name)
+        engine.close()
+        algorithm = algorithm_from_checkpoint(tmp_path / name)
+        penalties[name] = algorithm.config.env_config.get(FAILURE_PENALTY)
+        algorithm.stop()
+    assert penalties == {"with": -7.0, "without": None}

@@ -65,6 +65,7 @@ class PackedEngine:
                 # Other numbers than at the trial's start: its environments begin new episodes.
                 words = np.random.SeedSequence([task.seed, member.num_iterations, 1]).generate_state(1)
                 env_seed = int(words[0])
+            member.failure_penalty = task.failure_penalty
             stack.add(member, env_seed)
         except BaseException:
             if is_new:
