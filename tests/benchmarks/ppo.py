@@ -6,12 +6,14 @@ import argparse
 import itertools
 import json
 import os
+import platform
+import re
 import statistics
 import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -163,17 +165,14 @@ def command_rows() -> list[Row]:
 
 def many_rows(num_env_steps: int) -> list[Row]:
     """A thousand trials, once, and what a trial of them costs beside one of a hundred."""
-    span: Callable[[Path], float] = lambda folder: (  # noqa: E731
-        max(record["ended_at"] for record in records(folder)) - min(record["started_at"] for record in records(folder))
-    )
-    table, costs = [], {}
-    for num_trials in (MANY // 10, MANY):
+    table: list[Row] = []
+    costs = {}
+    for num_trials, goal in ((MANY // 10, ""), (MANY, "360 s, 6 GiB")):
         done, folder = launch(workload.sweep_file(num_env_steps, num_samples=num_trials // 4))
-        costs[num_trials] = span(folder) / num_trials
+        spans = [(record["started_at"], record["ended_at"]) for record in records(folder)]
+        costs[num_trials] = (max(end for _, end in spans) - min(start for start, _ in spans)) / num_trials
         text = f"{done.wall_s:.0f} s, {done.peak_bytes / 2**30:.2f} GiB"
-        table.append(
-            (f"launch, {num_trials:,} trials, start to end", text, "360 s, 6 GiB" if num_trials == MANY else "")
-        )
+        table.append((f"launch, {num_trials:,} trials, start to end", text, goal))
     ratio = costs[MANY] / costs[MANY // 10]
     table.append(("  cost of a trial of them, beside one of a hundred", f"{ratio:.2f} x", "1.1 x"))
     return table
@@ -181,9 +180,6 @@ def many_rows(num_env_steps: int) -> list[Row]:
 
 def machine_name() -> str:
     """Cores and processor of this machine."""
-    import platform
-    import re
-
     cpuinfo = Path("/proc/cpuinfo")
     names = re.findall(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else []
     return f"{len(os.sched_getaffinity(0))} cores of {names[0] if names else platform.machine()}"
