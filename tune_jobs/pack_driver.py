@@ -111,6 +111,10 @@ class PackDriver:
             self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))
             self._write(pack)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # As `RecordKeeper`: Tune's pickle of it is never read back.
+        return {}
+
     @property
     def pack_ids(self) -> tuple[str, ...]:
         """The packs' names."""

@@ -51,6 +51,10 @@ class RecordKeeper:
         self.running: set[str] = set()
         """Trials that a process has."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Tune pickles who drives it into a file that is never read back here; listeners and open files can't be.
+        return {}
+
     def record(self, trial_id: str) -> TrialRecord:
         """A trial's newest record."""
         return self._records[trial_id]

@@ -12,13 +12,21 @@ from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorE
 from odd_envs import EXIT, RAISE, WRONG_SHAPE
 from policy_factory import register_test_envs
 
+from policies import env_modules
 from policies.env_modules import allow_modules
 from policies.envs import make_env
 from policies.errors import EnvError
 from policies.packed.envs import check_seedable, choose_kind, make_packed_envs
 
 register_test_envs()
-allow_modules(["odd_envs"])
+
+
+@pytest.fixture(autouse=True)
+def own_modules(monkeypatch):
+    """The modules of these tests are allowed, and are not any more when they are over."""
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["odd_envs", "policy_factory"])
+
 
 N = 3
 KINDS = [
@@ -307,7 +315,6 @@ def test_a_penalty_without_a_failure_is_refused():
     ],
 )
 def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(make, kind, env_id, env_args):
-    allow_modules(["policy_factory"])
     envs = make(env_id, kind, env_args=env_args, members={"a": 2**32 - 2}, num_processes=2)
     scalars = [make_env(env_id, env_args) for _ in range(N)]
     first = [env.reset(seed=seed)[0] for env, seed in zip(scalars, (2**32 - 2, 2**32 - 1, 0), strict=True)]

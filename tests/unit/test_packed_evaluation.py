@@ -8,6 +8,7 @@ import pytest
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
 import policies.packed.evaluation
+from policies import env_modules
 from policies.env_modules import allow_modules
 from policies.errors import EnvError
 from policies.evaluate import Evaluator
@@ -18,7 +19,13 @@ from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
 from policies.portable import Layer, Normalization
 
 register_test_envs()
-allow_modules(["odd_envs"])
+
+
+@pytest.fixture(autouse=True)
+def own_modules(monkeypatch):
+    """The modules of these tests are allowed, and are not any more when they are over."""
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["odd_envs", "policy_factory"])
 
 
 def assert_as_alone(policies, *, env_id="CartPole-v1", env_args=None, seeds=range(12), cap=None):
