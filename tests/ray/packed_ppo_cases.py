@@ -320,6 +320,7 @@ def rows_of_updates(**values):
 
     group._update = reading
     group.learn(batch)
+    group.finish()
     stack.envs.close()
     return stack, seen, batch.advantages[1]
 

@@ -92,7 +92,8 @@ def learn_in_pack(stack, sampled):
     found = {}
     for group, (old, batch) in zip(stack._groups, sampled.groups, strict=True):
         assert [m.member_id for m in group.members] == [m.member_id for m in old.members]
-        stats = group.learn(batch)
+        group.learn(batch)
+        stats = group.finish()
         group.write_back()
         views = group._networks.views_of(group._networks.gradients)
         for index, member in enumerate(group.members):
