@@ -9,8 +9,6 @@ the same after `_target_`.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias, cast
 
 import gymnasium as gym
@@ -25,19 +23,15 @@ from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from torch import Tensor, nn
 
 from policies.errors import SpecError
-from policies.exploration import EpsilonGreedy, EpsilonSchedule
+from policies.exploration import EpsilonGreedy
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
-from policies.network_layers import Encoder, ObservationStatistics, hidden_gain, initialize
+from policies.network_layers import Encoder, ObservationStatistics
+from policies.network_parts import DQNNetworks, PPONetworks, model_config
 
 QF_PREDS, QF_NEXT_PREDS, QF_TARGET_NEXT_PREDS = "qf_preds", "qf_next_preds", "qf_target_next_preds"
 RL_MODULE_KEY = "rl_module"
 """Where a module's `model_config` says which class of the user's own it is."""
 
-# RLlib resolves an activation by these names (its models/utils.py): a torch.nn class name or one of its own.
-RLLIB_ACTIVATIONS = {
-    "linear": "linear", "relu": "relu", "tanh": "tanh", "silu": "silu", "elu": "elu", "gelu": "GELU",
-}  # fmt: skip
-_OUR_ACTIVATIONS = {theirs: ours for ours, theirs in RLLIB_ACTIVATIONS.items()}
 _LOG_STD_CLIP = 20.0  # RLlib's own (log_std_clip_param of its DefaultModelConfig)
 
 Batch: TypeAlias = dict[str, Any]
@@ -63,17 +57,10 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
         config = self.model_config
         self.add_statistics()
         self._shares = bool(config["vf_share_layers"])
-        names = ["encoder"] if self._shares else ["actor_encoder", "critic_encoder"]
-        if self.inference_only:
-            names = names[:1]
-        self.encoder = nn.ModuleDict({name: make_encoder(self.observation_space, config) for name in names})
-        self._actor_name = names[0]
+        parts = PPONetworks(self.observation_space, self.action_space, config, inference_only=self.inference_only)
+        self.encoder, self.pi, self.vf = parts.encoder, parts.pi, parts.vf
+        self._actor_name = "encoder" if self._shares else "actor_encoder"
         self._is_gaussian = isinstance(self.action_space, gym.spaces.Box)
-        # Mean and log standard deviation of each component, or one logit an action.
-        num_outputs = 2 * math.prod(self.action_space.shape) if self._is_gaussian else int(self.action_space.n)
-        self.pi = nn.Linear(self._actor.num_features, num_outputs)
-        self.vf = nn.Linear(self._actor.num_features, 1)
-        initialize_networks(config, hidden=[self.encoder], heads=[(self.pi, 0.01), (self.vf, 1.0)])
 
     @property
     def _actor(self) -> Encoder:
@@ -120,11 +107,8 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
         self.uses_double_q = bool(config["double_q"])
         self.uses_target_network = bool(config["target_network"])
         self.num_atoms = 1  # RLlib's learner asks
-        self.encoder = make_encoder(self.observation_space, config)
-        self.af = nn.Linear(self.encoder.num_features, int(self.action_space.n))
-        self.vf = nn.Linear(self.encoder.num_features, 1) if self.uses_dueling else None
-        heads = [(head, 1.0) for head in (self.af, self.vf) if head is not None]
-        initialize_networks(config, hidden=[self.encoder], heads=heads)
+        parts = DQNNetworks(self.observation_space, self.action_space, config)
+        self.encoder, self.af, self.vf = parts.encoder, parts.af, parts.vf
 
     def make_target_networks(self) -> None:
         """Copy the networks, weights and all; nothing where there is no target network."""
@@ -189,25 +173,6 @@ def _q_values(observations: Tensor, encoder: nn.Module, af: nn.Module, vf: nn.Mo
     return values + advantages - advantages.mean(dim=-1, keepdim=True)
 
 
-def make_encoder(observation_space: gym.Space[Any], config: Mapping[str, Any]) -> Encoder:
-    """The encoder that a `model_config` describes.
-
-    Raises:
-        SpecError: Convolutions and observations do not go together.
-    """
-    activation = _OUR_ACTIVATIONS[config["fcnet_activation"]]
-    return Encoder(observation_space, config["fcnet_hiddens"], activation, config["conv_filters"])
-
-
-def initialize_networks(
-    config: Mapping[str, Any], *, hidden: list[nn.Module], heads: Sequence[tuple[nn.Module, float]]
-) -> None:
-    """Set first weights as a `model_config` says; heads come with the gain of orthogonal weights."""
-    gain = hidden_gain(_OUR_ACTIVATIONS[config["fcnet_activation"]])
-    for module, module_gain in [*((network, gain) for network in hidden), *heads]:
-        initialize(module, config["initializer"], module_gain)
-
-
 # -- from hyperparameters
 
 
@@ -222,42 +187,13 @@ def module_spec(hyperparams: TrainedHyperparams, rl_module: str | None = None) -
     Raises:
         SpecError: The class cannot be imported, or is none that the algorithm can train.
     """
-    config = _model_config(hyperparams)
+    config = model_config(hyperparams)
     if rl_module is None:
         ours = PPOModule if isinstance(hyperparams, PPOHyperparams) else DQNModule
         return RLModuleSpec(module_class=ours, model_config=config)
     return RLModuleSpec(
         module_class=_own_class(hyperparams, rl_module), model_config={**config, RL_MODULE_KEY: rl_module}
     )
-
-
-def _model_config(hyperparams: TrainedHyperparams) -> dict[str, Any]:
-    """By RLlib's names where it has one: a user's module may be a subclass of RLlib's default."""
-    filters = hyperparams.conv_filters
-    config: dict[str, Any] = {
-        "fcnet_hiddens": list(hyperparams.hidden_sizes),
-        "fcnet_activation": RLLIB_ACTIVATIONS[hyperparams.activation],
-        # The heads are one linear layer each: the portable policy counts on it.
-        "head_fcnet_hiddens": [],
-        "conv_filters": None if filters is None else [list(item) for item in filters],
-        "conv_activation": RLLIB_ACTIVATIONS[hyperparams.activation],
-        "initializer": hyperparams.initializer,
-        "normalize_observations": hyperparams.normalize_observations,
-    }
-    if isinstance(hyperparams, PPOHyperparams):
-        return {**config, "vf_share_layers": hyperparams.vf_share_layers}
-    config |= {
-        "double_q": hyperparams.double_q,
-        "dueling": hyperparams.dueling,
-        "target_network": hyperparams.target_network,
-        "exploration": EpsilonSchedule.of(hyperparams).as_config(),
-    }
-    if hyperparams.epsilon_schedule == "linear":
-        start, initial = hyperparams.epsilon_start, hyperparams.epsilon_initial
-        after = [start + hyperparams.epsilon_decay, hyperparams.epsilon_final]
-        # For subclasses of RLlib's module, which begins at 0 with the first value.
-        config["epsilon"] = [[0, initial], *([[start, initial]] if start else []), after]
-    return config
 
 
 def _own_class(hyperparams: TrainedHyperparams, rl_module: str) -> type[RLModule]:

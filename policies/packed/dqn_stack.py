@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.exploration import EpsilonSchedule
+from policies.epsilon import EpsilonSchedule
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn_group import DQNGroup
 from policies.packed.envs import PackedEnvs, Step

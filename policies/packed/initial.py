@@ -1,4 +1,4 @@
-"""First weights of a member: those of the RLModule that RLlib builds for its hyperparameters."""
+"""First weights of a member: those of the RLModule that RLlib would build for its hyperparameters."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
-from policies.networks import module_spec
-from policies.packed.member import Member
+from policies.network_parts import DQNNetworks, PPONetworks, model_config
+from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
 
 
 def new_member(
@@ -22,6 +22,9 @@ def new_member(
 ) -> Member:
     """A member that has not trained yet.
 
+    Its weights are, to the last bit, those of `RLModuleSpec.build()` after `torch.manual_seed(seed)`: the same parts
+    build both, and RLlib itself, which takes a second to load, is not needed.
+
     Args:
         member_id: Its trial's id.
         hyperparams: Validated.
@@ -29,13 +32,16 @@ def new_member(
         observation_space: The environment's.
         action_space: The environment's.
     """
-    spec = module_spec(hyperparams)
-    spec.observation_space, spec.action_space, spec.inference_only = observation_space, action_space, False
+    build = PPONetworks if isinstance(hyperparams, PPOHyperparams) else DQNNetworks
     torch.manual_seed(seed)
-    module = spec.build()
-    if hasattr(module, "make_target_networks"):
-        module.make_target_networks()
-    weights = {name: np.array(value.detach().numpy()) for name, value in module.state_dict().items()}
+    networks = build(observation_space, action_space, model_config(hyperparams))
+    weights: Weights = {name: np.array(value.detach().numpy()) for name, value in networks.state_dict().items()}
+    if not isinstance(hyperparams, PPOHyperparams) and hyperparams.target_network:
+        weights |= {f"{TARGET_PREFIX}{name}": np.array(value) for name, value in weights.items()}
+    if hyperparams.normalize_observations:
+        shape = observation_space.shape or ()
+        weights[OBS_MEAN], weights[OBS_VAR] = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+        weights[OBS_COUNT] = np.array(0, dtype=np.int64)
     return Member(
         member_id,
         hyperparams,

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from ray.rllib.algorithms.algorithm import Algorithm
@@ -16,35 +14,12 @@ from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
 from policies.dqn_algorithm import ReplayDQN
 from policies.errors import CheckpointError
-from policies.hyperparams import PPOHyperparams
 from policies.packed.member import Member
 from policies.packed.state import STATE_FOLDER, load_member
 from policies.policy_network import PolicyNetwork
-from policies.portable import PortablePolicy, describe_space, read_policy
-from policies.restore import check_weights, network_from_weights
+from policies.portable import read_policy
+from policies.restore import check_weights
 from policies.rllib_config import build_algorithm_config
-
-
-def portable_policy(
-    member: Member,
-    observation_space: gym.Space[Any],
-    action_space: gym.Space[Any],
-    *,
-    env_id: str,
-    env_args: Mapping[str, Any],
-    training: Mapping[str, Any],
-) -> PortablePolicy:
-    """The greedy policy of a member, with its weights written back."""
-    return PortablePolicy(
-        network=network_from_weights(member.weights, member.hyperparams, observation_space, action_space),
-        algorithm="ppo" if isinstance(member.hyperparams, PPOHyperparams) else "dqn",
-        env_id=env_id,
-        env_args=dict(env_args),
-        observation_space=describe_space(observation_space),
-        action_space=describe_space(action_space),
-        action_transform="unsquash" if isinstance(action_space, gym.spaces.Box) else "none",
-        training=dict(training),
-    )
 
 
 def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num_gpus: float = 0.0) -> Algorithm:

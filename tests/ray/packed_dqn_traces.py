@@ -12,7 +12,7 @@ import torch
 from packed_dqn import SMALL, add, compare, make_stack
 from packed_dqn_cases import arrives
 
-from policies.exploration import EpsilonSchedule
+from policies.epsilon import EpsilonSchedule
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn_group import DQNGroup
 

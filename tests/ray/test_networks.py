@@ -109,7 +109,8 @@ def test_pixels_of_cartpole_train(build):
     ],
 )
 def test_networks_that_do_not_go_with_the_observations_are_refused(env_id, values, words):
-    from policies.networks import make_encoder, module_spec
+    from policies.network_parts import make_encoder
+    from policies.networks import module_spec
 
     env = gym.make(env_id)
     config = module_spec(make_hyperparams("ppo", values)).model_config

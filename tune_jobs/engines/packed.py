@@ -15,9 +15,9 @@ from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.envs import EnvKind, choose_kind, make_packed_envs
 from policies.packed.initial import new_member
 from policies.packed.member import Member
+from policies.packed.portable_member import portable_policy
 from policies.packed.stack import Stack, make_stack
 from policies.packed.state import STATE_FOLDER, check_shapes, load_member, save_member
-from policies.packed.to_rllib import portable_policy
 from policies.portable import PortablePolicy
 from tune_jobs.engines.protocol import IterationStats, TrialTask
 from tune_jobs.packs import pack_key

@@ -1,0 +1,35 @@
+"""A member of a pack as a portable policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from policies.hyperparams import PPOHyperparams
+from policies.packed.member import Member
+from policies.portable import PortablePolicy, describe_space
+from policies.portable_weights import network_from_weights
+
+
+def portable_policy(
+    member: Member,
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any],
+    training: Mapping[str, Any],
+) -> PortablePolicy:
+    """The greedy policy of a member, with its weights written back."""
+    return PortablePolicy(
+        network=network_from_weights(member.weights, member.hyperparams, observation_space, action_space),
+        algorithm="ppo" if isinstance(member.hyperparams, PPOHyperparams) else "dqn",
+        env_id=env_id,
+        env_args=dict(env_args),
+        observation_space=describe_space(observation_space),
+        action_space=describe_space(action_space),
+        action_transform="unsquash" if isinstance(action_space, gym.spaces.Box) else "none",
+        training=dict(training),
+    )
