@@ -1,22 +1,18 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
-import traceback
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
-from odd_envs import EXIT, RAISE, WRONG_SHAPE
 from policy_factory import register_test_envs
 
 from policies import env_modules
 from policies.env_modules import allow_modules
 from policies.envs import make_env
 from policies.errors import EnvError
-from policies.packed.envs import check_seedable, choose_kind, make_packed_envs
+from policies.packed.envs import make_packed_envs
 
 register_test_envs()
 
@@ -364,170 +360,3 @@ def test_an_env_may_write_into_its_action(make):
         assert (actions == 0).all()
     finally:
         del gym.registry["TestGreedy-v0"]
-
-
-# -- failures
-
-
-def go_on(envs, breaking=None, how=0, place=1):
-    actions = np.zeros(len(envs.observations), dtype=np.int64)
-    if breaking is not None:
-        actions[rows_of(envs, breaking)][place] = how
-    return envs.step(actions)
-
-
-@pytest.mark.parametrize("kind", ["scalar", "processes"])
-@pytest.mark.parametrize(("how", "words"), [(RAISE, "the motor broke"), (WRONG_SHAPE, r"shape \(5,\), not \(2,\)")])
-def test_an_env_that_raises_fails_its_member_alone(make, kind, how, words):
-    envs = make("odd_envs:Fragile", kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
-    alone = make("odd_envs:Fragile", "scalar", members={"a": 1, "c": 3})
-    for index in range(20):
-        step, expected = go_on(envs, "b", how if index == 3 else 0), go_on(alone)
-        for member_id in ("a", "c"):
-            assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
-        if index >= 3:
-            assert all((values == 0).all() for values in seen_by(envs, step, "b").values())
-            assert (envs.observations[rows_of(envs, "b")] == 0).all()
-    assert list(envs.errors) == ["b"]
-    error = envs.errors["b"]
-    assert isinstance(error, EnvError)
-    with pytest.raises(EnvError, match=rf"odd_envs:Fragile raised an error in step\(\): .*{words}"):
-        raise error
-    # Where in the env it happened, for the trial's log.
-    assert ("odd_envs.py" if how == RAISE else "sub_envs.py") in "".join(traceback.format_exception(error))
-    envs.arrange(["b", "c", "a"])
-    envs.remove("b")
-    assert envs.errors == {}
-    envs.add("b", 2)
-    step = go_on(envs)
-    assert (step.observations[rows_of(envs, "b")] != 0).all()
-    assert envs.errors == {}
-
-
-@pytest.mark.parametrize("kind", ["scalar", "processes"])
-def test_a_member_that_cannot_be_reset_is_none(make, kind):
-    envs = make("odd_envs:RefusesSeeds", kind, num_envs=2, members={"a": 2}, num_processes=2)
-    with pytest.raises(EnvError, match=r"reset\(\): ValueError: 13 brings bad luck"):
-        envs.add("b", 12)  # its second sub-environment, in another process than the first
-    assert envs.member_ids == ("a",)
-    assert envs.errors == {}
-    go_on(envs)
-    envs.add("b", 14)
-    step = go_on(envs)
-    alone = make("odd_envs:RefusesSeeds", "scalar", num_envs=2, members={"b": 14})
-    np.testing.assert_array_equal(step.observations[2:], go_on(alone).observations)
-
-
-def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_with_it_again(make):
-    envs = make("odd_envs:Fragile", "processes", members={"a": 1, "b": 2}, num_processes=2)
-    go_on(envs)
-    # Places 0 and 2 of a, and place 1 of b, are in one process.
-    step = go_on(envs, "b", EXIT)
-    assert set(envs.errors) == {"a", "b"}
-    assert "ended with exit code 7" in str(envs.errors["a"])
-    assert (step.observations == 0).all()
-    assert not go_on(envs).rewards.any()
-    for member_id, seed in (("a", 1), ("b", 2)):
-        envs.remove(member_id)
-        envs.add(member_id, seed)
-    envs.add("c", 3)
-    assert envs.errors == {}
-    go_on(envs)
-    step = go_on(envs, "b", EXIT)
-    assert list(envs.errors) == ["b"]
-    alone = make("odd_envs:Fragile", "scalar", members={"a": 1, "c": 3})
-    go_on(alone)
-    expected = go_on(alone)
-    for member_id in ("a", "c"):
-        assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
-
-
-def test_a_process_that_is_killed_fails_its_members(make):
-    envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
-    os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
-    go_on(envs)
-    assert "was killed by SIGKILL" in str(envs.errors["a"])
-    assert isinstance(envs.errors["a"], EnvError)
-    envs.remove("a")
-    envs.add("b", 2)  # another process takes its place
-    assert go_on(envs).rewards.all()
-
-
-def test_a_process_that_is_dead_when_a_member_comes_fails_both(make):
-    envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
-    process = multiprocessing.active_children()[0]
-    process.kill()
-    process.join()
-    with pytest.raises(EnvError, match="SIGKILL"):
-        envs.add("b", 2)
-    assert envs.member_ids == ("a",)
-    assert list(envs.errors) == ["a"]
-    assert (envs.observations == 0).all()
-    envs.add("b", 2)
-    go_on(envs)
-    assert list(envs.errors) == ["a"]
-
-
-# -- which kind
-
-
-def test_cartpole_is_vectorised():
-    choice = choose_kind("CartPole-v1", {"max_episode_steps": 200}, spare_cpus=4)
-    assert choice.kind == "vectorised"
-    assert 0 < choice.step_us < 20
-    assert choose_kind("CartPole-v1", {"frame_stack": 2}, spare_cpus=4).kind == "scalar"
-
-
-def test_a_fast_env_stays_in_the_process():
-    choice = choose_kind("Pendulum-v1", None, spare_cpus=4)
-    assert choice.kind == "scalar"
-    assert 0 < choice.step_us < 1000
-    assert choice.why == f"a step takes {choice.step_us:.0f} us"
-
-
-def test_a_slow_env_gets_processes_where_cpus_are_idle():
-    choice = choose_kind("odd_envs:Slow", None, spare_cpus=2)
-    assert choice.kind == "processes"
-    assert 2000 < choice.step_us < 20_000
-    assert choice.why.endswith("ms, and 2 CPUs would be idle")
-    choice = choose_kind("odd_envs:Slow", None, spare_cpus=0)
-    assert choice.kind == "scalar"
-    assert choice.why.endswith("ms, but no CPU is idle")
-
-
-@pytest.mark.parametrize("fail_at", [1, 2, 3, 50])
-def test_an_env_that_raises_is_left_to_its_trial(fail_at):
-    choice = choose_kind("TestWalk-v0", {"fail_at": fail_at}, spare_cpus=0)
-    assert choice.kind == "scalar"
-    check_seedable("TestWalk-v0", {"fail_at": fail_at})
-
-
-@pytest.mark.parametrize(
-    ("env_id", "env_args"),
-    [
-        ("CartPole-v1", None),
-        ("CartPole-v1", {"pixels": True}),
-        ("Pendulum-v1", None),
-        ("TestWalk-v0", {"end": 1.0}),
-        ("odd_envs:Slow", None),
-    ],
-)
-def test_envs_that_can_be_seeded(env_id, env_args):
-    check_seedable(env_id, env_args)
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("Unseedable", "odd_envs:Unseedable cannot be seeded.* the observation at first .*of it.* is .* one time and "),
-        ("ForgetsLater", "odd_envs:ForgetsLater cannot be seeded.* the next episode's first observation after 7 steps"),
-        (
-            "Sharing",
-            "odd_envs:Sharing depends on other environments in the same process.* the observation after 1 step ",
-        ),
-    ],
-)
-def test_envs_that_cannot_be_seeded_are_refused_with_what_differs(name, words):
-    with pytest.raises(EnvError, match=words) as caught:
-        check_seedable(f"odd_envs:{name}", None)
-    assert "engine: rllib" in caught.value.hint
