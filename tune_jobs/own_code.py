@@ -35,7 +35,7 @@ def load_source(source: Source, overrides: Sequence[str] = (), rl_module: type[A
         SpecError: The sweep is wrong, or a class is where no other process finds it.
     """
     if isinstance(source, SweepSpec):
-        source = source.model_dump(mode="json")
+        source = dict(source)
     if isinstance(source, Mapping):
         source = _with_names(source)
     if rl_module is not None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.plain_data import MAX_CHARACTERS, shortened, to_plain
 from tune_jobs.search_space import Domain
 from tune_jobs.spec import (
     NAME_RULE,
@@ -26,8 +25,13 @@ from tune_jobs.spec import (
     dotted,
     hyperparam_problems,
 )
+from tune_jobs.sweep_yaml import parse_yaml
 
 _HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
+
+
+# What the characters that are read may take up at most, at 4 bytes each.
+_MAX_BYTES = 4 * MAX_CHARACTERS
 
 
 class Preset(NamedTuple):
@@ -114,7 +118,11 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
         SpecError: No such file or preset, no YAML, or a wrong sweep; the message lists every problem.
     """
     label, data = _read(source)
-    set_paths = [_apply_override(data, override) for override in overrides]
+    if overrides:
+        set_paths = [_apply_override(data, override) for override in overrides]
+        data = to_plain(data, f"{label} with --set")
+    else:
+        set_paths = []
     try:
         return SweepSpec.model_validate(data)
     except ValidationError as error:
@@ -165,73 +173,18 @@ def json_schema() -> dict[str, Any]:
     }
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML as people mean it: 1e-4 is a number, dates are texts, a key may stand only once."""
-
-    def construct_mapping(
-        self,
-        node: yaml.MappingNode,
-        deep: bool = False,  # noqa: FBT001, FBT002 - PyYAML's signature
-    ) -> dict[Any, Any]:
-        """Refuse keys that stand twice; PyYAML would silently take the last."""
-        seen: set[str] = set()
-        for key_node, _ in node.value:
-            if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == "tag:yaml.org,2002:merge":
-                continue
-            if key_node.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key_node.value!r} stands twice", key_node.start_mark
-                )
-            seen.add(key_node.value)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-# YAML 1.1, which PyYAML reads, wants a dot and a signed exponent in floats: it takes 1e-4 for a text.
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?[eE][-+]?[0-9]+$"),
-    list("-+0123456789"),
-)
-
-
-def _parse_yaml(text: str, label: str) -> Any:
-    try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a subclass of SafeLoader
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise SpecError(f"{label}{place}: {error.problem}", "Correct the YAML there.") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise SpecError(f"{label}: this is no YAML: {error}", "Correct the YAML.") from error
-
-
 def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """What a source is called in messages, and its content as plain JSON-like data."""
     if isinstance(source, Mapping):
         label, data = "sweep", source
     else:
         label, text = _read_text(source)
-        data = _parse_yaml(text, label)
+        data = parse_yaml(text, label)
     if not isinstance(data, Mapping):
         kind = "is empty" if data is None else f"holds a {type(data).__name__}"
         raise SpecError(f"{label}: {kind}, not the fields of a sweep", _HINT)
-    try:
-        # One pass through JSON makes a copy that holds nothing JSON can't, as the sweep folder is to hold it
-        # as JSON.
-        plain = json.loads(json.dumps(data, default=_to_plain))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise SpecError(f"{label}: holds a value that JSON can't hold: {error}", _HINT) from error
+    plain: dict[str, Any] = to_plain(data, label)
     return label, plain
-
-
-def _to_plain(value: Any) -> Any:
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    raise TypeError(f"{value!r} is a {type(value).__name__}")
 
 
 def _read_text(source: str | Path) -> tuple[str, str]:
@@ -248,7 +201,11 @@ def _read_text(source: str | Path) -> tuple[str, str]:
             f"Name a .yaml file, or one of the presets: {', '.join(presets)}.",
         )
     try:
-        return path.name, path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise SpecError(f"{path}: is larger than {_MAX_BYTES:,} bytes", "Name a sweep file; those are short.")
+        return path.name, content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"{path}: can't be read: {error}", "Name a text file that you may read.") from error
 
@@ -272,10 +229,12 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
             section[parent] = child
         if not isinstance(child, dict):
             here = ".".join(parents[: index + 1])
-            raise SpecError(f"--set {override}: {here} is {child!r}, which has no fields", f"Set {here} itself.")
+            raise SpecError(
+                f"--set {override}: {here} is {shortened(child)}, which has no fields", f"Set {here} itself."
+            )
         section = child
     if text.strip():
-        section[last] = json.loads(json.dumps(_parse_yaml(text, f"--set {override}"), default=str))
+        section[last] = parse_yaml(text, f"--set {override if len(override) <= 80 else path}")
     else:
         section.pop(last, None)
     return path

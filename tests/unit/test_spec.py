@@ -273,8 +273,11 @@ def test_whole_values_of_a_quantised_float_range_are_accepted():
         ("env: [a\n", "sweep.yaml, line 2"),
         ("", "sweep.yaml: is empty"),
         ("- a\n", "sweep.yaml: holds a list"),
-        ("env: !!python/object/apply:os.system [ls]\n", "could not determine a constructor"),
-        ("env: x\nalgorithm: ppo\nhyperparams: {lr: &a [*a]}\n", "JSON"),
+        (
+            "env: !!python/object/apply:os.system [ls]\n",
+            "sweep.yaml, line 1, column 6: the tag !!python/object/apply:os.system",
+        ),
+        ("env: x\nalgorithm: ppo\nhyperparams: {lr: &a [*a]}\n", "line 3, column 19: contains itself"),
     ],
 )
 def test_bad_yaml_is_told_with_its_line(tmp_path, text, part):

@@ -1,0 +1,163 @@
+"""YAML of sweep files: the words of YAML 1.2, refusals of what has two meanings, and no more than the limits."""
+
+import math
+import tracemalloc
+
+import pytest
+
+from policies.errors import SpecError
+from tune_jobs.plain_data import MAX_CHARACTERS, MAX_DEPTH
+from tune_jobs.spec_file import load_spec
+from tune_jobs.sweep_yaml import parse_yaml
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+MERGES = "a: &a {k: 1}\n" + "".join(
+    f"{name}: &{name} {{<<: [{', '.join([f'*{before}'] * 9)}]}}\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+def refused(text, label="x.yaml"):
+    with pytest.raises(SpecError) as caught:
+        parse_yaml(text, label)
+    assert caught.value.hint
+    return caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("", None), ("~", None), ("null", None), ("Null", None), ("true", True), ("FALSE", False),
+        ("0", 0), ("-0", 0), ("+12", 12), ("150_000", 150_000), ("-1_000", -1000), ("0o17", 15), ("0x1F", 31),
+        ("1e-4", 1e-4), ("1E5", 1e5), ("3.", 3.0), (".5", 0.5), ("-.5e3", -500.0), ("1_000.5", 1000.5), ("08.5", 8.5),
+        ("5.e1", 50.0),
+        # no numbers, no dates, no truth values
+        ("1__000", "1__000"), ("1_", "1_"), ("1,000", "1,000"), ("2024-01-01", "2024-01-01"), ("=", "="), ("y", "y"),
+        ("1e", "1e"), ("0x", "0x"), ("-", ["-"]), ("nan", "nan"), ("inf", "inf"), ("None", "None"), ("10:70", "10:70"),
+        ("a:30", "a:30"), ("'010'", "010"), ('"yes"', "yes"), ("'1:30'", "1:30"), ("!!str no", "no"), ("'<<'", "<<"),
+        ("!!int '5'", 5), ("!!float 5", 5), ("|\n    010\n", "010\n"),
+    ],
+)  # fmt: skip
+def test_words_mean_what_yaml_1_2_says_with_underscores(text, value):
+    if text == "-":
+        assert parse_yaml("- '-'", "x") == value
+        return
+    read = parse_yaml(f"key: {text}", "x")["key"]
+    assert (read, type(read)) == (value, type(value))
+
+
+@pytest.mark.parametrize(("text", "value"), [(".inf", math.inf), ("-.INF", -math.inf), ("+.Inf", math.inf)])
+def test_infinity_is_read_as_yaml_writes_it(text, value):
+    assert parse_yaml(text, "x") == value
+    assert math.isnan(parse_yaml(".NaN", "x"))
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("010", ["010 begins with 0", "Write 10, 0o10 if it is octal"]),
+        ("-010", ["-010 begins with 0", "Write -10"]),
+        ("089", ["089 begins with 0", "Write 89, or '089' in quotes"]),
+        ("00", ["00 begins with 0"]),
+        ("1:30", ["1:30 may mean a time, 90 to some", "'1:30' in quotes"]),
+        ("1:30:00", ["5400"]),
+        ("1:30.5", ["90.5"]),
+        ("0b11", ["0b11 may mean a binary number", "Write 3"]),
+        ("no", ["no may mean false or a text", "Write false, or 'no' in quotes"]),
+        ("Yes", ["Yes may mean true or a text"]),
+        ("on", ["Write true"]),
+        ("OFF", ["Write false"]),
+        ("!!bool yes", ["yes may mean true"]),
+        ("!!int 010", ["010 begins with 0"]),
+        ("!!int abc", ["the tag !!int"]),
+        ("!!timestamp 2024-01-01", ["the tag !!timestamp"]),
+        ("!!binary aGk=", ["the tag !!binary"]),
+        ("!!set {a, b}", ["the tag !!set"]),
+        ("!mine 3", ["the tag !mine"]),
+        ("{[a]: 3}", ["a list or a mapping stands as a key"]),
+    ],
+)
+def test_what_has_two_meanings_or_none_is_refused_with_both_and_its_place(text, parts):
+    with pytest.raises(SpecError) as caught:
+        parse_yaml(f"first: 1\nkey: {text}", "x.yaml")
+    assert caught.value.message.startswith("x.yaml, line 2, column ")
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_keys_are_texts_as_they_are_written():
+    assert parse_yaml("{no: 1, 010: 2, 1: 3, true: 4, ~: 5}", "x") == {"no": 1, "010": 2, "1": 3, "true": 4, "~": 5}
+
+
+def test_a_merged_mapping_gives_way_to_what_is_written():
+    text = "a: &a {x: 1, y: 1}\nb: &b {y: 2, z: 2}\nc: {<<: [*a, *b], x: 3}\nd: {<<: *a, z: 4}"
+    read = parse_yaml(text, "x")
+    assert read["c"] == {"x": 3, "y": 1, "z": 2}
+    assert read["d"] == {"x": 1, "y": 1, "z": 4}
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("a: &a {x: 1}\nb: {<<: *a, <<: *a}", "x.yaml, line 2, column 13: the key '<<' stands twice (several"),
+        ("{a: 1, 'a': 2}", "the key 'a' stands twice"),
+        ("<<: 3", "<< takes a mapping"),
+        ("<<: [3]", "<< takes a mapping"),
+        ("a: 1\n---\na: 2", "x.yaml, line 2"),
+    ],
+)
+def test_nothing_stands_twice(text, part):
+    assert part in refused(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (LAUGHS, ["stands for 490,329,064 values", "at most 100,000"]),
+        (MERGES, ["values and keys; at most 100,000"]),
+        ("a: &a " + "x" * 50_000 + "\nb: [" + ", ".join(["*a"] * 6) + "]", ["stands for 350,", "characters; at most"]),
+        ("a: &a [*a]", ["line 1, column 4: contains itself"]),
+        ("a: &a {b: {<<: *a}}", ["contains itself"]),
+        ("[" * 20_000, ["is nested 65 deep; at most 64"]),
+        ("{a: " * 20_000, ["is nested 65 deep; at most 64"]),
+        ("- " * 20_000, ["is nested 65 deep; at most 64"]),
+        (
+            "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}]\n" for i in range(1, 200)),
+            ["levels, one in the other; at most 64"],
+        ),
+        ("x: [" + "1," * 100_001 + "]", ["has more than 100,000 values and keys"]),
+        ("x: " + "y" * MAX_CHARACTERS, ["has 262,147 characters; at most 262,144"]),
+        ("seed: " + "9" * 5_000, ["line 1, column 7: a number of 5,000 digits; at most 40"]),
+        ("seed: 0x" + "f" * 5_000, ["a number of 5,002 digits"]),
+    ],
+)
+def test_what_stands_for_too_much_is_refused_before_it_is_built(text, parts):
+    message = refused(text)
+    for part in parts:
+        assert part in message
+
+
+def test_a_refusal_needs_little_memory():
+    tracemalloc.start()
+    refused(LAUGHS)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # What it stands for takes gigabytes.
+    assert peak < 20_000_000
+
+
+def test_the_limits_hold_for_set_too():
+    flow = "{" + LAUGHS.strip().replace("\n", ", ") + "}"
+    with pytest.raises(SpecError, match=r"--set env.args.*values and keys"):
+        load_spec({"env": "x", "algorithm": "ppo"}, [f"env.args={flow}"])
+    with pytest.raises(SpecError, match=f"nested more than {MAX_DEPTH} deep"):
+        load_spec({"env": "x", "algorithm": "ppo"}, ["env." + ".".join("a" * 5_000) + "=1"])
+
+
+def test_a_file_of_megabytes_is_not_read(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_bytes(b"#" * 5_000_000)
+    with pytest.raises(SpecError, match="larger than"):
+        load_spec(path)

@@ -1,0 +1,128 @@
+"""A sweep's fields as plain JSON-like data, copied within limits: what a sweep folder can hold, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from policies.errors import SpecError
+
+MAX_CHARACTERS = 262_144
+MAX_VALUES = 50_000
+MAX_DEPTH = 64
+"""Levels of lists and mappings."""
+MAX_DIGITS = 40
+"""Of a whole number: seeds may have 128 bits."""
+
+_SMALLER = "Give less: a sweep's fields are settings, not data."
+
+
+def to_plain(value: Any, label: str) -> Any:
+    """A copy that holds dicts with texts as keys, lists, texts, finite numbers, booleans and None alone.
+
+    NumPy's numbers, booleans, texts and arrays become Python's, paths texts, pydantic models dicts.
+
+    Args:
+        value: What a sweep file or a Python call gave.
+        label: What messages call it.
+
+    Raises:
+        SpecError: Something in it is of another kind, or it is larger than the limits; the message says where.
+    """
+    return _Copy(label).of(value, "")
+
+
+class _Copy:
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._num_values = 0
+        self._num_characters = 0
+        self._above: set[int] = set()
+
+    def of(self, value: Any, path: str) -> Any:
+        value = self._of_python(value, path)
+        self._count(path, values=1)
+        if isinstance(value, Mapping | list | tuple):
+            return self._container(value, path)
+        if isinstance(value, str):
+            self._count(path, characters=len(value))
+            # Not a subclass of str, such as an enum's member.
+            return str.__str__(value)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return self._number(value, path)
+        if value is None or isinstance(value, bool):
+            return value
+        kind = f"the class {value.__qualname__}" if isinstance(value, type) else f"of type {type(value).__name__}"
+        raise self._error(
+            path, f"{shortened(value)} is {kind}, which JSON can't hold",
+            "Give texts, numbers, true or false, None, lists and mappings of them.",
+        )  # fmt: skip
+
+    def _of_python(self, value: Any, path: str) -> Any:
+        """NumPy's values, paths and models as Python's own."""
+        if isinstance(value, BaseModel):
+            # Its fields alone: model_dump would copy them before they are counted.
+            return dict(value)
+        if isinstance(value, np.ndarray | np.generic):
+            if value.size > MAX_VALUES:
+                self._count(path, values=value.size)
+            return value.tolist()
+        return str(value) if isinstance(value, PurePath) else value
+
+    def _number(self, value: float, path: str) -> int | float:
+        if isinstance(value, int):
+            if abs(value) >= 10**MAX_DIGITS:
+                raise self._error(path, f"has a whole number of more than {MAX_DIGITS} digits", "Give a smaller one.")
+            return int(value)
+        if not math.isfinite(value):
+            raise self._error(path, f"{float(value)!r} is not a finite number", "Give a number.")
+        return float(value)
+
+    def _container(self, value: Mapping[Any, Any] | list[Any] | tuple[Any, ...], path: str) -> Any:
+        if id(value) in self._above:
+            raise self._error(path, "contains itself", "Take the inner one out.")
+        if len(self._above) >= MAX_DEPTH:
+            raise self._error(path, f"is nested more than {MAX_DEPTH} deep", _SMALLER)
+        self._above.add(id(value))
+        try:
+            if not isinstance(value, Mapping):
+                return [self.of(item, f"{path}[{index}]") for index, item in enumerate(value)]
+            copied = {}
+            for key, item in value.items():
+                name = self._key(key, path)
+                copied[name] = self.of(item, f"{path}.{name}" if path else name)
+            return copied
+        finally:
+            self._above.remove(id(value))
+
+    def _key(self, key: Any, path: str) -> str:
+        if isinstance(key, bool) or not isinstance(key, str | int | np.integer):
+            raise self._error(path, f"has the key {shortened(key)}, which is no text", "Name fields by texts.")
+        self._count(path, characters=len(name := str(key)))
+        return name
+
+    def _count(self, path: str, *, values: int = 0, characters: int = 0) -> None:
+        self._num_values += values
+        self._num_characters += characters
+        if self._num_values > MAX_VALUES:
+            raise self._error(path, f"more than {MAX_VALUES:,} values up to here", _SMALLER)
+        if self._num_characters > MAX_CHARACTERS:
+            raise self._error(path, f"more than {MAX_CHARACTERS:,} characters up to here", _SMALLER)
+
+    def _error(self, path: str, problem: str, hint: str) -> SpecError:
+        shown = path if len(path) <= 80 else f"{path[:60]}..."
+        return SpecError(f"{self._label}: {shown}{': ' if shown else ''}{problem}", hint)
+
+
+def shortened(value: Any) -> str:
+    """A value's repr, at most 80 characters of it."""
+    try:
+        text = repr(value)
+    except Exception:  # noqa: BLE001 - an object of a user's own may raise anything
+        return "a value"
+    return text if len(text) <= 80 else f"{text[:77]}..."
