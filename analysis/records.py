@@ -8,14 +8,18 @@ NaN or infinite is written as `None`, so it can never win.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, computed_field, field_validator
 
 FORMAT_VERSION = 1
 
 TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
 SweepState = Literal["running", "interrupted", "completed"]
+TRIAL_ID_PATTERN = "t[0-9]{4,9}"
+"""What trials are called: part of their folders' paths."""
+TrialId = Annotated[str, Field(pattern=f"^{TRIAL_ID_PATTERN}$")]
+Iteration = Annotated[int, Field(ge=0, le=2**63 - 1)]
 FINISHED: frozenset[str] = frozenset({"completed", "failed", "stopped"})
 
 
@@ -32,10 +36,9 @@ class _Record(BaseModel):
 class CheckpointRecord(_Record):
     """One kept checkpoint of a trial."""
 
-    trial_id: str
-    iteration: int
+    trial_id: TrialId
+    iteration: Iteration
     num_env_steps: int
-    path: str = Field(description="Folder, relative to the sweep folder, with forward slashes.")
     training_return: float | None = None
     evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")
 
@@ -43,6 +46,12 @@ class CheckpointRecord(_Record):
     @classmethod
     def _finite(cls, value: float | None) -> float | None:
         return finite_or_none(value)
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def path(self) -> str:
+        """Folder, relative to the sweep folder, with forward slashes; what a file says of it is not read."""
+        return f"trials/{self.trial_id}/checkpoints/{self.iteration:06d}"
 
 
 class IterationRecord(_Record):
@@ -69,7 +78,7 @@ class ChangeRecord(_Record):
 
     iteration: int = Field(description="Iterations the trial itself had done.")
     num_env_steps: int = Field(description="Env steps the trial itself had done.")
-    source_trial_id: str = Field(description="Whose weights and optimizer state it went on with.")
+    source_trial_id: TrialId = Field(description="Whose weights and optimizer state it went on with.")
     source_iteration: int = Field(description="Iteration of the copied checkpoint in that trial.")
     before: dict[str, Any] = Field(description="The trial's searched values until then.")
     after: dict[str, Any] = Field(description="Its searched values from then on.")
@@ -79,7 +88,7 @@ class ChangeRecord(_Record):
 class TrialRecord(_Record):
     """One training run: one point and one seed."""
 
-    trial_id: str
+    trial_id: TrialId
     index: int
     point_index: int
     seed_index: int = 0

@@ -27,6 +27,7 @@ from policies.files import write_atomic
 from tune_jobs.address import recorded_cluster
 from tune_jobs.live import quiet
 from tune_jobs.machine import Machine
+from tune_jobs.places import within
 from tune_jobs.ray_environment import prepare_environment
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
@@ -188,7 +189,7 @@ def check_storage(folder: Path) -> None:
         CannotRunError: A node does not, or has another version of tune-jobs; the message names it.
     """
     token = secrets.token_hex(8)
-    probe = folder / ".probe"
+    probe = within(folder, ".probe")
     probe.mkdir(parents=True, exist_ok=True)
     write_atomic(probe / "question", token)
     try:

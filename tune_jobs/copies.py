@@ -12,6 +12,7 @@ from pathlib import Path
 
 from analysis.records import ChangeRecord, CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.places import remove_folder, within
 from tune_jobs.store import TrialStore, verify_checkpoint
 
 _ATTEMPTS = 5
@@ -19,7 +20,7 @@ _ATTEMPTS = 5
 
 def copied_folder(trial: TrialStore, iteration: int) -> Path:
     """Where a trial's copy of another's checkpoint lies, taken over at an iteration of its own."""
-    return trial.folder / "copied" / f"{iteration:06d}"
+    return within(trial.folder, "copied", f"{iteration:06d}")
 
 
 def copy_latest_checkpoint(source: TrialStore, target: TrialStore, iteration: int) -> CheckpointRecord:
@@ -44,17 +45,18 @@ def copy_latest_checkpoint(source: TrialStore, target: TrialStore, iteration: in
             known = source.checkpoints()
             if not known:
                 break
-            shutil.rmtree(temporary, ignore_errors=True)
-            shutil.copytree(source.sweep_folder / known[-1].path, temporary)
+            remove_folder(temporary)
+            # Links stay links, which `verify_checkpoint` refuses: what they point to is not to get in here.
+            shutil.copytree(source.checkpoint_folder(known[-1].iteration), temporary, symlinks=True)
             record = verify_checkpoint(temporary)
         except (OSError, shutil.Error, NotFoundError) as error:
             # Deleted while it was being copied: there is a newer one.
             reason = error
             continue
-        shutil.rmtree(final, ignore_errors=True)
+        remove_folder(final)
         temporary.replace(final)
         return record
-    shutil.rmtree(temporary, ignore_errors=True)
+    remove_folder(temporary)
     raise CheckpointError(
         f"Trial {source.trial_id} has no checkpoint that trial {target.trial_id} could go on from"
         + (f": {reason}." if reason is not None else "."),
@@ -78,4 +80,4 @@ def pending_copy(trial: TrialStore, change: ChangeRecord | None, latest_iteratio
 
 def remove_copies(trial: TrialStore) -> None:
     """Delete a trial's copies: it has a newer checkpoint of its own."""
-    shutil.rmtree(trial.folder / "copied", ignore_errors=True)
+    remove_folder(within(trial.folder, "copied"))

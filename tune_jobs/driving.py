@@ -214,7 +214,7 @@ def _run_trials(
 ) -> None:
     from tune_jobs.live import shown
 
-    with shown(monitor, progress, store.folder / "driver.log"), _stopping_on_signals(store, monitor):
+    with shown(monitor, progress, store.driver_log), _stopping_on_signals(store, monitor):
         from tune_jobs.runner import RunJob, run_trials
 
         job = RunJob(

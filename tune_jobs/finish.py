@@ -81,7 +81,7 @@ def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
     sweep = _trusted(store).read_record()
     spec = SweepSpec.model_validate(sweep.spec)
     selection = select_best(read_trials(store))
-    folder = store.folder / selection.checkpoint.path
+    folder = store.checkpoint_folder(selection.checkpoint)
     verify_checkpoint(folder)
     portable = read_policy(folder)
     seeds = confirmation_seeds(spec.seed, num_episodes)
@@ -168,7 +168,7 @@ def find_policy(
                 choose_best(store)
             policy = load_policy(store.best_folder)
         else:
-            checkpoint = store.folder / best_checkpoint(store, trial_id).path
+            checkpoint = store.checkpoint_folder(best_checkpoint(store, trial_id))
             verify_checkpoint(checkpoint)
             policy = load_policy(checkpoint)
             store = None
@@ -259,7 +259,7 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
             record = store.read_best().checkpoint
         else:
             record = choose_best(store).checkpoint
-        folder = store.folder / record.path
+        folder = store.checkpoint_folder(record)
     verify_checkpoint(folder)
     return folder
 

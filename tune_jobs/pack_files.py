@@ -13,6 +13,7 @@ from pathlib import Path
 
 from policies.errors import CheckpointError
 from policies.files import write_atomic
+from tune_jobs.places import within
 
 _TAIL_BYTES = 20_000
 TIMEOUT_MARK = "Timeout ("
@@ -39,8 +40,17 @@ class PackFiles:
 
     def __init__(self, sweep_folder: Path, pack_id: str) -> None:
         self.pack_id = pack_id
-        self.assignment_path = sweep_folder / "packs" / f"{pack_id}.json"
-        self.log_path = sweep_folder / "packs" / f"{pack_id}.log"
+        self._sweep_folder = sweep_folder
+
+    @property
+    def assignment_path(self) -> Path:
+        """Of `<pack>.json`."""
+        return within(self._sweep_folder, "packs", f"{self.pack_id}.json")
+
+    @property
+    def log_path(self) -> Path:
+        """Of `<pack>.log`."""
+        return within(self._sweep_folder, "packs", f"{self.pack_id}.log")
 
     def write(self, assignment: Assignment) -> None:
         """Replace the assignment."""

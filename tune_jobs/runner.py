@@ -6,7 +6,6 @@ Tune decides which trial runs where and when; what a trial is and how far it got
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from tune_jobs.pack_driver import PackDriver, PackScheduler
 from tune_jobs.pack_files import TIMEOUT_MARK
 from tune_jobs.pack_trainable import PackTrainable
 from tune_jobs.packs import PackPlan
+from tune_jobs.places import remove_folder
 from tune_jobs.population import PopulationScheduler
 from tune_jobs.ray_environment import prepare_environment
 from tune_jobs.record_keeper import Listener, RecordKeeper
@@ -61,7 +61,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     """
     prepare_environment()
     store = SweepStore(job.sweep_folder)
-    shutil.rmtree(store.tune_folder, ignore_errors=True)
+    remove_folder(store.tune_folder)
     wanted = set(job.trial_ids)
     packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
     others = [name for name in job.trial_ids if name not in set(packed)]

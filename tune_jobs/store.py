@@ -8,17 +8,14 @@ writes `sweep.json` and every `trial.json`; the process that trains a trial writ
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from analysis.records import (
-    FORMAT_VERSION,
     BestRecord,
     CheckpointRecord,
     IterationRecord,
@@ -26,37 +23,21 @@ from analysis.records import (
     TrialRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from policies.files import sha256_file, write_atomic, write_plain
+from policies.files import write_atomic
 from tune_jobs.locks import held
+from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
+from tune_jobs.places import check_trial_id, checkpoint_iteration, is_trial_id, refuse_link, remove_folder, within
+from tune_jobs.record_files import dump, read_record
 
-MANIFEST = "manifest.json"
-_RecordT = TypeVar("_RecordT", bound=BaseModel)
-
-
-def _read_record(path: Path, kind: type[_RecordT], what: str) -> _RecordT:
-    try:
-        data = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise NotFoundError(f"No {what} at {path}.", "List the sweeps here with `tune-jobs list`.") from error
-    except (OSError, ValueError) as error:
-        raise CheckpointError(
-            f"{path} cannot be read as {what}: {error}.",
-            "Restore the file from a backup, or delete the folder.",
-        ) from error
-    version = data.get("format_version", FORMAT_VERSION) if isinstance(data, dict) else FORMAT_VERSION
-    if version > FORMAT_VERSION:
-        raise CheckpointError(
-            f"{path} has format version {version}; this tune-jobs reads up to {FORMAT_VERSION}.",
-            "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
-        )
-    try:
-        return kind.model_validate(data)
-    except ValidationError as error:
-        raise CheckpointError(f"{path} is not a valid {what}: {error}.", "Restore the file from a backup.") from error
-
-
-def _dump(record: BaseModel, indent: int | None = 1) -> str:
-    return record.model_dump_json(indent=indent) + "\n"
+__all__ = [
+    "MANIFEST",
+    "SweepStore",
+    "TrialStore",
+    "list_sweep_stores",
+    "name_taken",
+    "read_manifest",
+    "verify_checkpoint",
+]
 
 
 class TrialStore:
@@ -64,33 +45,65 @@ class TrialStore:
 
     def __init__(self, sweep_folder: Path, trial_id: str) -> None:
         self.sweep_folder = sweep_folder
-        self.trial_id = trial_id
-        self.folder = sweep_folder / "trials" / trial_id
-        self.record_path = self.folder / "trial.json"
-        self.results_path = self.folder / "results.jsonl"
-        self.checkpoints_folder = self.folder / "checkpoints"
-        self.log_path = self.folder / "log.txt"
+        self.trial_id = check_trial_id(trial_id)
+
+    # Looked at anew each time: what is no link now may be one when the trial goes on.
+
+    @property
+    def folder(self) -> Path:
+        """The trial's folder."""
+        return within(self.sweep_folder, "trials", self.trial_id)
+
+    @property
+    def record_path(self) -> Path:
+        """Of trial.json."""
+        return within(self.folder, "trial.json")
+
+    @property
+    def results_path(self) -> Path:
+        """Of results.jsonl."""
+        return within(self.folder, "results.jsonl")
+
+    @property
+    def log_path(self) -> Path:
+        """Of log.txt."""
+        return within(self.folder, "log.txt")
+
+    @property
+    def checkpoints_folder(self) -> Path:
+        """Where its checkpoints lie."""
+        return within(self.folder, "checkpoints")
+
+    def checkpoint_folder(self, iteration: int) -> Path:
+        """Where the checkpoint of an iteration lies, or would."""
+        return within(self.checkpoints_folder, f"{iteration:06d}")
 
     def read_record(self) -> TrialRecord:
         """trial.json.
 
         Raises:
             NotFoundError: There is none.
-            CheckpointError: It is damaged or of a newer format.
+            CheckpointError: It is damaged, of a newer format, or another trial's.
         """
-        return _read_record(self.record_path, TrialRecord, "trial record")
+        record = read_record(self.record_path, TrialRecord, "trial record")
+        if record.trial_id != self.trial_id:
+            raise CheckpointError(
+                f"{self.record_path} is of trial {record.trial_id}, but lies in the folder of {self.trial_id}.",
+                "Restore the file from a backup.",
+            )
+        return record
 
     def write_record(self, record: TrialRecord) -> None:
         """Replace trial.json."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.record_path, _dump(record))
+        write_atomic(self.record_path, dump(record))
 
     def append_iterations(self, records: Sequence[IterationRecord]) -> None:
         """Append lines to results.jsonl; a line torn by a kill is dropped when it is read."""
         if not records:
             return
         with self.results_path.open("a", encoding="utf-8") as file:
-            file.write("".join(_dump(record, indent=None) for record in records))
+            file.write("".join(dump(record, indent=None) for record in records))
 
     def read_iterations(self) -> list[IterationRecord]:
         """Every whole line of results.jsonl, in order; empty if there is no file."""
@@ -112,67 +125,76 @@ class TrialStore:
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
         """Replace results.jsonl by these lines: those up to the checkpoint a trial goes on from."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.results_path, "".join(_dump(record, indent=None) for record in records))
+        write_atomic(self.results_path, "".join(dump(record, indent=None) for record in records))
 
     def checkpoints(self) -> list[CheckpointRecord]:
-        """The complete checkpoints, oldest first (those being written have no final name yet)."""
+        """The complete checkpoints, oldest first (those being written have no final name yet).
+
+        Raises:
+            CheckpointError: A manifest is damaged, or of another checkpoint than lies there.
+        """
+        return [self._checkpoint(iteration) for iteration in self._iterations()]
+
+    def _iterations(self) -> list[int]:
+        """Those that have a checkpoint, in order."""
         if not self.checkpoints_folder.is_dir():
             return []
-        records = [
-            read_manifest(folder)
-            for folder in self.checkpoints_folder.iterdir()
-            if folder.is_dir() and not folder.name.startswith(".")
-        ]
-        return sorted(records, key=lambda record: record.iteration)
+        numbers = (checkpoint_iteration(path.name) for path in self.checkpoints_folder.iterdir())
+        return sorted(number for number in numbers if number is not None)
+
+    def _checkpoint(self, iteration: int) -> CheckpointRecord:
+        folder = self.checkpoint_folder(iteration)
+        record = read_manifest(folder)
+        if (record.trial_id, record.iteration) != (self.trial_id, iteration):
+            raise CheckpointError(
+                f"The manifest of checkpoint {folder} is of trial {record.trial_id}, iteration {record.iteration}.",
+                "Delete this folder; the trial goes on from its other checkpoints.",
+            )
+        return record
 
     def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None]) -> None:
         """Write a checkpoint folder whole: to a hidden name, hashed, synced, then renamed.
 
         Args:
-            record: Its scores and iteration; `record.path` must be `checkpoint_path(record.iteration)`.
+            record: Its scores and iteration.
             write: Fills the folder it is given.
+
+        Raises:
+            CheckpointError: Its place is a symbolic link.
         """
-        target = self.sweep_folder / record.path
+        target = self.checkpoint_folder(record.iteration)
         temporary = target.with_name(f".{target.name}.{os.getpid()}")
-        shutil.rmtree(temporary, ignore_errors=True)
+        remove_folder(temporary)
         temporary.mkdir(parents=True)
         try:
             write(temporary)
-            files = {}
-            for path in sorted(temporary.rglob("*")):
-                if path.is_file():
-                    name = path.relative_to(temporary).as_posix()
-                    files[name] = {"bytes": path.stat().st_size, "sha256": sha256_file(path)}
-            manifest = {"format_version": FORMAT_VERSION, **record.model_dump(mode="json"), "files": files}
-            write_plain(temporary / MANIFEST, json.dumps(manifest, indent=1) + "\n")
-            for path in [*temporary.rglob("*"), temporary]:
-                _sync(path)
+            write_manifest(temporary, record)
             if target.exists():
                 # A trial that went on from an earlier checkpoint writes this iteration anew.
-                shutil.rmtree(target)
+                remove_folder(target)
             temporary.replace(target)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
 
-    def checkpoint_path(self, iteration: int) -> str:
-        """Where the checkpoint of an iteration lies, relative to the sweep folder."""
-        return f"trials/{self.trial_id}/checkpoints/{iteration:06d}"
-
     def delete_checkpoint(self, record: CheckpointRecord) -> None:
-        """Remove a checkpoint: first from sight, then from disk."""
-        folder = self.sweep_folder / record.path
+        """Remove a checkpoint: first from sight, then from disk.
+
+        Raises:
+            CheckpointError: Its place is a symbolic link.
+        """
+        folder = self.checkpoint_folder(record.iteration)
         hidden = folder.with_name(f".{folder.name}.deleted")
-        shutil.rmtree(hidden, ignore_errors=True)
+        remove_folder(hidden)
         folder.replace(hidden)
-        shutil.rmtree(hidden, ignore_errors=True)
+        remove_folder(hidden)
 
     def remove_leftovers(self) -> None:
         """Delete half-written or half-deleted checkpoints of a process that was killed."""
         if self.checkpoints_folder.is_dir():
             for folder in self.checkpoints_folder.iterdir():
-                if folder.name.startswith("."):
-                    shutil.rmtree(folder, ignore_errors=True)
+                if folder.name.startswith(".") and not folder.is_symlink():
+                    remove_folder(folder)
 
     def log_tail(self, num_lines: int = 15) -> str:
         """The last lines of the trial's log; empty if there is none."""
@@ -185,57 +207,6 @@ class TrialStore:
         return "\n".join(lines[-num_lines:])
 
 
-def _sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on disk."""
-    # Network file systems may not sync folders.
-    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def read_manifest(checkpoint: Path) -> CheckpointRecord:
-    """The record in a checkpoint's manifest.
-
-    Raises:
-        NotFoundError: The folder or its manifest is missing.
-        CheckpointError: The manifest is damaged.
-    """
-    if not checkpoint.is_dir():
-        raise NotFoundError(f"No checkpoint folder at {checkpoint}.", "List a sweep's with `tune-jobs trials SWEEP`.")
-    if not (checkpoint / MANIFEST).is_file():
-        raise CheckpointError(
-            f"Checkpoint {checkpoint} has no {MANIFEST}: it is not one, or was not written whole.",
-            "Use another checkpoint of the trial, or delete this folder.",
-        )
-    return _read_record(checkpoint / MANIFEST, CheckpointRecord, "checkpoint manifest")
-
-
-def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
-    """Check every file of a checkpoint against its manifest, before anything in it is read.
-
-    Raises:
-        NotFoundError: The folder is missing.
-        CheckpointError: A file is missing or differs in size or hash; the message names it.
-    """
-    record = read_manifest(checkpoint)
-    files = json.loads((checkpoint / MANIFEST).read_bytes()).get("files", {})
-    for name, expected in files.items():
-        path = checkpoint / name
-        if not path.is_file():
-            raise CheckpointError(
-                f"Checkpoint {checkpoint} lacks the file {name}.", "Use another checkpoint of the trial."
-            )
-        if path.stat().st_size != expected["bytes"] or sha256_file(path) != expected["sha256"]:
-            raise CheckpointError(
-                f"Checkpoint {checkpoint}: the file {name} is not the one that was written (its SHA-256 differs).",
-                "Use another checkpoint of the trial, or restore the file from a backup.",
-            )
-    return record
-
-
 class SweepStore:
     """One sweep's folder."""
 
@@ -243,13 +214,30 @@ class SweepStore:
         # Ray takes only absolute paths for storage ("URI has empty scheme" otherwise).
         self.folder = folder.absolute()
         self.record_path = self.folder / "sweep.json"
-        self.best_folder = self.folder / "best"
-        self.report_folder = self.folder / "report"
-        self.tune_folder = self.folder / "tune"
         self._stop_path = self.folder / ".stop"
         self._lock_path = self.folder / ".lock"
         self._driver_lock_path = self.folder / ".driver-lock"
         self._made: list[Path] = []
+
+    @property
+    def best_folder(self) -> Path:
+        """The winner's policy, its evaluation and films."""
+        return within(self.folder, "best")
+
+    @property
+    def report_folder(self) -> Path:
+        """The report."""
+        return within(self.folder, "report")
+
+    @property
+    def tune_folder(self) -> Path:
+        """Ray Tune's own state."""
+        return within(self.folder, "tune")
+
+    @property
+    def driver_log(self) -> Path:
+        """What Ray and RLlib print in the process that drives the sweep."""
+        return within(self.folder, "driver.log")
 
     @property
     def name(self) -> str:
@@ -297,26 +285,36 @@ class SweepStore:
             NotFoundError: There is none.
             CheckpointError: It is damaged or of a newer format.
         """
-        return _read_record(self.record_path, SweepRecord, "sweep")
+        refuse_link(self.record_path)
+        return read_record(self.record_path, SweepRecord, "sweep")
 
     def write_record(self, record: SweepRecord) -> None:
         """Replace sweep.json."""
-        write_atomic(self.record_path, _dump(record))
+        write_atomic(self.record_path, dump(record))
 
     def trial(self, trial_id: str) -> TrialStore:
-        """The folder of one trial."""
+        """The folder of one trial.
+
+        Raises:
+            NotFoundError: No trial is called so.
+        """
         return TrialStore(self.folder, trial_id)
+
+    def checkpoint_folder(self, record: CheckpointRecord) -> Path:
+        """Where a checkpoint lies.
+
+        Raises:
+            CheckpointError: A symbolic link is in the way.
+        """
+        return self.trial(record.trial_id).checkpoint_folder(record.iteration)
 
     def read_trials(self) -> list[TrialRecord]:
         """Every trial's record, by index."""
-        trials_folder = self.folder / "trials"
+        trials_folder = within(self.folder, "trials")
         if not trials_folder.is_dir():
             return []
-        records = [
-            self.trial(folder.name).read_record()
-            for folder in trials_folder.iterdir()
-            if (folder / "trial.json").is_file()
-        ]
+        stores = [self.trial(path.name) for path in trials_folder.iterdir() if is_trial_id(path.name)]
+        records = [store.read_record() for store in stores if store.record_path.is_file()]
         return sorted(records, key=lambda record: record.index)
 
     def read_best(self) -> BestRecord:
@@ -325,17 +323,17 @@ class SweepStore:
         Raises:
             NotFoundError: No best policy has been chosen yet.
         """
-        path = self.best_folder / "evaluation.json"
+        path = within(self.best_folder, "evaluation.json")
         if not path.is_file():
             raise NotFoundError(
                 f"Sweep {self.name} has no best policy yet.", f"Choose it with `tune-jobs best {self.name}`."
             )
-        return _read_record(path, BestRecord, "best record")
+        return read_record(path, BestRecord, "best record")
 
     def write_best(self, record: BestRecord) -> None:
         """Replace best/evaluation.json."""
         self.best_folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.best_folder / "evaluation.json", _dump(record))
+        write_atomic(self.best_folder / "evaluation.json", dump(record))
 
     def request_stop(self) -> None:
         """Ask the process that drives this sweep to stop."""

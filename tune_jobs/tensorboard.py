@@ -14,6 +14,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from analysis.records import TrialRecord
+from tune_jobs.places import within
 
 _FILE_VERSION = b"brain.Event:2"
 # Protocol buffers: number of the field, and how it is written.
@@ -52,9 +53,9 @@ class ScalarWriter:
     def flush(self) -> None:
         """Append what was added to the files."""
         for trial_id, data in self._unwritten.items():
-            folder = self._folder / "trials" / trial_id / "tensorboard"
+            folder = within(self._folder, "trials", trial_id, "tensorboard")
             folder.mkdir(parents=True, exist_ok=True)
-            with (folder / self._name).open("ab") as file:
+            with within(folder, self._name).open("ab") as file:
                 file.write(data)
         self._unwritten.clear()
 

@@ -112,7 +112,7 @@ class TrialLoop:
         if folder is not None and change is not None:
             start = change.iteration
         elif latest is not None:
-            folder = self.task.sweep_folder / latest.path
+            folder = self._store.checkpoint_folder(latest.iteration)
         self._take_up_results(start, change.iteration if change is not None else 0)
         if folder is not None:
             verify_checkpoint(folder)
@@ -274,7 +274,6 @@ class TrialLoop:
             trial_id=self.task.trial_id,
             iteration=self._last.iteration,
             num_env_steps=self._last.num_env_steps,
-            path=self._store.checkpoint_path(self._last.iteration),
             training_return=self._last.training_return,
             evaluation_return=score,
         )

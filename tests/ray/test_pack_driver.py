@@ -117,9 +117,7 @@ def test_who_is_ended_makes_room_before_it_has_left(tmp_path):
 def test_who_is_ended_and_cannot_save_is_ended_all_the_same(tmp_path, how):
     driven = Driven(tmp_path, 2, num_packs=1, scheduler=ASHA, max_retries=0)
     driven.tell(t0000=(200, 9.0), t0001=(200, 1.0))
-    saved = CheckpointRecord(
-        trial_id="t0001", iteration=2, num_env_steps=200, path="trials/t0001/checkpoints/000002", evaluation_return=1.0
-    )
+    saved = CheckpointRecord(trial_id="t0001", iteration=2, num_env_steps=200, evaluation_return=1.0)
     driven.store.trial("t0001").write_checkpoint(saved, lambda folder: None)
     if how == "fails":
         driven.tell(t0001=failure(1, retried=True))

@@ -68,7 +68,6 @@ CHECKPOINT = CheckpointRecord(
     trial_id="t0001",
     iteration=30,
     num_env_steps=30_720,
-    path="trials/t0001/checkpoints/30",
     evaluation_return=200.0,
 )
 TRIALS = [

@@ -154,7 +154,6 @@ def make_trial(index, *, seeds_per_point, point, status, rows):
                 trial_id=trial_id,
                 iteration=row.iteration,
                 num_env_steps=row.num_env_steps,
-                path=f"trials/{trial_id}/checkpoints/{row.iteration}",
                 training_return=row.training_return,
                 evaluation_return=row.evaluation_return,
             )

@@ -72,9 +72,9 @@ def test_the_copy_stays_though_the_other_trial_deletes_its_checkpoints(tmp_path,
 def test_a_copy_without_a_change_in_the_record_does_not_count(tmp_path, better):
     worse = taken_over(tmp_path, better, iteration=10)
     after = Trial(tmp_path, engine=Recording())
-    assert after.engine.checkpoint == tmp_path / worse.store.checkpoint_path(10)
+    assert after.engine.checkpoint == worse.store.checkpoint_folder(10)
     earlier = Trial(tmp_path, engine=Recording(), changes=(change(4),))
-    assert earlier.engine.checkpoint == tmp_path / worse.store.checkpoint_path(10)
+    assert earlier.engine.checkpoint == worse.store.checkpoint_folder(10)
 
 
 def test_a_copy_counts_before_the_trials_own_checkpoint_of_the_same_iteration_which_stays(tmp_path, better):
@@ -93,7 +93,7 @@ def test_a_trial_that_is_opened_again_before_it_saved_goes_on_from_the_copy_and_
     assert (again.engine.checkpoint, again.loop.iteration) == (copied_folder(again.store, 5), 5)
     again.run_to(10)
     last = Trial(tmp_path, engine=Recording(), changes=(change(5),))
-    assert last.engine.checkpoint == tmp_path / last.store.checkpoint_path(10)
+    assert last.engine.checkpoint == last.store.checkpoint_folder(10)
     assert not copied_folder(last.store, 5).exists()
 
 
@@ -140,7 +140,7 @@ def test_a_checkpoint_that_is_deleted_while_it_is_copied_gives_way_to_the_newer_
 
     def checkpoints():
         calls.append(1)
-        gone = CheckpointRecord(trial_id="t0001", iteration=19, num_env_steps=1, path="trials/t0001/checkpoints/gone")
+        gone = CheckpointRecord(trial_id="t0001", iteration=15, num_env_steps=1)
         return [gone] if len(calls) == 1 else real()
 
     monkeypatch.setattr(better, "checkpoints", checkpoints)
@@ -160,7 +160,7 @@ def changed_trial():
         change(10, before={"lr": 0.1}, after={"lr": 0.2}),
         change(20, before={"lr": 0.2}, after={"lr": 0.3}, source_trial_id="t0002"),
     )
-    best = CheckpointRecord(trial_id="t0000", iteration=15, num_env_steps=1500, path="x", evaluation_return=9.0)
+    best = CheckpointRecord(trial_id="t0000", iteration=15, num_env_steps=1500, evaluation_return=9.0)
     return TrialRecord(
         trial_id="t0000", index=0, point_index=0, seed=0, point={"lr": 0.3}, hyperparams={"lr": 0.3, "gamma": 0.9},
         changes=changes, checkpoints=(best,), status="completed",

@@ -12,11 +12,7 @@ def make_trial(index, status="pending", *, steps=0, score=None, time_s=0.0, poin
     trial_id = f"t{index:04d}"
     checkpoints = ()
     if score is not None:
-        checkpoints = (
-            CheckpointRecord(
-                trial_id=trial_id, iteration=1, num_env_steps=steps, path="trials/x", evaluation_return=score
-            ),
-        )
+        checkpoints = (CheckpointRecord(trial_id=trial_id, iteration=1, num_env_steps=steps, evaluation_return=score),)
     return TrialRecord(
         trial_id=trial_id,
         index=index,

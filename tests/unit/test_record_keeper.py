@@ -35,7 +35,7 @@ def on_disk(store, trial_id):
 
 def test_what_a_trial_tells_is_in_its_record(kept):
     store, keeper, _, told = kept
-    checkpoint = CheckpointRecord(trial_id="t0003", iteration=4, num_env_steps=400, path="trials/t0003/checkpoints/4")
+    checkpoint = CheckpointRecord(trial_id="t0003", iteration=4, num_env_steps=400)
     keeper.started("t0003")
     assert told[-1].status == "running"
     keeper.progressed("t0003", progress(4, checkpoints=(checkpoint,)), node="here", pid=12)

@@ -284,7 +284,7 @@ def test_hostile_text_is_never_html(tmp_path):
 def test_a_winner_the_selection_has_moved_from_is_called_out(tmp_path):
     synthetic = make_sweep(points=[{"lr": 1e-3}, {"lr": 3e-3}])
     assert not winner_card(synthetic.best, synthetic.trials, synthetic.sweep, tmp_path)["stale"]
-    old = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1, path="trials/t0000/checkpoints/1")
+    old = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1)
     synthetic.best = synthetic.best.model_copy(update={"checkpoint": old})
     _, _, page = report(tmp_path, synthetic)
     assert "Another checkpoint leads by now" in page.words

@@ -16,7 +16,6 @@ def checkpoint(trial_id, iteration, evaluation, *, steps=None, training=None):
         trial_id=trial_id,
         iteration=iteration,
         num_env_steps=iteration * 1000 if steps is None else steps,
-        path=f"trials/{trial_id}/checkpoints/{iteration}",
         training_return=training,
         evaluation_return=evaluation,
     )

@@ -52,7 +52,6 @@ def write_checkpoint(trial, iteration=3, files=None, **scores):
         trial_id=trial.trial_id,
         iteration=iteration,
         num_env_steps=100 * iteration,
-        path=trial.checkpoint_path(iteration),
         **scores,
     )
 
@@ -74,7 +73,7 @@ def test_records_come_back_as_they_were(store, trial):
     assert store.read_record() == sweep
     record = make_trial(
         status="failed", error="no\nroom", evaluation_return=0.0, checkpoints=(
-            CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=2, path="p", evaluation_return=-1.0),
+            CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=2, evaluation_return=-1.0),
         ),
     )  # fmt: skip
     trial.write_record(record)
@@ -215,7 +214,7 @@ def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial):
 
     record, _ = write_checkpoint(trial, 3)
     with pytest.raises(OSError, match="No space"):
-        trial.write_checkpoint(record.model_copy(update={"iteration": 4, "path": trial.checkpoint_path(4)}), fails)
+        trial.write_checkpoint(record.model_copy(update={"iteration": 4}), fails)
     assert [path.name for path in trial.checkpoints_folder.iterdir()] == ["000003"]
     # Nor where it would replace one.
     with pytest.raises(OSError, match="No space"):
@@ -225,7 +224,7 @@ def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial):
 
 def test_while_a_checkpoint_is_written_readers_do_not_see_it(trial):
     seen = []
-    record = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1, path=trial.checkpoint_path(1))
+    record = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1)
     trial.write_checkpoint(record, lambda folder: seen.append((trial.checkpoints(), folder.is_dir())))
     assert seen == [([], True)]
     assert trial.checkpoints() == [record]

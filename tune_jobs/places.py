@@ -1,0 +1,97 @@
+"""What the parts of a sweep folder may be called, and that none of them leads out of it.
+
+A sweep folder may have been edited, or come from somebody else. So nothing that is read from its files names a place:
+trials, checkpoints and packs are found by their numbers. And no symbolic link in it is followed: what is read, written
+or deleted through one lies elsewhere. (The sweep folder itself, and what it lies in, may be links: these are named by
+whoever runs the command.)
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+from analysis.records import TRIAL_ID_PATTERN
+from policies.errors import CheckpointError, NotFoundError
+
+_CHECKPOINT_NAME = re.compile(r"[0-9]{6,19}")
+_TRIAL_ID = re.compile(TRIAL_ID_PATTERN)
+
+
+def is_trial_id(name: str) -> bool:
+    """Whether a trial can be called so."""
+    return _TRIAL_ID.fullmatch(name) is not None
+
+
+def check_trial_id(name: str) -> str:
+    """Return a trial's id if a trial can be called so.
+
+    Raises:
+        NotFoundError: It cannot.
+    """
+    if not is_trial_id(name):
+        raise NotFoundError(
+            f"{name[:80]!r} is no trial's id; they are t0000, t0001 and so on.", "List them with `tune-jobs trials`."
+        )
+    return name
+
+
+def checkpoint_iteration(name: str) -> int | None:
+    """The iteration that a checkpoint folder is called by, or None if a checkpoint is not called so."""
+    return int(name) if _CHECKPOINT_NAME.fullmatch(name) is not None else None
+
+
+def within(folder: Path, *parts: str) -> Path:
+    """A place in a folder, once it is certain that no link on the way leads elsewhere.
+
+    Args:
+        folder: Of the sweep, or in it; not looked at itself.
+        parts: Names below each other, each of one part.
+
+    Raises:
+        CheckpointError: One of them is a symbolic link.
+    """
+    path = folder
+    for part in parts:
+        path /= part
+        refuse_link(path)
+    return path
+
+
+def refuse_link(path: Path) -> None:
+    """Check that a part of a sweep folder is no symbolic link.
+
+    Raises:
+        CheckpointError: It is one.
+    """
+    if path.is_symlink():
+        raise CheckpointError(
+            f"{path} is a symbolic link; links in a sweep folder are not followed.",
+            "Remove the link, or replace it with what it points to.",
+        )
+
+
+def refuse_links_in(folder: Path) -> None:
+    """Check that neither a folder nor anything in it is a symbolic link; it need not be there.
+
+    Raises:
+        CheckpointError: Something is.
+    """
+    refuse_link(folder)
+    for path in folder.rglob("*"):
+        refuse_link(path)
+
+
+def remove_folder(folder: Path) -> None:
+    """Delete a folder with all that is in it, if it is there; of links the names alone, never what they point to.
+
+    Args:
+        folder: As `within` gave it.
+
+    Raises:
+        CheckpointError: It is a symbolic link.
+    """
+    refuse_link(folder)
+    # It leaves links in the folder unfollowed by itself.
+    shutil.rmtree(folder, ignore_errors=True)
