@@ -24,7 +24,7 @@ from analysis.records import (
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.files import write_atomic
-from tune_jobs.locks import held
+from tune_jobs.locks import held, is_held
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
 from tune_jobs.places import check_trial_id, checkpoint_iteration, is_trial_id, refuse_link, remove_folder, within
 from tune_jobs.record_files import dump, read_record
@@ -349,13 +349,7 @@ class SweepStore:
 
     def is_driven(self) -> bool:
         """Whether a process drives this sweep now (on this machine, or on one that shares locks with it)."""
-        if not self._lock_path.exists():
-            return False
-        try:
-            with self.lock():
-                return False
-        except CannotRunError:
-            return True
+        return is_held(self._lock_path) or is_held(self._driver_lock_path)
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -366,8 +360,8 @@ class SweepStore:
         """
         watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
         with held(self._lock_path, f"Sweep {self.name} is being run by another process.", watch):
-            with self.driver_lock():
-                pass
+            if is_held(self._driver_lock_path):
+                raise CannotRunError(*self._still_driven)
             yield
 
     @contextlib.contextmanager
@@ -377,9 +371,15 @@ class SweepStore:
         Raises:
             CannotRunError: Such a process still runs.
         """
-        message = f"Sweep {self.name} is still being run on a cluster, for a process that is gone."
-        with held(self._driver_lock_path, message, "Try again in a minute: the cluster is ending it."):
+        with held(self._driver_lock_path, *self._still_driven):
             yield
+
+    @property
+    def _still_driven(self) -> tuple[str, str]:
+        return (
+            f"Sweep {self.name} is still being run on a cluster, for a process that is gone.",
+            "Try again in a minute: the cluster is ending it.",
+        )
 
 
 def name_taken(folder: Path) -> SpecError:

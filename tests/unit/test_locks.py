@@ -1,12 +1,16 @@
 """Who may drive a sweep, and who gets its name."""
 
+import errno
+import fcntl
+import os
 import subprocess
 import sys
 
 import pytest
 
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.locks import held
+from tune_jobs import locks
+from tune_jobs.locks import held, is_held
 from tune_jobs.store import SweepStore
 
 
@@ -87,3 +91,72 @@ def test_a_storage_that_is_a_file_is_refused(tmp_path):
     with pytest.raises(CannotRunError, match="cannot be written"):
         SweepStore(tmp_path / "file" / "mine").create()
     assert (tmp_path / "file").read_text() == ""
+
+
+ASKER = """
+import sys
+from pathlib import Path
+from tune_jobs.store import SweepStore
+store = SweepStore(Path(sys.argv[1]))
+print("asking", flush=True)
+while not (store.folder / "enough").exists():
+    store.is_driven()
+print("asked", flush=True)
+"""
+
+
+def test_asking_whether_a_sweep_is_driven_keeps_no_driver_from_it(store):
+    """As `status` in a loop beside `resume` after `resume`."""
+    with store.lock():
+        pass
+    arguments = [sys.executable, "-c", ASKER, str(store.folder)]
+    askers = [subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    try:
+        assert [asker.stdout.readline() for asker in askers] == ["asking\n"] * 3
+        for _ in range(400):
+            with store.lock(), store.driver_lock():
+                assert store.is_driven()
+        (store.folder / "enough").touch()
+        assert [asker.communicate()[0] for asker in askers] == ["asked\n"] * 3
+    finally:
+        for asker in askers:
+            asker.kill()
+            asker.wait()
+
+
+def test_who_wants_a_lock_waits_for_those_who_only_ask(tmp_path, monkeypatch):
+    path = tmp_path / "lock"
+    path.touch()
+    with path.open() as asker:
+        fcntl.flock(asker, fcntl.LOCK_SH)
+        assert not is_held(path)  # others may ask at the same time
+        monkeypatch.setattr(locks.time, "sleep", lambda _: fcntl.flock(asker, fcntl.LOCK_UN))
+        with held(path, "taken", ""):
+            assert is_held(path)
+
+
+def test_one_may_ask_about_a_sweep_that_one_cannot_write(store, monkeypatch):
+    with store.lock():
+        pass
+    real = os.open
+
+    def reading_alone(path, flags, *mode):
+        """As for another user; root may write what no one may."""
+        if flags & os.O_ACCMODE != os.O_RDONLY:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, flags, *mode)
+
+    monkeypatch.setattr(locks.os, "open", reading_alone)
+    assert not store.is_driven()
+    with pytest.raises(CannotRunError, match="cannot be written: Permission denied"), store.lock():
+        pass
+
+
+@pytest.mark.parametrize("name", [".lock", ".driver-lock"])
+def test_a_lock_is_no_link(store, tmp_path, name):
+    (store.folder / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(CannotRunError, match="symbolic link"), store.lock(), store.driver_lock():
+        pass
+    with pytest.raises(CannotRunError, match="symbolic link"):
+        store.is_driven()
+    assert not (tmp_path / "elsewhere").exists()
