@@ -12,6 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from analysis.records import TrialRecord
 from analysis.tables import format_value, point_names
 
@@ -31,6 +34,7 @@ PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", "-.", ":")
 _MAX_GROUP_VALUES = len(PALETTE)
+_MAX_DRAWN = 1e100
 _CSS_NAMES = {INK: "ink", MUTED: "muted", GRID: "grid", ACCENT: "accent"} | {
     color: f"series-{i}" for i, color in enumerate(PALETTE)
 }
@@ -140,11 +144,16 @@ def _short(value: float) -> str:
     return f"{value:g}"
 
 
+def drawable(values: ArrayLike) -> NDArray[np.float64]:
+    """Finite values as matplotlib can place them: near the largest of floats its axes overflow."""
+    return np.clip(np.asarray(values, dtype=np.float64), -_MAX_DRAWN, _MAX_DRAWN)
+
+
 def goal_line(axes: Axes, threshold: float | None) -> None:
     """The return to reach, dashed; nothing if there is none."""
     if threshold is not None:
         axes.axhline(
-            threshold,
+            float(drawable([threshold])[0]),
             color=ACCENT,
             linewidth=1.6,
             linestyle=(0, (6, 3)),

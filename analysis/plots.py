@@ -19,6 +19,7 @@ from analysis.plot_style import (
     PALETTE,
     Style,
     add_legend,
+    drawable,
     escape,
     goal_line,
     group_names,
@@ -136,7 +137,7 @@ def score_by_lr(
             x, y = zip(*scored, strict=True)
             axes.scatter(
                 x,
-                y,
+                drawable(y),
                 s=70,
                 color=style.color,
                 marker=style.marker,
@@ -171,7 +172,7 @@ def score_per_episode(
     Raises:
         ValueError: There is no episode.
     """
-    scores = np.asarray(returns, dtype=np.float64)
+    scores = drawable(returns)
     if scores.ndim != 1 or scores.size == 0:
         raise ValueError(f"expected the returns of at least one episode, got shape {scores.shape}")
     figure = new_figure(size)
@@ -223,7 +224,7 @@ def _curve(items: Sequence[IterationRecord]) -> tuple[NDArray[np.float64], NDArr
     pairs = [(item.num_env_steps, item.training_return) for item in items if item.training_return is not None]
     if not pairs:
         return np.empty(0), np.empty(0)
-    array = np.asarray(pairs, dtype=np.float64)
+    array = drawable(pairs)
     if len(array) > _MAX_LINE_POINTS:
         array = array[np.linspace(0, len(array) - 1, _MAX_LINE_POINTS).round().astype(int)]
     return array[:, 0], array[:, 1]
@@ -250,7 +251,7 @@ def _draw_winner(
         x, y = zip(*evaluated, strict=True)
         axes.plot(
             x,
-            y,
+            drawable(y),
             linestyle="",
             marker="o",
             markersize=6,
@@ -317,7 +318,7 @@ def _mark_lost_and_winner(
     if best is not None and winner is not None and winner in positions:
         axes.scatter(
             [positions[winner]],
-            [best.score],
+            drawable([best.score]),
             s=260,
             facecolors="none",
             edgecolors=INK,

@@ -2,7 +2,8 @@
 
 Words: *training return* is the mean undiscounted return of the last 100 whole exploring episodes; *evaluation return*
 the mean of greedy episodes on the sweep's fixed evaluation seeds. `None` stands for "not known (yet)"; a score that is
-NaN or infinite is written as `None`, so it can never win.
+NaN or infinite is written as `None`, so it can never win. Other numbers may be NaN or infinite: JSON has neither, so
+files have the strings "NaN", "Infinity" and "-Infinity" for them. Files of older versions have null, read as NaN.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, computed_field, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
 
 FORMAT_VERSION = 1
 
@@ -28,9 +29,17 @@ def finite_or_none(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
+def _nan_for_null(value: Any) -> Any:
+    return math.nan if value is None else value
+
+
+Number = Annotated[float, BeforeValidator(_nan_for_null)]
+"""A number that is always known, but may be NaN or infinite."""
+
+
 class _Record(BaseModel):
     # Unknown keys are ignored, so that an older version can read what a newer one wrote.
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", ser_json_inf_nan="strings")
 
 
 class CheckpointRecord(_Record):
@@ -60,10 +69,10 @@ class IterationRecord(_Record):
     iteration: int
     num_env_steps: int = Field(description="Env steps sampled so far in this trial.")
     num_episodes: int = Field(description="Whole episodes so far in this trial.")
-    time_s: float = Field(description="Seconds of training so far, evaluation and checkpoints included.")
+    time_s: Number = Field(description="Seconds of training so far, evaluation and checkpoints included.")
     training_return: float | None = None
     evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")
-    episode_returns: tuple[float, ...] = Field((), description="Whole training episodes that ended here.")
+    episode_returns: tuple[Number, ...] = Field((), description="Whole training episodes that ended here.")
     episode_lengths: tuple[int, ...] = ()
     learner: dict[str, float | None] = Field(default_factory=dict, description="Losses, entropy, lr, ...")
 
@@ -82,7 +91,7 @@ class ChangeRecord(_Record):
     source_iteration: int = Field(description="Iteration of the copied checkpoint in that trial.")
     before: dict[str, Any] = Field(description="The trial's searched values until then.")
     after: dict[str, Any] = Field(description="Its searched values from then on.")
-    time: float = Field(description="Unix time, seconds.")
+    time: Number = Field(description="Unix time, seconds.")
 
 
 class TrialRecord(_Record):
@@ -109,7 +118,7 @@ class TrialRecord(_Record):
     num_iterations: int = 0
     num_env_steps: int = 0
     num_episodes: int = 0
-    time_s: float = 0.0
+    time_s: Number = 0.0
     training_return: float | None = None
     evaluation_return: float | None = Field(None, description="The newest evaluation.")
     best_evaluation_return: float | None = None
@@ -144,7 +153,7 @@ class EvaluationRecord(_Record):
     env_id: str
     env_args: dict[str, Any] = Field(default_factory=dict)
     seeds: tuple[int, ...]
-    returns: tuple[float, ...] = Field(description="Undiscounted return of each episode, in the order of seeds.")
+    returns: tuple[Number, ...] = Field(description="Undiscounted return of each episode, in the order of seeds.")
     lengths: tuple[int, ...] = Field(description="Env steps of each episode.")
     threshold: float | None = Field(None, description="The env's reward threshold; None if it has none.")
 
@@ -162,7 +171,7 @@ class EvaluationRecord(_Record):
     def std_return(self) -> float:
         """Population standard deviation of the episode returns."""
         mean = self.mean_return
-        return math.sqrt(sum((value - mean) ** 2 for value in self.returns) / len(self.returns))
+        return math.sqrt(sum((value - mean) * (value - mean) for value in self.returns) / len(self.returns))
 
     @property
     def solved(self) -> bool | None:
@@ -177,7 +186,7 @@ class BestRecord(_Record):
     checkpoint: CheckpointRecord
     point: dict[str, Any]
     seed: int
-    selection_score: float = Field(description="Mean evaluation return it was chosen by.")
+    selection_score: Number = Field(description="Mean evaluation return it was chosen by.")
     confirmation: EvaluationRecord = Field(description="The winner on seeds it was not chosen on.")
     random: EvaluationRecord = Field(description="A random policy on the confirmation seeds.")
 
@@ -197,10 +206,10 @@ class SweepRecord(_Record):
     evaluation_seeds: tuple[int, ...]
     confirmation_seeds: tuple[int, ...]
     num_trials: int
-    created_at: float
+    created_at: Number
     started_at: float | None = None
     ended_at: float | None = None
-    run_time_s: float = Field(0.0, description="Seconds that launches and resumes took together.")
+    run_time_s: Number = Field(0.0, description="Seconds that launches and resumes took together.")
     versions: dict[str, str] = Field(default_factory=dict)
     git_commit: str | None = None
     address: str | None = None

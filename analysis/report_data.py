@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,6 +23,7 @@ from analysis.tables import (
 from analysis.wording import NONE, duration, moment, number, seed_range, shown_path
 from policies.portable import BASELINE_KINDS
 
+_MAX_AVERAGED = 1e150
 _MAX_ERROR_CHARS = 4_000
 
 
@@ -86,9 +86,9 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
     confirmation, random = best.confirmation, best.random
     rng = np.random.default_rng(0)
     interval = gain = None
-    if _all_finite(confirmation.returns):
+    if _have_mean(confirmation.returns):
         interval = mean_with_ci(confirmation.returns, rng=rng)
-        if _all_finite(random.returns) and random.seeds == confirmation.seeds:
+        if _have_mean(random.returns) and random.seeds == confirmation.seeds:
             gain = paired_difference(confirmation.returns, random.returns, rng=rng)
     policy = shown_path(folder / "best" / "policy.json")
     return {
@@ -183,5 +183,6 @@ def _is_stale(best: BestRecord, trials: Sequence[TrialRecord]) -> bool:
         return False
 
 
-def _all_finite(values: Sequence[float]) -> bool:
-    return len(values) > 0 and all(map(math.isfinite, values))
+def _have_mean(values: Sequence[float]) -> bool:
+    """Whether there are values, all finite, whose sums and squares are finite too."""
+    return len(values) > 0 and all(abs(value) < _MAX_AVERAGED for value in values)

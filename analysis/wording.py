@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from numbers import Real
@@ -26,7 +27,9 @@ def number(value: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as "42 s", "1 min 10 s" or "2 h 5 min"."""
+    """Seconds as "42 s", "1 min 10 s" or "2 h 5 min"; a dash if they are not finite."""
+    if not math.isfinite(seconds):
+        return NONE
     whole = round(seconds)
     if whole < 60:
         return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
@@ -37,8 +40,13 @@ def duration(seconds: float) -> str:
 
 
 def moment(unix_time: float | None) -> str:
-    """A Unix time as UTC, to the minute."""
-    return NONE if unix_time is None else f"{datetime.fromtimestamp(unix_time, tz=UTC):%Y-%m-%d %H:%M} UTC"
+    """A Unix time as UTC, to the minute; a dash if it is not known or no time."""
+    if unix_time is None:
+        return NONE
+    try:
+        return f"{datetime.fromtimestamp(unix_time, tz=UTC):%Y-%m-%d %H:%M} UTC"
+    except (ValueError, OverflowError, OSError):
+        return NONE
 
 
 def seed_range(seeds: Sequence[int]) -> str:

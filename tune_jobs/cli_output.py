@@ -72,6 +72,8 @@ def format_score(value: float | None) -> str:
 
 def format_duration(seconds: float) -> str:
     """Seconds as people say them: 42 s, 3 min 20 s, 2 h 5 min."""
+    if not math.isfinite(seconds):
+        return "-"
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -138,9 +140,15 @@ def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
         return
     table = make_table("sweep", "state", "trials", "created")
     for status in statuses:
-        created = time.strftime("%Y-%m-%d %H:%M", time.localtime(status.sweep.created_at))
-        table.add_row(status.sweep.name, _state(status), _counts(status), created)
+        table.add_row(status.sweep.name, _state(status), _counts(status), _local_time(status.sweep.created_at))
     console.print(table)
+
+
+def _local_time(unix_time: float) -> str:
+    try:
+        return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_time))
+    except (ValueError, OverflowError, OSError):
+        return "-"
 
 
 def show_status(status: SweepStatus, *, as_json: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any, cast
 
@@ -182,5 +181,4 @@ def _is_of(task: TrialTask, saved: PortablePolicy) -> bool:
 
 def _learner_stats(result: dict[str, Any]) -> dict[str, float]:
     stats = result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
-    found = {ours: float(stats[theirs]) for theirs, ours in _LEARNER_STATS.items() if theirs in stats}
-    return {name: value for name, value in found.items() if math.isfinite(value)}
+    return {ours: float(stats[theirs]) for theirs, ours in _LEARNER_STATS.items() if theirs in stats}

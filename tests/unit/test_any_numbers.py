@@ -1,0 +1,86 @@
+"""Whoever reads records copes with numbers that are NaN, infinite or too large to add."""
+
+import json
+import math
+
+import pytest
+from fake_sweeps import Result, Status
+from synthetic_sweep import make_sweep
+
+from analysis.report import build_report
+from analysis.tables import groups_frame, iterations_frame, steps_to_solve_frame, trials_frame
+from tune_jobs.cli_output import show_best, show_evaluation, show_result, show_status, show_sweeps, show_trials
+from tune_jobs.live import summary_line
+from tune_jobs.monitor import SweepMonitor
+from tune_jobs.tensorboard import ScalarWriter
+
+VALUES = [math.nan, math.inf, -math.inf, 1.7e308]
+
+
+def spoilt(value):
+    """A sweep in which every number that may be any is this one."""
+    made = make_sweep(points=[{"lr": 0.1}, {"lr": 0.01}], failed=(1,))
+
+    def again(record, **changes):
+        return type(record).model_validate(record.model_dump() | changes)
+
+    scores = {"training_return": value, "evaluation_return": value}
+    numbers = {"time_s": value, "episode_returns": (value, 1.0, value), "learner": {"loss": value, "lr": None}}
+    made.results = {name: [again(item, **numbers, **scores) for item in items] for name, items in made.results.items()}
+    made.trials = [
+        again(trial, time_s=value, started_at=value, **scores, checkpoints=[again(trial.checkpoints[0], **scores)])
+        for trial in made.trials
+    ]
+    made.sweep = again(made.sweep, created_at=value, started_at=value, ended_at=value, run_time_s=value)
+    returns = (value, -value, *made.best.confirmation.returns[2:])
+    confirmation = again(made.best.confirmation, returns=returns)
+    random = again(made.best.random, returns=(value,) * len(made.best.random.returns))
+    made.best = again(made.best, selection_score=value, confirmation=confirmation, random=random)
+    return made
+
+
+@pytest.fixture(params=VALUES, ids=str)
+def made(request):
+    return spoilt(request.param)
+
+
+def test_the_report_and_the_tables_are_made(made, tmp_path):
+    path = build_report(tmp_path, sweep=made.sweep, trials=made.trials, results=made.results, best=made.best, videos={})
+    assert "winner" in path.read_text().lower()
+    assert len(trials_frame(made.trials, made.results, threshold=195.0)) == 2
+    assert len(iterations_frame(made.results)) == sum(map(len, made.results.values()))
+    for frame in (groups_frame, steps_to_solve_frame):
+        arguments = (["lr"],) if frame is groups_frame else ()
+        assert len(frame(made.trials, made.results, *arguments, threshold=195.0)) == 2
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_everything_is_shown_and_json_is_json(made, tmp_path, capsys, as_json):
+    status = Status(made.sweep, {"completed": 1, "failed": 1}, alive=False)
+    result = Result(tmp_path, made.sweep, made.trials, made.best, None, {})
+    shown = [
+        lambda: show_result(result, storage=None, as_json=as_json),
+        lambda: show_sweeps([status], as_json=as_json),
+        lambda: show_status(status, as_json=as_json),
+        lambda: show_trials(made.trials, as_json=as_json),
+        lambda: show_best(made.best, as_json=as_json),
+        lambda: show_evaluation(made.best.confirmation, made.best.random, as_json=as_json),
+    ]
+    for show in shown:
+        show()
+        out = capsys.readouterr().out
+        assert out.strip()
+        if as_json:
+            json.loads(out, parse_constant=lambda token: pytest.fail(f"{token} is no JSON"))
+
+
+def test_the_running_sweep_is_shown_and_written_for_tensorboard(made, tmp_path):
+    running = [trial.model_copy(update={"status": "running"}) for trial in made.trials]
+    monitor = SweepMonitor("mine", running, max_env_steps_per_trial=100_000, max_concurrent=2)
+    monitor.update(made.trials[0])
+    assert "1 completed" in summary_line(monitor)
+    writer = ScalarWriter(tmp_path)
+    for trial in made.trials:
+        writer.write(trial, evaluated=True)
+    writer.flush()
+    assert list(tmp_path.glob("trials/*/tensorboard/*"))
