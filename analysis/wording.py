@@ -26,6 +26,11 @@ def number(value: Any) -> str:
     return f"{value:.4g}"
 
 
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """A number with what it counts: "1 point", "1,024 points"."""
+    return f"{count:,} {noun if count == 1 else plural or f'{noun}s'}"
+
+
 def duration(seconds: float) -> str:
     """Seconds as "42 s", "1 min 10 s" or "2 h 5 min"; a dash if they are not finite."""
     if not math.isfinite(seconds):

@@ -7,9 +7,10 @@ fixed in a sweep file or searched. Units: env steps are steps of one sub-environ
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
 Activation = Literal["linear", "relu", "tanh", "silu", "elu", "gelu"]
 Algorithm = Literal["ppo", "dqn", "random", "constant"]
@@ -22,6 +23,33 @@ NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 PositiveInt = Annotated[int, Field(ge=1)]
 
 
+def as_sizes(value: Any) -> Any:
+    """A number alone as the list of one that it stands for."""
+    return (value,) if _is_number(value) else value
+
+
+def _as_action(value: Any) -> Any:
+    """An action as one type or the other, so that a wrong one is told once."""
+    if _is_number(value):
+        return int(value) if float(value).is_integer() else (float(value),)
+    if isinstance(value, list | tuple) and value and all(map(_is_number, value)):
+        return tuple(map(float, value))
+    raise ValueError(f"{value!r} is not allowed: it should be a number, or a list of numbers for continuous actions")
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+_SIZE = {"type": "integer", "minimum": 1}
+_SIZES = {"anyOf": [_SIZE, {"type": "array", "items": _SIZE, "minItems": 1}]}
+_ACTION = {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}, "minItems": 1}]}
+Sizes = Annotated[tuple[PositiveInt, ...], BeforeValidator(as_sizes), WithJsonSchema(_SIZES)]
+"""Whole numbers; one alone stands for a list of one."""
+
+
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -29,8 +57,10 @@ class _Frozen(BaseModel):
 class _Hyperparams(_Frozen):
     """What PPO and DQN share."""
 
-    hidden_sizes: tuple[PositiveInt, ...] = Field(
-        (64, 64), min_length=1, description="Units of each hidden layer, from input to output."
+    hidden_sizes: Sizes = Field(
+        (64, 64),
+        min_length=1,
+        description="Units of each hidden layer, from input to output; a number alone: of the only one.",
     )
     activation: Activation = Field("tanh", description="Activation after each hidden layer.")
     initializer: Initializer = Field(
@@ -204,7 +234,9 @@ class RandomHyperparams(_Frozen):
 class ConstantHyperparams(RandomHyperparams):
     """Of the baseline that repeats one action."""
 
-    action: int | tuple[float, ...] = Field(0, description="The action: a number, or a list for continuous actions.")
+    action: Annotated[int | tuple[float, ...], BeforeValidator(_as_action), WithJsonSchema(_ACTION)] = Field(
+        0, description="The action: a number, or a list for continuous actions."
+    )
 
 
 def _check_schedule(final_name: str, final: float | None, steps_name: str, steps: int | None) -> None:

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from pydantic import BaseModel
 
+from analysis.wording import counted
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -123,7 +125,7 @@ def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None
         counts[trial.status] += 1
     told = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
     steps = sum(trial.num_env_steps for trial in trials)
-    console.print(f"{len(trials)} trials: {told}; {steps:,} env steps")
+    console.print(f"{counted(len(trials), 'trial')}: {told}; {counted(steps, 'env step')}")
     for trial in trials:
         if trial.status == "failed":
             console.print(f"{trial.trial_id} failed: {_first_line(trial.error)}", style="red")
@@ -243,7 +245,7 @@ def span(seeds: Sequence[int]) -> str:
 def _returns(record: EvaluationRecord) -> str:
     low, high = min(record.returns), max(record.returns)
     spread = f"{record.mean_return:.1f} ± {record.std_return:.1f}"
-    return f"{spread} over {record.num_episodes} episodes ({low:g} to {high:g})"
+    return f"{spread} over {counted(record.num_episodes, 'episode')} ({low:g} to {high:g})"
 
 
 def _verdict(record: EvaluationRecord) -> dict[str, str]:

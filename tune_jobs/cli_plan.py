@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from analysis.wording import counted
 from tune_jobs.cli_output import format_bytes, format_value, make_console, make_table, print_facts, print_json, span
 
 if TYPE_CHECKING:
@@ -35,18 +36,19 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
     machine, stop = plan.machine, spec.stop
     returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
     rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
-    rules += [] if stop.num_episodes is None else [f"{stop.num_episodes:,} episodes"]
+    rules += [] if stop.num_episodes is None else [counted(stop.num_episodes, "episode")]
     rules += [
-        f"{stop.num_env_steps:,} env steps",
-        f"{stop.num_iterations:,} iterations",
+        counted(stop.num_env_steps, "env step"),
+        counted(stop.num_iterations, "iteration"),
         f"{stop.time_s:g} s",
     ]
     threshold = "" if plan.env.threshold is None else f" (solved at {plan.env.threshold:g})"
-    has = f"{machine.num_cpus:g} CPUs" + (f" and {machine.num_gpus:g} GPUs" if machine.num_gpus else "")
+    points = counted(plan.num_points, "point")
+    has = _resources(machine.num_cpus, machine.num_gpus)
     return {
         "environment": f"{plan.env.env_id}{threshold}",
         "algorithm": spec.algorithm,
-        "trials": f"{len(plan.trials):,}: {plan.num_points:,} points, {spec.seeds_per_point} seed(s) each",
+        "trials": f"{len(plan.trials):,}: {points}, {counted(spec.seeds_per_point, 'seed')} each",
         "engine": _engine_fact(plan),
         "at once": f"{_at_once(plan)}; {machine.source} has {has}",
         "a trial stops at": " or ".join(rules),
@@ -66,7 +68,11 @@ def _engine_fact(plan: SweepPlan) -> str:
     if packs is None:
         return told
     measured = "" if packs.env_step_us is None else f", {packs.env_step_us:.3g} us a step"
-    kind = f"{packs.num_env_processes} processes a pack" if packs.num_env_processes else packs.env_kind
+    kind = (
+        f"{counted(packs.num_env_processes, 'process', 'processes')} a pack"
+        if packs.num_env_processes
+        else packs.env_kind
+    )
     return f"{told}; environments: {kind}{measured}"
 
 
@@ -75,12 +81,12 @@ def _at_once(plan: SweepPlan) -> str:
     if packs is None:
         return f"{plan.max_concurrent}, each on {_resources(plan.cpus_per_trial, plan.gpus_per_trial)}"
     each = _resources(packs.cpus_per_pack, packs.gpus_per_pack)
-    trials = f"{packs.max_concurrent} in {packs.num_packs} pack{'s' * (packs.num_packs > 1)} of up to {packs.slots}"
+    trials = f"{packs.max_concurrent} in {counted(packs.num_packs, 'pack')} of up to {packs.slots}"
     return f"{trials}, each pack on {each}"
 
 
 def _resources(cpus: float, gpus: float) -> str:
-    return f"{cpus:g} CPU{'s' * (cpus > 1)}" + (f" and {gpus:g} GPU" if gpus else "")
+    return f"{cpus:g} CPU{'s' * (cpus > 1)}" + (f" and {gpus:g} GPU{'s' * (gpus > 1)}" if gpus else "")
 
 
 def _search_fact(spec: SweepSpec) -> str:

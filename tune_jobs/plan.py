@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from analysis.records import FINISHED, TrialRecord
+from analysis.wording import counted
 from policies.envs import EnvInfo, check_env
 from policies.errors import CannotRunError, SpecError
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
@@ -25,7 +26,8 @@ from tune_jobs.packs import Engine, PackPlan, choose_engines, pack_key
 from tune_jobs.points import largest_hyperparams, planned_points
 from tune_jobs.search_space import num_points
 from tune_jobs.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
-from tune_jobs.spec import SweepSpec, describe, dotted
+from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_problems import details_of, dotted, explain
 from tune_jobs.tpe import check_installed
 from tune_jobs.trial_sizes import max_disk_bytes, max_env_steps, member_bytes
 
@@ -242,10 +244,7 @@ def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: in
     try:
         values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **point})
     except ValidationError as error:
-        problems = "; ".join(
-            f"{dotted(detail['loc'])} {describe(detail['msg'], detail['input'])}".strip()
-            for detail in error.errors(include_url=False)
-        )
+        problems = "; ".join(f"{dotted(detail['loc'])} {explain(detail)}".strip() for detail in details_of(error))
         raise SpecError(
             f"The values of {place} don't go together: {problems}",
             "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
@@ -291,27 +290,29 @@ def _max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
 
 def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
     cpus, gpus, runners = spec.cpus_per_trial, spec.resources.num_gpus, spec.resources.num_env_runners
-    made_of = f" (1 process and {runners} env runners)" if runners and spec.resources.num_cpus is None else ""
+    made_of = (
+        f" (1 process and {counted(runners, 'env runner')})" if runners and spec.resources.num_cpus is None else ""
+    )
     if cpus > machine.num_cpus:
         if runners:
             hint = f"Set resources.num_env_runners to at most {max(0, int(machine.num_cpus) - 1)}"
         else:
             hint = f"Set resources.num_cpus to at most {int(machine.num_cpus)}"
         raise CannotRunError(
-            f"One trial needs {cpus} CPUs{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
+            f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
             f"{hint}, or launch on a larger cluster with --address.",
         )
     if gpus > machine.num_gpus:
         raise CannotRunError(
-            f"One trial needs {gpus:g} GPUs; {machine.source} has {machine.num_gpus:g}. {_FOR_EVER}",
+            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {_FOR_EVER}",
             "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
         )
     main = cpus - runners
     if machine.nodes and not any(main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes):
         nodes = ", ".join(f"{node_cpus:g} and {node_gpus:g}" for node_cpus, node_gpus in machine.nodes)
         raise CannotRunError(
-            f"One trial's process needs {main} CPUs and {gpus:g} GPUs on one node; no node of "
-            f"{machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {_FOR_EVER}",
+            f"One trial's process needs {counted(main, 'CPU')} and {gpus:g} GPU{'s' * (gpus != 1)} on one node; no "
+            f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {_FOR_EVER}",
             "Lower resources.num_cpus or resources.num_gpus.",
         )
 
@@ -336,5 +337,5 @@ def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
         )
     wanted = spec.resources.max_concurrent
     if wanted is not None and concurrent is not None and concurrent < min(wanted, _num_trials(spec)):
-        notes.append(f"resources.max_concurrent is {wanted}, but only {concurrent} trials fit at once.")
+        notes.append(f"resources.max_concurrent is {wanted}, but only {counted(concurrent, 'trial')} can run at once.")
     return notes

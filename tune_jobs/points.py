@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from policies.hyperparams import Hyperparams
+from policies.hyperparams import Hyperparams, as_sizes
 from tune_jobs.search_space import Domain, Listed, Range, draw_point, draw_points
 from tune_jobs.spec import SweepSpec
 
@@ -34,6 +34,8 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
         known: Of the points that are known; at least one.
     """
     ends = {name: _ends(domain) for name, domain in spec.space.items() if name in _DECIDE_SIZE}
+    if "hidden_sizes" in ends:
+        ends["hidden_sizes"] = [as_sizes(value) for value in ends["hidden_sizes"]]
     return [
         known[0].model_copy(update=dict(zip(ends, values, strict=True))) for values in itertools.product(*ends.values())
     ]

@@ -7,49 +7,31 @@ Files, presets and `--set` are read by `spec_file.load_spec`.
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from analysis.wording import counted
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from tune_jobs.packs import why_none_is_packed
 from tune_jobs.search_checks import search_problems
 from tune_jobs.search_space import Domain, Number, WholeNumber
 from tune_jobs.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
+from tune_jobs.spec_problems import Problem, ProblemsError, details_of, did_you_mean, dotted, explain
 
 SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
 _NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
 NAME_RULE = "up to 100 letters, digits, '_', '-' and '.', beginning with none of the last two"
 
+Flag = Annotated[bool, Field(strict=True)]
+"""true or false; no text and no number stands for them."""
 PositiveWhole = Annotated[WholeNumber, Field(ge=1)]
 NonNegativeWhole = Annotated[WholeNumber, Field(ge=0)]
 PositiveNumber = Annotated[Number, Field(gt=0)]
-
-
-class Problem(NamedTuple):
-    """One thing that is wrong with a sweep."""
-
-    path: str
-    """Dotted path in the sweep file."""
-    text: str
-    """What is wrong there."""
-
-
-class ProblemsError(ValueError):
-    """Several problems at once, found by a validator that sees the whole sweep.
-
-    Args:
-        problems: What is wrong, and where.
-    """
-
-    def __init__(self, problems: Iterable[Problem]) -> None:
-        self.problems = list(problems)
-        super().__init__("; ".join(f"{path}: {text}" for path, text in self.problems))
 
 
 class _Section(BaseModel):
@@ -64,7 +46,7 @@ class EnvSpec(_Section):
     frame_stack: Annotated[WholeNumber, Field(ge=1, le=64)] = Field(
         1, description="Observe the last so many observations at once."
     )
-    pixels: bool = Field(
+    pixels: Flag = Field(
         default=False, description="Observe small grey images of what the env renders, not its numbers."
     )
     failure_penalty: Number | None = Field(
@@ -261,16 +243,6 @@ def check_sweep_name(name: str) -> str:
     return name
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """' Did you mean ...?' with the nearest of the known names, or nothing."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1)
-    # `environment` and `epochs` look unlike `env` and `num_epochs`, but mean them.
-    inside = [other for other in names if min(len(name), len(other)) >= 3 and (other in name or name in other)]
-    nearest = close[0] if close else max(inside, key=len, default=None)
-    return "" if nearest is None else f" Did you mean {nearest!r}?"
-
-
 def _section_problems(spec: SweepSpec) -> list[Problem]:
     """Settings that contradict each other."""
     problems = [Problem(path, text) for path, text in search_problems(spec)]
@@ -282,7 +254,7 @@ def _section_problems(spec: SweepSpec) -> list[Problem]:
     if resources.num_cpus is not None and resources.num_cpus < needed:
         text = (
             f"{resources.num_cpus} is fewer than the {needed} that a trial with "
-            f"{resources.num_env_runners} env runners needs; leave it out to get just those"
+            f"{counted(resources.num_env_runners, 'env runner')} needs; leave it out to get just those"
         )
         problems.append(Problem("resources.num_cpus", text))
     if resources.num_gpus > 1 and not resources.num_gpus.is_integer():
@@ -357,11 +329,8 @@ def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -
     except ValidationError as error:
         # An empty location is a check across fields, made here against defaults: the plan makes it for each
         # point.
-        details = [detail for detail in error.errors(include_url=False) if detail["loc"]]
-        return [
-            Problem(path + dotted(detail["loc"][1:], root=False), describe(detail["msg"], detail["input"]))
-            for detail in details
-        ]
+        details = [detail for detail in details_of(error) if detail["loc"]]
+        return [Problem(path + dotted(detail["loc"][1:], root=False), explain(detail)) for detail in details]
     if not _same_kind(value, checked):
         meant = list(checked) if isinstance(checked, tuple) else checked
         return [Problem(path, f"{value!r} is of the wrong type: write {meant!r} if that is meant")]
@@ -371,24 +340,6 @@ def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -
 def _same_kind(raw: Any, checked: Any) -> bool:
     """Whether pydantic left the kind of a value alone: it would read true as 1, 1 as true and "5" as 5."""
     if isinstance(checked, tuple):
-        return isinstance(raw, list | tuple) and all(map(_same_kind, raw, checked))
+        # One number may stand for a list of one.
+        return all(map(_same_kind, raw if isinstance(raw, list | tuple) else [raw], checked))
     return isinstance(raw, str) == isinstance(checked, str) and isinstance(raw, bool) == isinstance(checked, bool)
-
-
-def dotted(location: Iterable[int | str], *, root: bool = True) -> str:
-    """A location in the sweep file as people write it: ('space', 'lr', 'grid', 0) is space.lr.grid[0]."""
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
-    return text.removeprefix(".") if root else text
-
-
-def describe(message: str, value: Any) -> str:
-    """One of pydantic's messages in the words of a sweep file's writer, with the value."""
-    text = message.removeprefix("Value error, ")
-    if text == message:
-        shown = repr(value)
-        shown = shown if len(shown) <= 80 else f"{shown[:77]}..."
-        text = f"{shown} is not allowed: {text[0].lower()}{text[1:]}".replace("input should", "it should")
-        if isinstance(value, str):
-            # pydantic lists the allowed words in quotes
-            text += "." + did_you_mean(value, message.split("'")[1::2]) if "'" in message else ""
-    return text

@@ -15,16 +15,8 @@ from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tune_jobs.plain_data import MAX_CHARACTERS, shortened, to_plain
 from tune_jobs.search_space import Domain
-from tune_jobs.spec import (
-    NAME_RULE,
-    Problem,
-    ProblemsError,
-    SweepSpec,
-    describe,
-    did_you_mean,
-    dotted,
-    hyperparam_problems,
-)
+from tune_jobs.spec import NAME_RULE, SweepSpec, hyperparam_problems
+from tune_jobs.spec_problems import Problem, ProblemsError, details_of, did_you_mean, dotted, explain
 from tune_jobs.sweep_yaml import parse_yaml
 
 _HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
@@ -246,8 +238,8 @@ def _is_set(path: str, set_paths: Sequence[str]) -> bool:
 
 
 def _problems(error: ValidationError, data: Mapping[str, Any]) -> list[Problem]:
-    details = error.errors(include_url=False)
-    problems = [problem for detail in details for problem in _from_detail(detail, data)]
+    details = details_of(error)
+    problems = [problem for detail in details for problem in _from_detail(detail)]
     if not any(isinstance(detail.get("ctx", {}).get("error"), ProblemsError) for detail in details):
         # A wrong field kept pydantic from running the checks that look at the whole: run them on what is
         # right.
@@ -257,7 +249,7 @@ def _problems(error: ValidationError, data: Mapping[str, Any]) -> list[Problem]:
 
 def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
     algorithm, fixed, space = data.get("algorithm"), data.get("hyperparams"), data.get("space")
-    if algorithm not in HYPERPARAMS_BY_ALGORITHM:
+    if algorithm not in list(HYPERPARAMS_BY_ALGORITHM):  # a list, as what stands there may be unhashable
         return []
     adapter: TypeAdapter[Any] = TypeAdapter(Domain)
     domains = {}
@@ -273,7 +265,17 @@ def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
     return problems + [Problem(path.replace("hyperparams.", "space.", 1), text) for path, text in unseen]
 
 
-def _from_detail(detail: ErrorDetails, data: Mapping[str, Any]) -> list[Problem]:
+_FORMS = {
+    "name": f"use {NAME_RULE}",
+    "rl_module": "write module:Class",
+    "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
+    "search": "give random or tpe, or a mapping of its fields",
+    "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
+}
+"""How fields are written that may have several forms, or one that no type describes."""
+
+
+def _from_detail(detail: ErrorDetails) -> list[Problem]:
     location = _without_tags(detail["loc"])
     path = dotted(location)
     inner = detail.get("ctx", {}).get("error")
@@ -284,10 +286,12 @@ def _from_detail(detail: ErrorDetails, data: Mapping[str, Any]) -> list[Problem]
     if detail["type"] == "missing":
         options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
         return [Problem(path, f"is missing{f': give {options}' if options else ''}")]
-    if detail["type"] == "string_pattern_mismatch" and path == "name":
-        text = f"{data.get('name')!r} is not allowed: use {NAME_RULE}"
-        return [Problem(path, text)]
-    return [Problem(path, describe(detail["msg"], detail["input"]))]
+    if path in _FORMS:
+        return [Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")]
+    if detail["type"] == "model_type":
+        fields = ", ".join(_section(location).model_fields)
+        return [Problem(path, f"{shortened(detail['input'])} is not allowed: give a mapping of its fields ({fields})")]
+    return [Problem(path, explain(detail))]
 
 
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:
@@ -300,14 +304,19 @@ def _without_tags(location: Iterable[int | str]) -> list[int | str]:
 
 
 def _unknown_key(location: Sequence[int | str]) -> str:
-    *parents, name = [str(part) for part in location]
-    model: Any = SweepSpec
-    for parent in parents:
-        model = model.model_fields[parent].annotation
+    name, model = str(location[-1]), _section(location[:-1])
     # A field that exists elsewhere under just this name is meant more likely than a similar one here.
     suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
     listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
     return f"there is no field {name!r} here.{suggestion}{listed}"
+
+
+def _section(location: Sequence[int | str]) -> type[BaseModel]:
+    model: Any = SweepSpec
+    for part in location:
+        model = model.model_fields[str(part)].annotation
+    found: type[BaseModel] = model
+    return found
 
 
 def _other_place(name: str) -> str:

@@ -38,6 +38,14 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_one_of_a_thing_is_not_called_many(run):
+    one = [f"--set={name}=1" for name in ("stop.num_env_steps", "stop.num_iterations", "stop.num_episodes")]
+    Path("one.yaml").write_text("env: CartPole-v1\nalgorithm: ppo\nresources: {max_concurrent: 1}\n")
+    lines = run("launch", "one.yaml", "--dry-run", *one).stdout.splitlines()
+    assert any(line.split()[1:] == ["1:", "1", "point,", "1", "seed", "each"] for line in lines)
+    assert any("1 episode or 1 env step or 1 iteration or" in line for line in lines)
+
+
 def test_a_dry_run_of_many_trials_shows_the_first_ones(run):
     output = run("launch", "cartpole-ppo", "--dry-run", "--set", "num_samples=100").stdout
     assert "t0023" in output
@@ -131,7 +139,7 @@ BAD_INPUT = {
     "no yaml": ({"text": "env: [\n"}, 2, ["sweep.yaml, line 2"]),
     "bad name": ({"more": ["--name", "a/b"]}, 2, ["'a/b'"]),
     "bad --set": ({"set": "oops"}, 2, ["--set oops: this is no assignment"]),
-    "too many CPUs": ({"set": "resources.num_env_runners=1000"}, 5, ["1001 CPUs", "this machine has"]),
+    "too many CPUs": ({"set": "resources.num_env_runners=1000"}, 5, ["1,001 CPUs", "this machine has"]),
     "contradiction": (
         {"set": "hyperparams.minibatch_size=4096"},
         2,

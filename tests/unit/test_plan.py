@@ -107,8 +107,8 @@ def test_as_many_trials_at_once_as_fit(overrides, machine, expected):
             Machine(6, 0, "the cluster at auto", ((3, 0), (3, 0))),
             ["the cluster at auto", "3 and 0"],
         ),
-        (["resources.num_gpus=1"], Machine(4, 1, "c", ((0, 1), (4, 0))), ["1 CPUs and 1 GPUs on one node"]),
-        ([], Machine(0.5), ["needs 1 CPUs", "has 0.5"]),
+        (["resources.num_gpus=1"], Machine(4, 1, "c", ((0, 1), (4, 0))), ["1 CPU and 1 GPU on one node"]),
+        ([], Machine(0.5), ["needs 1 CPU;", "has 0.5"]),
     ],
 )
 def test_what_would_wait_for_ever_is_refused_with_the_numbers(overrides, machine, parts):
@@ -198,7 +198,7 @@ def test_disk_counts_what_convolutions_make_of_an_image():
 def test_notes_tell_what_may_not_be_meant():
     assert "repeats every point" in plan("space.lr=").notes[0]
     assert "below CartPole-v0's threshold 195" in plan("stop.training_return=100").notes[0]
-    assert "only 2 trials fit" in plan("resources.max_concurrent=8", "engine=rllib").notes[0]
+    assert "only 2 trials can run" in plan("resources.max_concurrent=8", "engine=rllib").notes[0]
     assert plan("space=", "num_samples=1").notes == ()
 
 

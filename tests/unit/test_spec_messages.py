@@ -1,0 +1,165 @@
+"""Whatever is wrong in whichever field: it is said in the words of a sweep file, not in those of the library below."""
+
+import re
+
+import pytest
+from pydantic import BaseModel
+from spec_errors import MINIMAL, write
+
+from policies.errors import SpecError
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.search_space import DOMAIN_KINDS
+from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import load_spec
+
+FOREIGN = re.compile(
+    r"should be a valid|instance of|input should|field required|extra inputs|type=|value error|pydantic|dictionary|"
+    r"\b(tuple|string|integer|boolean|dict|str|int)\b|(List|Tuple|String) should|validat|unable to|"
+    r"[A-Z]\w+(Spec|Hyperparams)\b|should match pattern|\bmodel\b",
+    re.IGNORECASE,
+)
+WRONG = [
+    None, True, 0, -1, 3, 1.5, -0.5, 10**39, float("nan"), float("inf"), "", "x", "no", "3", "010", [], [None], [[]],
+    [0], ["x"], [1.5], [True], [1, 2, 3], [3, 2, 1, 0, -1], {}, {"x": 1}, {"id": 3}, {"type": None}, {"grid": 3},
+]  # fmt: skip
+
+
+def sections(model=SweepSpec, path=()):
+    """The path of every field of the sweep file."""
+    for name, field in model.model_fields.items():
+        yield (*path, name)
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from sections(field.annotation, (*path, name))
+
+
+def with_value(path, value):
+    data = {**MINIMAL, "env": {"id": "CartPole-v1"}}
+    *parents, last = path
+    section = data
+    for parent in parents:
+        section = section.setdefault(parent, {})
+    section[last] = value
+    return data
+
+
+def problem_with(data):
+    """The message, or None if it is right; nothing but a message may come."""
+    try:
+        load_spec(data)
+    except SpecError as error:
+        return error.message
+    return None
+
+
+def shown_without_values(message):
+    """The message without what it quotes: that is the user's own."""
+    return re.sub(r"'[^']*'|\"[^\"]*\"", "", message)
+
+
+@pytest.mark.parametrize("path", list(sections()), ids=".".join)
+def test_no_field_of_the_sweep_file_answers_in_foreign_words(path):
+    told = [(value, problem_with(with_value(path, value))) for value in WRONG]
+    # A field that takes anything would make this say nothing.
+    assert any(message is not None for _, message in told)
+    for value, message in told:
+        if message is not None:
+            assert not FOREIGN.search(shown_without_values(message)), (value, message)
+            assert path[0] in message, (value, message)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name"),
+    [(algorithm, name) for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items() for name in model.model_fields],
+)
+def test_no_hyperparameter_does(algorithm, name):
+    refused = 0
+    for value in WRONG:
+        fixed = {**MINIMAL, "algorithm": algorithm, "hyperparams": {name: value}}
+        searched = {**MINIMAL, "algorithm": algorithm, "space": {name: {"grid": [value]}}}
+        for message in (problem_with(fixed), problem_with(searched)):
+            if message is not None:
+                refused += 1
+                assert not FOREIGN.search(shown_without_values(message)), (value, message)
+                assert name in message, (value, message)
+    assert refused > len(WRONG)
+
+
+@pytest.mark.parametrize("kind", DOMAIN_KINDS)
+def test_no_domain_does(kind):
+    for value in [*WRONG, [1], [1, 2, 3, 4], ["a", "b"], [None, 1], [2, 1], [0.1, 0.2, 0], [1e-4, 1e-3]]:
+        message = problem_with({**MINIMAL, "space": {"lr": {kind: value}}})
+        if message is not None:
+            assert not FOREIGN.search(shown_without_values(message)), (value, message)
+            assert f"space.lr.{kind}" in message, (value, message)
+
+
+@pytest.mark.parametrize("value", WRONG)
+def test_no_whole_sweep_does(value):
+    message = problem_with(value) if isinstance(value, dict) else problem_with({**MINIMAL, "space": {"lr": value}})
+    if message is not None:
+        assert not FOREIGN.search(shown_without_values(message)), message
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"stop": [1]}, "stop: [1] is not allowed: give a mapping of its fields (training_return, "),
+        ({"search": False}, "search: False is not allowed: give random or tpe, or a mapping of its fields"),
+        ({"env": 3}, "env: 3 is not allowed: give a Gymnasium id such as CartPole-v1, or a mapping of id and args"),
+        ({"env": {"id": "x", "pixels": "yes"}}, "env.pixels: 'yes' is not allowed: it should be true or false"),
+        ({"rl_module": "x"}, "rl_module: 'x' is not allowed: write module:Class"),
+        (
+            {"hyperparams": {"hidden_sizes": "64x64"}},
+            "hyperparams.hidden_sizes: '64x64' is not allowed: it should be a",
+        ),
+        (
+            {"hyperparams": {"hidden_sizes": []}},
+            "hyperparams.hidden_sizes: [] is not allowed: it should have at least 1",
+        ),
+        (
+            {"hyperparams": {"num_epochs": 2.5}},
+            "hyperparams.num_epochs: 2.5 is not allowed: it should be a whole number",
+        ),
+        ({"hyperparams": {"conv_filters": [[8, 4]]}}, "hyperparams.conv_filters[0][2]: is missing"),
+        ({"space": {"lr": {"uniform": [0.1]}}}, "space.lr.uniform[1]: is missing"),
+        (
+            {"space": {"lr": {"uniform": [0.1, 1, 2]}}},
+            "space.lr.uniform: [0.1, 1, 2] is not allowed: it should have at",
+        ),
+        ({"space": {"lr": {"grid": 3}}}, "space.lr.grid: 3 is not allowed: it should be a list"),
+        ({"space": [1]}, "space: [1] is not allowed: it should be a mapping of names to values"),
+    ],
+)
+def test_what_is_said_of_common_mistakes(fields, message):
+    assert f"sweep: {message}" in problem_with({**MINIMAL, **fields})
+
+
+def test_a_search_that_is_no_is_told_where_it_stands(tmp_path):
+    with pytest.raises(SpecError, match=r"sweep.yaml, line 3, column 9: no may mean false or a text"):
+        load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nsearch: no\n"))
+
+
+# -- one number where a list of one is meant
+
+
+def planned(**fields):
+    return make_plan(load_spec({**MINIMAL, **fields}), Machine(2)).trials
+
+
+def test_one_hidden_size_is_one_hidden_layer():
+    (fixed,) = planned(hyperparams={"hidden_sizes": 8})
+    assert fixed.hyperparams["hidden_sizes"] == [8]
+    trials = planned(space={"hidden_sizes": {"grid": [64, [32, 32], 128]}})
+    assert [trial.hyperparams["hidden_sizes"] for trial in trials] == [[64], [32, 32], [128]]
+    (drawn,) = planned(space={"hidden_sizes": {"randint": [8, 10]}})
+    assert drawn.hyperparams["hidden_sizes"] in ([8], [9])
+    for search in ("hidden_sizes: {choice: [8, 16]}", "hidden_sizes: {lograndint: [8, 16]}"):
+        overrides = [f"space={{lr: {{uniform: [0.1, 0.2]}}, {search}}}", "search=tpe", "num_samples=20"]
+        assert len(make_plan(load_spec(MINIMAL, overrides), Machine(2)).trials) == 20
+
+
+def test_one_number_is_a_continuous_action():
+    fields = {"env": "Pendulum-v1", "algorithm": "constant", "hyperparams": {"action": 0.5}}
+    assert make_plan(load_spec(fields), Machine(1)).trials[0].hyperparams["action"] == [0.5]
