@@ -142,7 +142,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
             self.replay.add(sample.transitions)
             self.num_env_steps += sample.num_env_steps
             self.num_episodes += sample.num_episodes
-            self._new_observations.append(sample.transitions.obs)
+            self._new_observations.append(sample.observations)
         return self.num_env_steps - steps
 
     def _learn_statistics(self) -> bool:

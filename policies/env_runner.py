@@ -25,12 +25,13 @@ from ray.rllib.env.env_context import EnvContext
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
-from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
+from policies.action_bounds import ToBounds
 from policies.env_modules import allow_modules
 from policies.env_wrappers import FailurePenalty
 from policies.envs import ALLOWED_MODULES, FAILURE_PENALTY, make_vector_env
 from policies.replay import NStep, Transitions
+from policies.spaces import observation_dtype
 
 _WEIGHTS_SEQ_NO = "weights_seq_no"
 _UNPENALIZED = "unpenalized_rewards"
@@ -42,6 +43,8 @@ class Sample:
     """What `ArrayEnvRunner.sample_transitions` gives."""
 
     transitions: Transitions
+    observations: NDArray[Any]
+    """That were acted on, shape (B, ...): transitions of several steps come later than those."""
     num_env_steps: int
     num_episodes: int
     """Whole episodes that ended in it."""
@@ -112,6 +115,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         num_envs = self.config.num_envs_per_env_runner
         self.env = DictInfoToList(make_vector_env(self.config.env, env_args, num_envs, failure_penalty=penalty))
         self.num_envs = self.env.num_envs
+        space = self.env.single_action_space
+        self._to_bounds = ToBounds(space) if isinstance(space, gym.spaces.Box) else None
         self._needs_initial_reset = True
 
     def _reset_arrays(self) -> None:
@@ -124,7 +129,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         base = self.config.seed if self._seed_override is None else self._seed_override
         if self._needs_initial_reset and base is not None:
             seed = int(base) + max(0, (self.worker_index or 0) - 1) * self.num_envs
-        self._obs, _ = self.env.env.reset(seed=seed)
+        observations, _ = self.env.env.reset(seed=seed)
+        self._obs = self._as_seen(observations)
         self._just_ended = np.zeros(self.num_envs, dtype=np.bool_)
         self._streams = [_Stream() for _ in range(self.num_envs)]
         if self._n_step is not None:
@@ -179,8 +185,11 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         fragment = self._collect(num_timesteps, explore=True, num_env_steps=num_env_steps, num_episodes=num_episodes)
         before = len(self.finished_episodes)
         self._follow_episodes(fragment)
+        transitions = self._n_step.transitions(fragment)
+        is_whole = self.config.hyperparams.n_step == 1  # then the same array, sent once
         return Sample(
-            transitions=self._n_step.transitions(fragment),
+            transitions=transitions,
+            observations=transitions.obs if is_whole else fragment["obs"][:-1][fragment["stepped"]],
             num_env_steps=int(fragment["stepped"].sum()),
             num_episodes=len(self.finished_episodes) - before,
         )
@@ -230,7 +239,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                 )
                 row = self._actions(self._obs, explore=explore, num_units=units)
                 to_env = self._for_env(row[Columns.ACTIONS])
-                self._obs, rewards, terminated, truncated, _ = env.step(to_env)
+                observations, rewards, terminated, truncated, _ = env.step(to_env)
+                self._obs = self._as_seen(observations)
                 row |= {
                     "rewards": rewards,
                     "terminated": terminated,
@@ -248,11 +258,13 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                 rows["obs"].append(self._obs)
         return {key: np.stack(values) for key, values in rows.items()}
 
+    def _as_seen(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """Observations in the precision that networks compute in, whatever the env's: replay memories hold them so."""
+        return np.asarray(observations, dtype=observation_dtype(self.env.single_observation_space))
+
     def _actions(self, obs: NDArray[Any], *, explore: bool, num_units: int) -> dict[str, NDArray[Any]]:
         """One forward pass: actions and what RLlib's learner wants beside them, each of shape (N, ...)."""
-        # Images stay bytes, a quarter of the memory; the module scales them.
-        dtype = np.uint8 if obs.dtype == np.uint8 else np.float32
-        batch = {Columns.OBS: torch.from_numpy(np.ascontiguousarray(obs, dtype=dtype)).to(self._device)}
+        batch = {Columns.OBS: torch.from_numpy(np.ascontiguousarray(obs)).to(self._device)}
         # Not `forward_exploration`: it walks the module tree twice a step to switch between eval and train mode,
         # and this runner's module stays in eval mode.
         module = self.module
@@ -269,15 +281,22 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
 
     def _for_env(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Actions as the env takes them; the stored ones stay as the policy drew them."""
-        space = self.env.single_action_space
-        if isinstance(space, gym.spaces.Discrete):
+        if self._to_bounds is None:
+            start = self.env.single_action_space.start
             # The network's outputs count from 0; RLlib itself ignores a space that starts elsewhere.
-            return actions + space.start if space.start else actions
-        if self.config.normalize_actions:
-            return np.asarray(unsquash_action(actions, space), dtype=space.dtype)
-        if self.config.clip_actions:
-            return np.asarray(clip_action(actions, space), dtype=space.dtype)
-        return actions
+            return actions + start if start else actions
+        return self._to_bounds(actions)
+
+    def _try_env_step(self, actions: Any) -> Any:
+        """See RLlib, which calls this where whole episodes are asked for; `_collect` steps by itself.
+
+        RLlib's own pipeline, which these actions come from, sends a Discrete action without the space's start, and an
+        action of a Box as it is if a bound is infinite or its precision uncommon.
+        """
+        is_done = self._to_bounds is not None and self._to_bounds.stretches_all
+        if not is_done or self.env.single_action_space.dtype not in (np.float32, np.float64):
+            actions = self._for_env(np.asarray(actions))
+        return super()._try_env_step(actions)
 
     def _cut(self, fragment: dict[str, NDArray[Any]]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
         """Cut (T, N) columns into episode chunks: the finished ones in order of their end, then the running ones."""

@@ -4,9 +4,10 @@
 or takes a batch, shape (num, ...), and gives a batch of actions. Acting is greedy. The actions are those that RLlib
 sends to the env: shifted by the start of a Discrete space, and for Box actions transformed as the policy file says:
 
-* `unsquash`: the network's [-1, 1] is stretched over the bounds and clipped to them, if all bounds are
-  finite; otherwise the action is left as it is (`normalize_actions=True`, RLlib's default).
-* `clip`: clipped to the bounds.
+* `unsquash`: the network's [-1, 1] is stretched over the bounds and clipped to them; all of them are finite.
+* `by_component`: the same for components with two bounds; the others are clipped to the bound that they have.
+* `clip`: clipped to the bounds. So are actions of older files that say `unsquash` though a bound is infinite: their
+  policies were trained on actions as they are.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from policies.action_bounds import ToBounds
 from policies.envs import check_env
 from policies.errors import TuneJobsError
 from policies.forward import ForwardPass
 from policies.portable import (
     BASELINE_KINDS,
+    ActionTransform,
     PolicyNetwork,
     PortablePolicy,
     read_policy,
@@ -301,17 +304,16 @@ def action_function(
     low, high, dtype = action_space.low, action_space.high, action_space.dtype
     size = math.prod(action_space.shape)
     transform = portable.action_transform
-    if transform == "unsquash" and not (np.all(action_space.bounded_below) and np.all(action_space.bounded_above)):
-        transform = "none"
+    to_bounds = ToBounds(action_space)
+    if transform == "by_component" or (transform == "unsquash" and to_bounds.stretches_all):
+        return lambda outputs: to_bounds(outputs[:, :size])
+    if transform == "none":
+        return lambda outputs: outputs[:, :size].astype(dtype)
+    return lambda outputs: np.clip(outputs[:, :size], low, high).astype(dtype)
 
-    def to_actions(outputs: NDArray[np.float32]) -> NDArray[Any]:
-        # The same operations in the same order as RLlib's unsquash_action and clip_action, so the bits are
-        # the same.
-        actions: NDArray[Any] = outputs[:, :size]
-        if transform == "unsquash":
-            actions = low + (actions + 1.0) * (high - low) / 2.0
-        if transform != "none":
-            actions = np.clip(actions, low, high)
-        return actions.astype(dtype)
 
-    return to_actions
+def action_transform(action_space: gym.Space[Any]) -> ActionTransform:
+    """What a policy file says of how its actions become those of this space, as they did in training."""
+    if not isinstance(action_space, gym.spaces.Box):
+        return "none"
+    return "unsquash" if ToBounds(action_space).stretches_all else "by_component"

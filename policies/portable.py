@@ -46,7 +46,7 @@ __all__ = [
 FORMAT_VERSION = 2
 READABLE_VERSIONS = (1, 2)
 
-ActionTransform = Literal["none", "unsquash", "clip"]
+ActionTransform = Literal["none", "unsquash", "by_component", "clip"]
 
 
 @dataclass(frozen=True, eq=False)

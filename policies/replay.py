@@ -59,7 +59,7 @@ class NStep:
             pending.clear()
 
     def transitions(self, columns: Columns) -> Transitions:
-        """Those that are complete after these steps, oldest first.
+        """Those that are complete after these steps, oldest first; there may be none.
 
         Args:
             columns: As `ArrayEnvRunner.sample_columns` gives them: obs (T + 1, N, ...), the others (T, N).
@@ -158,7 +158,10 @@ class LastTransitions(ReplayBuffer):
     """No replay: every batch is the newest transitions, in order."""
 
     def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
-        """The newest transitions, each time."""
+        """The newest transitions, each time; fewer than asked for while there are fewer."""
+        if not self._size:
+            return
+        batch_size = min(batch_size, self._size)
         where = (self._next - batch_size + np.arange(batch_size)) % self.capacity
         for _ in range(num_batches):
             yield Transitions(**{name: values[where] for name, values in self._columns.items()})
@@ -180,7 +183,8 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         super().__init__(capacity, rng)
         self.alpha, self.beta = alpha, beta
         # A binary tree in an array: node i has children 2i and 2i + 1, the leaves are the rows, sums above.
-        self._num_leaves = 1 << max(1, (capacity - 1).bit_length())
+        self._num_levels = max(1, (capacity - 1).bit_length())
+        self._num_leaves = 1 << self._num_levels
         self._sums = np.zeros(2 * self._num_leaves)
         self._highest = 1.0
 
@@ -192,6 +196,8 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
     def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
         """Draw batches; the priorities set between two of them act on the next."""
+        if not self._size:
+            return
         for _ in range(num_batches):
             indices = self._find(self.rng.uniform(0.0, self._sums[1], batch_size))
             shares = self._sums[self._num_leaves + indices] / self._sums[1]
@@ -204,20 +210,21 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         """Set the priorities of rows from their newest TD errors."""
         priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self.alpha
         priorities = np.where(np.isfinite(priorities), priorities, self._highest)
-        self._highest = max(self._highest, float(priorities.max()))
+        self._highest = float(priorities.max(initial=self._highest))
         self._set(indices, priorities)
 
     def _set(self, indices: NDArray[np.int64], priorities: NDArray[np.float64]) -> None:
         nodes = self._num_leaves + indices
         self._sums[nodes] = priorities
-        while nodes[0] > 1:
+        # Level by level, of which there are as many whatever the rows are, and if there are none.
+        for _ in range(self._num_levels):
             nodes = nodes >> 1
             self._sums[nodes] = self._sums[2 * nodes] + self._sums[2 * nodes + 1]
 
     def _find(self, heights: NDArray[np.float64]) -> NDArray[np.int64]:
         """The rows at these heights of the stack of all priorities."""
         nodes = np.ones(len(heights), dtype=np.int64)
-        while nodes[0] < self._num_leaves:
+        for _ in range(self._num_levels):
             left = 2 * nodes
             beyond = heights >= self._sums[left]
             heights = np.where(beyond, heights - self._sums[left], heights)

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
@@ -19,8 +18,8 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from policies.errors import CheckpointError, TuneJobsError
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 from policies.networks import RL_MODULE_KEY, import_module_class
+from policies.policy import action_transform
 from policies.portable import (
-    ActionTransform,
     ModuleWeights,
     PolicyNetwork,
     PortablePolicy,
@@ -53,7 +52,6 @@ def portable_policy(
     Raises:
         CheckpointError: Its network is not the one the hyperparameters describe.
     """
-    config = algorithm.config
     module = algorithm.get_module()
     observation_space, action_space = module.observation_space, module.action_space
     class_path = module.model_config.get(RL_MODULE_KEY)
@@ -61,9 +59,6 @@ def portable_policy(
         network = network_from_weights(learner_weights(algorithm), hyperparams, observation_space, action_space)
     else:
         network = _module_network(algorithm, class_path)
-    transform: ActionTransform = "none"
-    if isinstance(action_space, gym.spaces.Box):
-        transform = "unsquash" if config.normalize_actions else "clip" if config.clip_actions else "none"
     return PortablePolicy(
         network=network,
         algorithm="ppo" if isinstance(hyperparams, PPOHyperparams) else "dqn",
@@ -71,7 +66,7 @@ def portable_policy(
         env_args=env_args,
         observation_space=describe_space(observation_space),
         action_space=describe_space(action_space),
-        action_transform=transform,
+        action_transform=action_transform(action_space),
         training=training or {},
     )
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 
 from policies.hyperparams import PPOHyperparams
 from policies.packed.member import Member
+from policies.policy import action_transform
 from policies.portable import PortablePolicy, describe_space
 from policies.portable_weights import network_from_weights
 
@@ -30,6 +31,6 @@ def portable_policy(
         env_args=dict(env_args),
         observation_space=describe_space(observation_space),
         action_space=describe_space(action_space),
-        action_transform="unsquash" if isinstance(action_space, gym.spaces.Box) else "none",
+        action_transform=action_transform(action_space),
         training=dict(training),
     )

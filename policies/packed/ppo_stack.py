@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from policies.action_bounds import ToBounds
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs import PackedEnvs
 from policies.packed.gae import advantages_and_targets, standardise
@@ -23,7 +24,7 @@ from policies.packed.member import Member, MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo import LOG_STD_CLIP
 from policies.packed.ppo_group import Batch, PPOGroup
-from policies.packed.sampling import EpisodeTracker, Observations, action_transform, one_hot
+from policies.packed.sampling import EpisodeTracker, Observations, one_hot
 
 Floats = NDArray[np.float32]
 
@@ -65,7 +66,7 @@ class PPOStack:
         self._is_gaussian = isinstance(space, gym.spaces.Box)
         if isinstance(space, gym.spaces.Box):
             self._num_actions = math.prod(space.shape)
-            self._transform = action_transform(space)
+            self._to_bounds = ToBounds(space)
         else:
             self._num_actions = int(cast("gym.spaces.Discrete[Any]", space).n)
         self._num_outputs = self._num_actions * (2 if self._is_gaussian else 1)
@@ -215,7 +216,7 @@ class PPOStack:
         if not self._is_gaussian:
             return actions
         # A member whose weights are not finite fails at its next evaluation, and no env should be given what it draws.
-        return np.asarray(self._transform(np.nan_to_num(actions)))
+        return self._to_bounds(np.nan_to_num(actions))
 
     def _batch(self, group: PPOGroup, fragment: Fragment, start: int, stop: int) -> Batch:
         """The rows of a group's members, start to stop of the stack, with advantages and value targets."""

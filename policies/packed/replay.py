@@ -161,6 +161,11 @@ class StackedPrioritizedReplay(StackedReplay):
         self._sums[slot], self._highest[slot] = 0.0, 1.0
         self._alpha[slot], self._beta[slot] = hyperparams.prioritized_alpha, hyperparams.prioritized_beta
 
+    @property
+    def _num_levels(self) -> int:
+        """Of a tree, above its leaves."""
+        return self._num_leaves.bit_length() - 1
+
     def _grow_trees(self) -> None:
         num_slots, capacity = self._rows.shape[:2]
         num_leaves = 1 << max(1, (capacity - 1).bit_length())
@@ -194,7 +199,7 @@ class StackedPrioritizedReplay(StackedReplay):
         """Set the priorities of rows, (M, B), from their newest TD errors."""
         priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self._alpha[slots, None]
         priorities = np.where(np.isfinite(priorities), priorities, self._highest[slots, None])
-        self._highest[slots] = np.maximum(self._highest[slots], priorities.max(axis=1))
+        self._highest[slots] = np.maximum(self._highest[slots], priorities.max(axis=1, initial=0.0))
         self._set(slots, indices, priorities)
 
     def _set(self, slots: Indices, places: Indices, priorities: NDArray[np.float64]) -> None:
@@ -202,7 +207,8 @@ class StackedPrioritizedReplay(StackedReplay):
         first = (slots * 2 * self._num_leaves)[:, None]
         nodes = self._num_leaves + places
         flat[first + nodes] = priorities
-        while nodes[0, 0] > 1:
+        # Level by level, of which there are as many whatever the rows are, and if there are none.
+        for _ in range(self._num_levels):
             nodes = nodes >> 1
             flat[first + nodes] = flat[first + 2 * nodes] + flat[first + 2 * nodes + 1]
 
@@ -211,7 +217,7 @@ class StackedPrioritizedReplay(StackedReplay):
         flat = self._sums.reshape(-1)
         first = (slots * 2 * self._num_leaves)[:, None]
         nodes = np.ones(heights.shape, dtype=np.int64)
-        while nodes[0, 0] < self._num_leaves:
+        for _ in range(self._num_levels):
             left = 2 * nodes
             sums = flat[first + left]
             beyond = heights >= sums

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -140,21 +139,3 @@ def one_hot(actions: NDArray[np.int64], num_actions: int) -> Floats:
     """Actions, (...), as (..., num_actions)."""
     out: Floats = (actions[..., None] == np.arange(num_actions)).astype(np.float32)
     return out
-
-
-def action_transform(space: gym.Space[Any]) -> Any:
-    """What turns a policy's continuous actions, (S, A), into the env's: stretched over its bounds and clipped.
-
-    The same operations in the same order as RLlib's `unsquash_action`.
-    """
-    assert isinstance(space, gym.spaces.Box)
-    low, high = space.low, space.high
-    bounded = bool(np.all(space.bounded_below) and np.all(space.bounded_above))
-
-    def transform(actions: Floats) -> NDArray[Any]:
-        if not bounded:
-            return actions.astype(space.dtype)
-        stretched: NDArray[Any] = np.clip(low + (actions + 1.0) * (high - low) / 2.0, low, high)
-        return stretched.astype(space.dtype)
-
-    return transform

@@ -16,7 +16,8 @@ from policies.packed.env_rows import MemberRows, Rows
 from policies.packed.envs import Step
 from policies.packed.penalty import Penalty
 from policies.packed.process_envs import ProcessHost
-from policies.packed.sub_envs import HereHost, Host, HostDiedError, SubStep, observation_dtype
+from policies.packed.sub_envs import HereHost, Host, HostDiedError, SubStep
+from policies.spaces import observation_dtype
 
 _NUM_SEEDS = 2**32  # Gymnasium takes larger ones, but many an env does not
 

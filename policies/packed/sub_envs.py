@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from policies.envs import make_env
 from policies.errors import EnvError
+from policies.spaces import observation_dtype
 
 
 class HostDiedError(EnvError):
@@ -179,11 +180,6 @@ class HereHost:
     def close(self) -> None:
         """See `Host.close`."""
         self._sub_envs.close()
-
-
-def observation_dtype(space: gym.Space[Any]) -> type[np.uint8 | np.float32]:
-    """Of the arrays of observations: images stay bytes, a quarter of the memory."""
-    return np.uint8 if space.dtype == np.uint8 else np.float32
 
 
 def _close(envs: Sequence[tuple[str, gym.Env[Any, Any]]]) -> None:

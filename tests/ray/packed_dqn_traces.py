@@ -281,6 +281,12 @@ def check_n_step():
     assert rewards.max() == np.median(rewards) == 4.0
     # Four steps apart: a cart moves by velocity times 0.02 s in one.
     assert np.median(np.abs(following[:, 0] - observations[:, 0] - 0.08 * observations[:, 1])) < 0.03
+    # Longer than a phase, than an episode (of 5 steps), than the memory; learning from the first batch on.
+    for n_step in (3, 9, 40):
+        shared = {"replay": "prioritized", "train_freq": 1, "learning_starts": 0, "replay_capacity": 20}
+        found = check_trace("phases", n_step=n_step, shared={**shared, "updates_per_env_step": 1.0})
+        assert found.num_stored == [20, 20, 20]
+        assert found.phases[0][0] == 15 + min(n_step, 5)
 
 
 @arrives("num_envs")

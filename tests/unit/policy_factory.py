@@ -171,7 +171,7 @@ class NotDrawable(Walk):
 
 
 class Pushes(gym.Env):
-    """Continuous actions, one bounded and one not, so that nothing can be stretched over the bounds."""
+    """Continuous actions, one bounded and one not."""
 
     def __init__(self):
         self.observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)

@@ -14,7 +14,7 @@ from policies.packed import ppo
 from policies.packed.gae import advantages_and_targets, standardise
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR
 from policies.packed.ppo_group import scheduled
-from policies.packed.sampling import EpisodeTracker, Observations, action_transform, one_hot
+from policies.packed.sampling import EpisodeTracker, Observations, one_hot
 
 M, B = 4, 200
 
@@ -251,12 +251,3 @@ def test_observations_as_they_are():
 
 def test_one_hot():
     np.testing.assert_array_equal(one_hot(np.array([[2, 0]]), 3), [[[0, 0, 1], [1, 0, 0]]])
-
-
-def test_actions_are_stretched_over_bounds_and_clipped():
-    transform = action_transform(gym.spaces.Box(np.float32([-2, 0]), np.float32([2, 1])))
-    np.testing.assert_allclose(transform(np.float32([[-1, -1], [0, 0], [0.5, 3], [-7, 1]])), [
-        [-2, 0], [0, 0.5], [1, 1], [-2, 1],
-    ])  # fmt: skip
-    unbounded = action_transform(gym.spaces.Box(-np.inf, np.inf, (2,)))
-    np.testing.assert_array_equal(unbounded(np.float32([[-7, 3]])), [[-7, 3]])

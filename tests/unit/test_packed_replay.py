@@ -368,3 +368,17 @@ def test_what_waits_for_rewards_leaves_with_its_member():
     # In another order now.
     found = stacked.rows(["b", "a"], obs, flags * 1, Step(obs, obs, rewards, rewards, ends, flags))
     assert [len(new) for new in found] == [2, 1]
+
+
+@pytest.mark.parametrize("replay", ["uniform", "prioritized", "none"])
+def test_no_rows_change_nothing(replay):
+    stacked, plain = (stack_of(replay, ("a", {}), ("b", {})) for _ in range(2))
+    put(stacked, ["a", "b"], transitions(0, 0), transitions(0, 0))
+    assert stacked.sizes(stacked.slots(["a", "b"])).tolist() == [0, 0]
+    for memory in (stacked, plain):
+        put(memory, ["a", "b"], transitions(0, 7), transitions(50, 7))
+    put(stacked, ["b"], transitions(7, 0))
+    slots = stacked.slots(["a", "b"])
+    stacked.set_priorities(slots, np.zeros((2, 0), dtype=np.int64), np.zeros((2, 0), dtype=np.float32))
+    numbers = np.random.default_rng(0).random((2, BATCH))
+    np.testing.assert_array_equal(stacked.draw(slots, numbers).rows, plain.draw(slots, numbers).rows)

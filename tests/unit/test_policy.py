@@ -154,10 +154,23 @@ def test_bounded_actions_are_stretched_over_the_bounds_and_clipped():
     np.testing.assert_array_equal(actions, np.clip(low + (mean + 1.0) * (high - low) / 2.0, low, high))
 
 
-def test_actions_with_an_open_bound_are_left_as_they_are():
-    mean, actions = _gaussian("TestPushes-v0", "unsquash")
-    assert (np.abs(mean) > 1).any()
-    np.testing.assert_array_equal(actions, mean)
+def test_components_act_by_their_own_bounds():
+    mean, actions = _gaussian("TestPushes-v0", "by_component")
+    assert (np.abs(mean[:, 0]) > 1).any()
+    stretched = np.clip(-1 + (mean[:, 0] + 1) * 2 / 2, -1, 1)
+    np.testing.assert_array_equal(actions, np.stack([stretched, mean[:, 1]], axis=1))
+
+
+def test_older_files_say_unsquash_of_boxes_with_an_open_bound():
+    """Their policies were trained on actions as they are: none is stretched, but none leaves its bounds."""
+    policy = make_portable("TestPushes-v0", seed=5)
+    bounds = {"low": [-0.1, "-inf"], "high": ["inf", "inf"]}
+    old = dataclasses.replace(policy, action_space={**policy.action_space, **bounds}, action_transform="unsquash")
+    acting = NetworkPolicy(old)
+    observations = 9 * np.random.default_rng(0).normal(size=(300, acting.observation_space.shape[0]))
+    mean = acting.outputs(observations)[:, :2]
+    assert (mean[:, 0] < -0.1).any()
+    np.testing.assert_array_equal(acting.act(observations), np.maximum(mean, np.float32([[-0.1, -np.inf]])))
 
 
 def test_clipping_keeps_each_bound():

@@ -201,3 +201,68 @@ def test_the_memory_that_the_hyperparameters_name(replay, kind, capacity):
     made = make_replay(DQNHyperparams(replay=replay, replay_capacity=700, train_batch_size=32), seed=3)
     assert type(made) is kind
     assert made.capacity == capacity
+
+
+# -- batches without rows: what n-step sums give before the first is complete
+
+KINDS = ("uniform", "prioritized", "none")
+
+
+@pytest.mark.parametrize("replay", KINDS)
+def test_no_transitions_change_nothing(replay):
+    values = DQNHyperparams(replay=replay, replay_capacity=5, train_batch_size=4)
+    plain, given_none = make_replay(values, seed=3), make_replay(values, seed=3)
+    assert len(given_none.add(rows(0, 0))) == 0
+    assert len(given_none) == 0
+    assert list(given_none.batches(2, 4)) == []
+    for memory in (plain, given_none):
+        memory.add(rows(0, 4))
+    given_none.add(rows(4, 0))
+    given_none.set_priorities(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.float32))
+    for memory in (plain, given_none):
+        memory.add(rows(4, 3))
+    assert len(given_none) == len(plain)
+    for ours, theirs in zip(given_none.batches(3, 4), plain.batches(3, 4), strict=True):
+        np.testing.assert_array_equal(ours.rewards, theirs.rewards)
+        assert (ours.indices is None) == (replay != "prioritized")
+
+
+def test_the_newest_transitions_are_those_that_are_there():
+    replay = LastTransitions(4, np.random.default_rng(0))
+    replay.add(rows(0, 3))
+    (batch,) = replay.batches(1, 4)
+    assert batch.rewards.tolist() == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("replay", KINDS[:2])
+@pytest.mark.parametrize(
+    ("n_step", "episode", "length"),
+    [(3, 100, 1), (3, 2, 1), (7, 5, 3), (40, 9, 4), (40, 100, 4)],
+    ids=["longer than a fragment", "longer than an episode", "both", "longer than the memory", "and no end before it"],
+)
+def test_sums_of_many_steps_fill_every_memory(replay, n_step, episode, length):
+    """Fragments of some steps; each transition that is complete is there once, whatever the fragments are."""
+    num_steps, gamma = 60, 0.9
+    memory = make_replay(
+        DQNHyperparams(replay=replay, replay_capacity=20, train_batch_size=4, n_step=n_step, gamma=gamma), seed=0
+    )
+    steps = NStep(1, n_step, gamma)
+    expected = []
+    for first in range(0, num_steps, length):
+        numbers = np.arange(first, first + length)
+        columns = fragment(numbers, terminated=np.flatnonzero(numbers % episode == episode - 1))
+        columns["obs"] = columns["obs"] + first
+        memory.add(steps.transitions(columns))
+        end = first + length
+        for start in range(end):
+            last = min(start // episode * episode + episode, start + n_step)
+            if last <= end:
+                expected += [start] if start not in expected else []
+    assert len(memory) == min(20, len(expected))
+    (batch,) = memory.batches(1, 500)
+    assert set(batch.obs[:, 0]) == set(expected[-20:])
+    for start, reward, discount in zip(batch.obs[:, 0], batch.rewards, batch.discounts, strict=True):
+        last = int(min(start // episode * episode + episode, start + n_step))
+        total = sum(gamma ** (step - start) * step for step in range(int(start), last))
+        assert reward == pytest.approx(total, rel=1e-5)
+        assert discount == pytest.approx(0.0 if last % episode == 0 else gamma**n_step)

@@ -138,12 +138,49 @@ class Shades(gym.Env):
         return self._observation(), reward, self.ticks >= 10, False, {}
 
 
+class Precise(gym.Env):
+    """A random walk of any precision, ten steps an episode, that takes the actions of its space alone.
+
+    Args:
+        dtype: Name of the observations' type.
+        shape: Of the observations.
+        bounds: (low, high) of each component of continuous actions, None: no bound; None: two discrete actions.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, *, dtype="float64", shape=(3,), bounds=None):
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, tuple(shape), np.dtype(dtype).type)
+        self.action_space = gym.spaces.Discrete(2)
+        if bounds is not None:
+            low, high = (
+                np.array([sign * np.inf if value is None else value for value in values], np.float32)
+                for sign, values in zip((-1, 1), zip(*bounds, strict=True), strict=True)
+            )
+            self.action_space = gym.spaces.Box(low, high)
+        self.ticks = 0
+
+    def _observation(self):
+        return self.np_random.normal(size=self.observation_space.shape).astype(self.observation_space.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.ticks = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.ticks += 1
+        return self._observation(), float(np.sum(action)), self.ticks >= 10, False, {}
+
+
 def register():
     """What the entry point names; more than once does no harm."""
     for env_id, entry_point, limit in (
         ("TestTicks-v0", Ticks, 7),
         ("TestTrouble-v0", Trouble, None),
         ("TestShades-v0", Shades, None),
+        ("TestPrecise-v0", Precise, None),
     ):
         if env_id not in gym.registry:
             gym.register(env_id, entry_point, max_episode_steps=limit)
