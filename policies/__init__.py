@@ -1,1 +1,6 @@
 """Policies and environments: hyperparameters, networks, evaluation, video."""
+
+from importlib import import_module
+
+# Which settles that a user's own folder called policies can be imported from as well; see tune_jobs/own_packages.py.
+import_module("tune_jobs")

@@ -21,6 +21,8 @@ from policies.errors import SpecError
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
 _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
+# Names of packages here that a user's own may have too; see tune_jobs/own_packages.py.
+_SHARED = ("policies", "analysis")
 
 _allowed: set[str] = set()
 
@@ -60,13 +62,15 @@ def module_folders() -> list[str]:
     """The folders on this process's path that hold the allowed modules it has imported, for other processes' paths."""
     found = []
     for name in allowed_modules():
-        package = sys.modules.get(name.partition(".")[0])
-        file = getattr(package, "__file__", None) or next(iter(getattr(package, "__path__", ())), None)
-        if package is None or file is None:
+        # Of the module itself: two projects may share a package, as a user's own `policies` does with this one.
+        module = sys.modules.get(name) or sys.modules.get(name.partition(".")[0])
+        file = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
+        if module is None or file is None:
             continue
         path = Path(file).absolute()
         # Of a package, __file__ is its __init__.py.
-        folder = str(path.parent.parent if path.name == "__init__.py" else path.parent)
+        place = path.parent if path.name == "__init__.py" else path
+        folder = str(place.parents[module.__name__.count(".")])
         if folder in {os.path.abspath(entry) for entry in sys.path}:  # noqa: PTH100 (sys.path holds strings)
             found.append(folder)
     return list(dict.fromkeys(found))
@@ -87,11 +91,14 @@ def import_module_allowed(module: str) -> ModuleType:
             f"If you trust it, allow it with --allow-module {module}, or in Python by passing the class itself; the "
             f"environment variable {ENVIRONMENT_VARIABLE}={module} does the same.",
         )
+    here = os.getcwd()  # noqa: PTH109 (sys.path holds strings)
+    if module in _SHARED and here not in sys.path:
+        # Found in any case, and asked for what the user's own has.
+        sys.path.append(here)
     try:
         try:
             return importlib.import_module(module)
         except ModuleNotFoundError as error:
-            here = os.getcwd()  # noqa: PTH109 (sys.path holds strings)
             if not _is_part(error.name, module) or here in sys.path:
                 raise
             sys.path.append(here)

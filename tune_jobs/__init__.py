@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from tune_jobs import own_packages as _own_packages
+
 if TYPE_CHECKING:
     from policies.env_modules import allow_modules as allow_modules
     from policies.errors import TuneJobsError as TuneJobsError
@@ -45,6 +47,9 @@ _HOME = {
     "load_spec": "tune_jobs.spec_file",
     **dict.fromkeys(_SWEEPS, "tune_jobs.sweeps"),
 }
+
+# Before anything of policies or analysis is imported.
+_own_packages.install()
 
 
 def __getattr__(name: str) -> Any:

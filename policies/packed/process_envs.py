@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
+from policies.child_processes import entry
 from policies.env_modules import allow_modules, allowed_modules
 from policies.errors import EnvError
 from policies.packed.sub_envs import HostDiedError, SubEnvs
@@ -29,7 +30,7 @@ class ProcessHost:
         self._env_id = env_id
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
-            target=serve, args=(theirs, env_id, dict(env_args or {}), allowed_modules()), daemon=True
+            target=entry(serve), args=(theirs, env_id, dict(env_args or {}), allowed_modules()), daemon=True
         )
         self._process.start()
         # Or a pipe whose process has ended would not seem to be closed.

@@ -18,6 +18,7 @@ from policies.hyperparams import Algorithm, DQNHyperparams, TrainedHyperparams, 
 from policies.portable import PortablePolicy, read_policy
 from policies.restore import portable_policy, restore_algorithm, take_over_state
 from policies.rllib_config import build_algorithm_config
+from tune_jobs.engines.env_runner import EnvRunner
 from tune_jobs.engines.protocol import IterationStats, TrialTask
 
 RLLIB_FOLDER = "rllib"
@@ -91,6 +92,7 @@ class RLlibEngine:
             failure_penalty=task.failure_penalty,
             rl_module=task.rl_module,
         )
+        config.env_runners(env_runner_cls=EnvRunner)
         # The learner's weights are drawn from these; a warm process has drawn other numbers before.
         torch.manual_seed(task.seed)
         return config.build_algo()

@@ -1,0 +1,30 @@
+"""The project's environment, which needs a helper from beside it."""
+
+import gymnasium as gym
+import numpy as np
+from analysis.rewards import reward_of
+
+
+class Walk(gym.Env):
+    """Ten steps; only the action 1 is rewarded."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    observation_space = gym.spaces.Box(0, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self._num_steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._num_steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self._num_steps += 1
+        observation = np.full(2, self._num_steps / 10, np.float32)
+        return observation, reward_of(action), False, self._num_steps >= 10, {}
+
+    def render(self):
+        return np.zeros((32, 32, 3), np.uint8)

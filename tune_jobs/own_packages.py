@@ -1,0 +1,216 @@
+"""`policies` and `analysis` mean the packages beside this one, whatever folders of a user's own have these names.
+
+Both names are common in this field. The folder of a script comes first on its path, Ray puts the driver's folders
+first on its workers' paths, and there a user's folder or file of that name would hide ours. A finder before all others
+settles the two names. It is installed when tune_jobs is imported, and each of ours imports tune_jobs first. What
+another process unpickles before anything else must be of a module in tune_jobs, or a user's folder could come first.
+
+The user's own stay usable. A submodule that ours does not have is looked for in theirs (`import analysis.my_plots`),
+and so is a name (`from analysis import plot_all`); that is when their `__init__.py` runs, as merely lying on the path
+is no reason to run it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from importlib.machinery import BuiltinImporter, FrozenImporter, ModuleSpec, PathFinder, SourceFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
+from types import ModuleType
+from typing import Any
+
+NAMES = ("policies", "analysis")
+_ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))  # noqa: PTH100, PTH120 (as sys.path and __path__)
+_INIT = "__init__.py"
+_PYTHONS_OWN = (BuiltinImporter, FrozenImporter, PathFinder)
+_SHARED = ("__all__", "__version__")
+
+_theirs: dict[str, ModuleType] = {}
+"""The user's own package or module of each name, where it was loaded."""
+
+
+def install() -> None:
+    """Make the two names mean ours from now on; only the first call does anything.
+
+    Raises:
+        ImportError: The user's own package has a module that ours has too, and it is already imported.
+    """
+    if not any(isinstance(finder, _Names) for finder in sys.meta_path):
+        for name in NAMES:
+            _refuse_loaded_clash(name)
+        sys.meta_path.insert(0, _Names())
+        sys.meta_path.append(_TheirSubmodules())
+        for name in NAMES:
+            _take_over(name)
+            _warn_of_hidden(name)
+
+
+def run(path: str, *args: Any) -> Any:
+    """Call what `path`, as `module:function`, names: the beginning of child processes."""
+    return pkgutil.resolve_name(path)(*args)
+
+
+class _Names:
+    """Finds the packages themselves; first of all finders."""
+
+    def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
+        """See `importlib.abc.MetaPathFinder.find_spec`."""
+        if fullname not in NAMES:
+            return None
+        folder, file = _folder(fullname), os.path.join(_folder(fullname), _INIT)  # noqa: PTH118
+        return spec_from_file_location(
+            fullname, file, loader=_Loader(fullname, file), submodule_search_locations=[folder]
+        )
+
+
+class _Loader(SourceFileLoader):
+    """Loads one of the packages, with the names of the user's own behind it."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        """See `importlib.abc.Loader.exec_module`."""
+        super().exec_module(module)
+        _add_fallback(module)
+
+
+class _TheirSubmodules:
+    """Finds what ours does not have in the user's own; last of all finders, so ours were looked for before."""
+
+    def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
+        """See `importlib.abc.MetaPathFinder.find_spec`."""
+        if fullname.count(".") != 1 or not fullname.startswith(tuple(f"{name}." for name in NAMES)):
+            return None
+        name = fullname.partition(".")[0]
+        return PathFinder.find_spec(fullname, [place for spec in _their_specs(name) for place in _places(spec)])
+
+
+def _folder(name: str) -> str:
+    return os.path.join(_ROOT, name)  # noqa: PTH118
+
+
+def _is_ours(spec: ModuleSpec, name: str) -> bool:
+    files = [spec.origin] if spec.has_location and spec.origin else []
+    return any(_is_folder_of_ours(place, name) for place in [*_places(spec), *map(os.path.dirname, files)])
+
+
+def _is_folder_of_ours(place: str, name: str) -> bool:
+    """Whether it is this package or another copy of it, such as a checkout; none is a user's own."""
+    copy = os.path.join(os.path.dirname(place), "tune_jobs", _INIT)  # noqa: PTH118, PTH120
+    return os.path.realpath(place) == os.path.realpath(_folder(name)) or os.path.isfile(copy)  # noqa: PTH113
+
+
+def _places(spec: ModuleSpec) -> Sequence[str]:
+    return list(spec.submodule_search_locations or ())
+
+
+def _their_specs(name: str) -> Iterator[ModuleSpec]:
+    """The user's own packages and modules of a name, in the order of the path, which may have changed meanwhile."""
+    for entry in sys.path:
+        spec = PathFinder.find_spec(name, [entry or os.getcwd()])  # noqa: PTH109
+        if spec is not None and not _is_ours(spec, name):
+            yield spec
+    # A project that is installed editable may be found by a finder of its own.
+    for finder in sys.meta_path:
+        known = finder in (BuiltinImporter, FrozenImporter, PathFinder) or isinstance(
+            finder, (_Names, _TheirSubmodules)
+        )
+        find_spec = None if known else getattr(finder, "find_spec", None)
+        spec = None if find_spec is None else find_spec(name, None)
+        if spec is not None and not _is_ours(spec, name):
+            yield spec
+
+
+def _modules_in(folder: str) -> dict[str, str]:
+    """The modules and packages in a folder: name -> what it lies in."""
+    try:
+        entries = os.listdir(folder)  # noqa: PTH208
+    except OSError:
+        return {}
+    paths = {entry: os.path.join(folder, entry) for entry in sorted(entries)}  # noqa: PTH118
+    modules = {entry.removesuffix(".py"): path for entry, path in paths.items() if entry.endswith(".py")}
+    packages = {entry: path for entry, path in paths.items() if os.path.isfile(os.path.join(path, _INIT))}  # noqa: PTH113, PTH118
+    modules.pop("__init__", None)
+    return {**modules, **packages}
+
+
+def _add_fallback(module: ModuleType) -> None:
+    name = module.__name__
+
+    def look_in_theirs(attribute: str) -> Any:
+        missing = f"module {name!r} has no attribute {attribute!r}"
+        # The import system asks for dunders and for submodules before it loads these: no reason to run their code.
+        is_dunder = attribute.startswith("__") and attribute not in _SHARED
+        if is_dunder or attribute in _modules_in(_folder(name)):
+            raise AttributeError(missing, name=attribute, obj=module)
+        theirs = _load_theirs(name)
+        if theirs is not None and attribute == "__all__" and not hasattr(theirs, attribute):
+            return [public for public in vars(theirs) if not public.startswith("_")]
+        if not hasattr(theirs, attribute):
+            raise AttributeError(missing, name=attribute, obj=module)
+        return getattr(theirs, attribute)
+
+    module.__dict__["__getattr__"] = look_in_theirs
+
+
+def _load_theirs(name: str) -> ModuleType | None:
+    """The user's own package or module, executed once under its own name but not in `sys.modules`."""
+    if name not in _theirs:
+        spec = next((spec for spec in _their_specs(name) if spec.loader is not None), None)
+        if spec is None or spec.loader is None:
+            return None
+        # Known before it is executed: its own modules may ask for it meanwhile.
+        module = _theirs[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del _theirs[name]
+            raise
+    return _theirs[name]
+
+
+def _refuse_loaded_clash(name: str) -> None:
+    for submodule in sorted(_modules_in(_folder(name))):
+        module = sys.modules.get(f"{name}.{submodule}")
+        if module is None or module.__spec__ is None:
+            continue
+        file = module.__spec__.origin or next(iter(_places(module.__spec__)), "")
+        if os.path.realpath(file).startswith(os.path.realpath(_folder(name)) + os.sep):
+            continue
+        raise ImportError(
+            f"tune_jobs cannot be imported: it has a module {name}.{submodule}, and {file}, which is imported already, "
+            "has the same name. Rename that file or the folder it lies in.",
+            name=f"{name}.{submodule}",
+            path=file,
+        )
+
+
+def _take_over(name: str) -> None:
+    """Put ours in the place of what was imported under its name before."""
+    before = sys.modules.get(name)
+    if before is None:
+        return
+    if before.__spec__ is not None and _is_ours(before.__spec__, name):
+        _add_fallback(before)
+        return
+    _theirs[name] = before
+    del sys.modules[name]
+    importlib.import_module(name)
+
+
+def _warn_of_hidden(name: str) -> None:
+    """Say which modules of the user's own cannot be imported any more; once, not in each process of a sweep."""
+    multiprocessing = sys.modules.get("multiprocessing")
+    if multiprocessing is not None and multiprocessing.parent_process() is not None:
+        return
+    ours = _modules_in(_folder(name))
+    places = dict.fromkeys(place for spec in _their_specs(name) for place in _places(spec))
+    hidden = {module: path for place in places for module, path in _modules_in(place).items() if module in ours}
+    if hidden:
+        warnings.warn(
+            f"tune-jobs has a package {name} too, with modules of the same names as {', '.join(hidden.values())}: "
+            f"`import {name}.{next(iter(hidden))}` gives tune-jobs' own. Rename yours to import them.",
+            stacklevel=4,
+        )
