@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
 SweepState = Literal["running", "interrupted", "completed"]

@@ -195,7 +195,7 @@ def run_sweep(
     if todo:
         _run_trials(store, plan, todo, monitor, address=address, machine=machine, progress=progress)
     interrupted = _close(store, started)
-    from tune_jobs.finish import read_trials
+    from tune_jobs.candidates import read_trials
 
     records = read_trials(store)
     result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord, TrialRecord
-from analysis.selection import NoUsableTrialError, score_trial, select_best
+from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord
+from analysis.selection import NoUsableTrialError, score_trial
 from policies.baselines import BASELINES, ConstantPolicy
 from policies.env_modules import allow_modules
 from policies.env_wrappers import FRAME_STACK, PIXELS
@@ -21,6 +21,7 @@ from policies.hyperparams import ConstantHyperparams
 from policies.policy import Policy, RandomPolicy, load_policy, policy_from_portable
 from policies.portable import PolicyNetwork, read_policy, save_policy
 from policies.video import record_comparison, record_video
+from tune_jobs.candidates import choose, leave_out, read_trials
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
@@ -58,14 +59,6 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepSto
     )
 
 
-def read_trials(store: SweepStore) -> list[TrialRecord]:
-    """The trials, with the checkpoints that are on disk now (a killed driver's records may lag behind them)."""
-    return [
-        record.model_copy(update={"checkpoints": tuple(store.trial(record.trial_id).checkpoints())})
-        for record in store.read_trials()
-    ]
-
-
 def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
     """Every trial's results, by trial id."""
     return {record.trial_id: store.trial(record.trial_id).read_iterations() for record in store.read_trials()}
@@ -76,14 +69,11 @@ def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
 
     Raises:
         NoUsableTrialError: No trial can win; the message says why.
-        CheckpointError: The winner's checkpoint is damaged.
+        CheckpointError: The record of the sweep or of a trial is damaged.
     """
     sweep = _trusted(store).read_record()
     spec = SweepSpec.model_validate(sweep.spec)
-    selection = select_best(read_trials(store))
-    folder = store.checkpoint_folder(selection.checkpoint)
-    verify_checkpoint(folder)
-    portable = read_policy(folder)
+    selection, portable = choose(store, read_trials(store))
     seeds = confirmation_seeds(spec.seed, num_episodes)
     policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
     env_args = spec.env.wrapped_args
@@ -332,7 +322,9 @@ def make_report(store: SweepStore) -> Path:
 
     try:
         best = store.read_best()
-    except NotFoundError:
+    except NotFoundError as error:
+        if isinstance(error, CheckpointError):
+            leave_out(error)
         try:
             best = choose_best(store)
         except NoUsableTrialError:

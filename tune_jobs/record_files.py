@@ -1,17 +1,27 @@
-"""The files of a sweep folder that are one record each, as JSON."""
+"""The files of a sweep folder that are one record each, as JSON.
+
+What others are chosen by is *sealed*: it carries the SHA-256 of everything else in it, as JSON with sorted keys and
+without spaces. Format 1 had no seals.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.spec import describe, dotted
 
 _RecordT = TypeVar("_RecordT", bound=BaseModel)
+
+_SEAL = "sha256"
+_FIRST_SEALED_VERSION = 2
+_BACKUP = "Restore the file from a backup."
 
 
 def dump(record: BaseModel, indent: int | None = 1) -> str:
@@ -19,34 +29,87 @@ def dump(record: BaseModel, indent: int | None = 1) -> str:
     return record.model_dump_json(indent=indent) + "\n"
 
 
-def read_record(path: Path, kind: type[_RecordT], what: str) -> _RecordT:
+def dump_sealed(record: BaseModel, **more: Any) -> str:
+    """A record as it is written, with further fields and a seal."""
+    data = json.loads(record.model_dump_json()) | more | {"format_version": FORMAT_VERSION}
+    return json.dumps({**data, _SEAL: seal(data)}, indent=1) + "\n"
+
+
+def seal(data: dict[str, Any]) -> str:
+    """The hash of everything in a file but the hash itself."""
+    content = {name: value for name, value in data.items() if name != _SEAL}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def read_record(path: Path, kind: type[_RecordT], what: str, *, is_sealed: bool = False) -> _RecordT:
     """Read a record.
 
     Args:
         path: Its file.
         kind: What it must be.
         what: What to call it in messages.
+        is_sealed: Whether it has to carry its seal.
 
     Raises:
         NotFoundError: There is no such file.
-        CheckpointError: It is damaged or of a newer format; the message names it.
+        CheckpointError: It is damaged, of a newer format, or was changed; the message names the file and the field.
     """
+    return parse_record(read_json(path, what, is_sealed=is_sealed), path, kind, what)
+
+
+def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, Any]:
+    """Read the fields of a record; see `read_record`."""
     try:
         data = json.loads(path.read_bytes())
     except FileNotFoundError as error:
         raise NotFoundError(f"No {what} at {path}.", "List the sweeps here with `tune-jobs list`.") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(
             f"{path} cannot be read as {what}: {error}.",
             "Restore the file from a backup, or delete the folder.",
         ) from error
-    version = data.get("format_version", FORMAT_VERSION) if isinstance(data, dict) else FORMAT_VERSION
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{path} is not a valid {what}: it is no JSON object.", _BACKUP)
+    version = data.get("format_version", FORMAT_VERSION)
+    if type(version) is not int or version < 1:
+        raise CheckpointError(f"{path} is not a valid {what}: format_version is {version!r:.80}.", _BACKUP)
     if version > FORMAT_VERSION:
         raise CheckpointError(
             f"{path} has format version {version}; this tune-jobs reads up to {FORMAT_VERSION}.",
             "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
         )
+    if is_sealed and (version >= _FIRST_SEALED_VERSION or _SEAL in data) and data.get(_SEAL) != _seal_of(data):
+        raise CheckpointError(
+            f"{path} is not the {what} that was written (its SHA-256 differs).",
+            "Restore the file from a backup: what it says now is not used.",
+        )
+    return data
+
+
+def _seal_of(data: dict[str, Any]) -> str | None:
+    try:
+        return seal(data)
+    except (ValueError, RecursionError):
+        return None
+
+
+def parse_record(data: dict[str, Any], path: Path, kind: type[_RecordT], what: str) -> _RecordT:
+    """The record that was read from a file.
+
+    Raises:
+        CheckpointError: It is none; the message names the file and the field.
+    """
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        raise CheckpointError(f"{path} is not a valid {what}: {error}.", "Restore the file from a backup.") from error
+        raise CheckpointError(f"{path} is not a valid {what}: {problems_in(error)}", _BACKUP) from error
+    except (RecursionError, OverflowError) as error:
+        raise CheckpointError(f"{path} is not a valid {what}: {error}.", _BACKUP) from error
+
+
+def problems_in(error: ValidationError) -> str:
+    """The first field that is wrong, why, and how many more there are."""
+    first, *others = error.errors(include_url=False)
+    place = dotted(first["loc"])
+    text = f"{place} is missing." if first["type"] == "missing" else f"{place} {describe(first['msg'], first['input'])}"
+    return text.strip()[:300] + (f" (and {len(others)} more)" if others else "")

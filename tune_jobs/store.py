@@ -27,7 +27,7 @@ from policies.files import write_atomic
 from tune_jobs.locks import held, is_held
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
 from tune_jobs.places import check_trial_id, checkpoint_iteration, is_trial_id, refuse_link, remove_folder, within
-from tune_jobs.record_files import dump, read_record
+from tune_jobs.record_files import dump, dump_sealed, read_record
 
 __all__ = [
     "MANIFEST",
@@ -133,16 +133,22 @@ class TrialStore:
         Raises:
             CheckpointError: A manifest is damaged, or of another checkpoint than lies there.
         """
-        return [self._checkpoint(iteration) for iteration in self._iterations()]
+        return [self.checkpoint(iteration) for iteration in self.checkpoint_iterations()]
 
-    def _iterations(self) -> list[int]:
-        """Those that have a checkpoint, in order."""
+    def checkpoint_iterations(self) -> list[int]:
+        """Those that have a checkpoint, damaged or not, in order."""
         if not self.checkpoints_folder.is_dir():
             return []
         numbers = (checkpoint_iteration(path.name) for path in self.checkpoints_folder.iterdir())
         return sorted(number for number in numbers if number is not None)
 
-    def _checkpoint(self, iteration: int) -> CheckpointRecord:
+    def checkpoint(self, iteration: int) -> CheckpointRecord:
+        """The manifest of an iteration's checkpoint.
+
+        Raises:
+            NotFoundError: There is none.
+            CheckpointError: It is damaged, or of another checkpoint.
+        """
         folder = self.checkpoint_folder(iteration)
         record = read_manifest(folder)
         if (record.trial_id, record.iteration) != (self.trial_id, iteration):
@@ -328,12 +334,12 @@ class SweepStore:
             raise NotFoundError(
                 f"Sweep {self.name} has no best policy yet.", f"Choose it with `tune-jobs best {self.name}`."
             )
-        return read_record(path, BestRecord, "best record")
+        return read_record(path, BestRecord, "best record", is_sealed=True)
 
     def write_best(self, record: BestRecord) -> None:
         """Replace best/evaluation.json."""
         self.best_folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.best_folder / "evaluation.json", dump(record))
+        write_atomic(self.best_folder / "evaluation.json", dump_sealed(record))
 
     def request_stop(self) -> None:
         """Ask the process that drives this sweep to stop."""

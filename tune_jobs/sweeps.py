@@ -253,7 +253,8 @@ def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[Tria
     Raises:
         NotFoundError: No such sweep.
     """
-    from tune_jobs.finish import find_sweep, read_trials
+    from tune_jobs.candidates import read_trials
+    from tune_jobs.finish import find_sweep
 
     return read_trials(find_sweep(sweep, storage))
 
@@ -265,7 +266,8 @@ def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.Dat
         NotFoundError: No such sweep.
     """
     from analysis.tables import trials_frame
-    from tune_jobs.finish import find_sweep, read_results, read_trials
+    from tune_jobs.candidates import read_trials
+    from tune_jobs.finish import find_sweep, read_results
 
     store = find_sweep(sweep, storage)
     return trials_frame(read_trials(store), read_results(store))

@@ -262,5 +262,5 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
 
 def _latest_iteration(folder: Path, trial_id: str) -> int:
-    """Of a trial's checkpoints on disk; 0: it has none."""
-    return max((record.iteration for record in SweepStore(folder).trial(trial_id).checkpoints()), default=0)
+    """Of a trial's checkpoints on disk, damaged or not; 0: it has none."""
+    return max(SweepStore(folder).trial(trial_id).checkpoint_iterations(), default=0)

@@ -8,11 +8,14 @@ from trial_runs import Trial
 from analysis.records import CheckpointRecord, TrialRecord
 from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.pack_files import Assignment, PackFiles
+from tune_jobs.record_files import seal
 from tune_jobs.store import SweepStore, TrialStore
 
 
 def edit(file, /, **changes):
-    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    """As somebody would who knows how manifests are sealed."""
+    data = json.loads(file.read_text()) | changes
+    file.write_text(json.dumps(data | {"sha256": seal(data)}))
 
 
 @pytest.fixture

@@ -56,7 +56,9 @@ def write_checkpoint(trial, iteration=3, files=None, **scores):
     )
 
     def write(folder):
-        for name, content in (files or {"policy.json": "{}", "rllib/state.pkl": "abc"}).items():
+        for name, content in (
+            {"policy.json": "{}", "policy.safetensors": ""} | (files or {"rllib/state.pkl": "abc"})
+        ).items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(content)
 
@@ -191,7 +193,7 @@ def test_a_checkpoint_has_a_manifest_of_every_file(trial):
     record, folder = write_checkpoint(trial, 3, evaluation_return=0.0)
     assert folder == trial.checkpoints_folder / "000003"
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert set(manifest["files"]) == {"policy.json", "rllib/state.pkl"}
+    assert set(manifest["files"]) == {"policy.json", "policy.safetensors", "rllib/state.pkl"}
     assert manifest["files"]["rllib/state.pkl"] == {
         "bytes": 3,
         "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad",
@@ -234,7 +236,7 @@ def test_a_checkpoint_written_anew_replaces_the_old_one(trial):
     write_checkpoint(trial, 3, {"old": "1"}, evaluation_return=1.0)
     record, folder = write_checkpoint(trial, 3, {"new": "2"}, evaluation_return=2.0)
     assert trial.checkpoints() == [record]
-    assert {path.name for path in folder.iterdir()} == {"new", "manifest.json"}
+    assert {path.name for path in folder.iterdir()} == {"new", "policy.json", "policy.safetensors", "manifest.json"}
     assert len(list(trial.checkpoints_folder.iterdir())) == 1
 
 

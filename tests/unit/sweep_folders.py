@@ -1,0 +1,67 @@
+"""A sweep folder as a run leaves it, in a second and without Ray: fakes for the training, the real files."""
+
+import dataclasses
+
+from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
+
+from tune_jobs.driving import write_new
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec import SweepSpec
+from tune_jobs.store import SweepStore
+from tune_jobs.trial import TrialLoop
+
+MACHINE = Machine(num_cpus=4, source="this machine")
+SPEC = {
+    "env": {"id": "CartPole-v1"},
+    "algorithm": "ppo",
+    "space": {"lr": {"uniform": [1e-4, 1e-2]}},
+    "num_samples": 2,
+    "seeds_per_point": 2,
+    "engine": "rllib",
+    "evaluation": {"every_iterations": 1, "num_episodes": 2},
+}
+
+
+def make_sweep_folder(folder, iterations=6, **spec):
+    """A completed sweep of 4 trials; trial i's checkpoint of iteration n scored 10 i + n.
+
+    The points are {t0000, t0001} and {t0002, t0003}; t0003 wins with its last checkpoint.
+    """
+    store = SweepStore(folder)
+    store.create()
+    made = SweepSpec.model_validate(SPEC | spec)
+    plan = make_plan(made, MACHINE)
+    write_new(store, made, plan, None)
+    for trial in plan.trials:
+        train(store, trial.trial_id, iterations)
+    record = store.read_record()
+    changes = {"state": "completed", "started_at": 1.0, "ended_at": 2.0, "created_at": 0.0, "git_commit": None}
+    store.write_record(record.model_copy(update=changes))
+    return store
+
+
+def train(store, trial_id, iterations):
+    """Run a trial to its end, and write its record as its driver does."""
+    known = store.trial(trial_id).read_record()
+    task = make_task(
+        store.folder, stop={"num_iterations": iterations}, evaluation={"every_iterations": 1},
+        checkpoints={"every_iterations": 2, "keep": 2},
+    )  # fmt: skip
+    task = dataclasses.replace(task, trial_id=trial_id, seed=known.seed)
+    evaluator = FakeEvaluator(lambda iteration: 10.0 * known.index + iteration)
+    loop = TrialLoop(task, FakeEngine(), evaluator, FakeClock(0.001))
+    loop.open()
+    while (progress := loop.advance(1e9)).status == "running":
+        pass
+    store.trial(trial_id).write_record(
+        known.model_copy(
+            update={
+                "status": progress.status, "stop_reason": progress.stop_reason, "num_iterations": progress.iteration,
+                "num_env_steps": progress.num_env_steps, "num_episodes": progress.num_episodes, "time_s": 1.0,
+                "training_return": progress.training_return, "evaluation_return": progress.evaluation_return,
+                "best_evaluation_return": progress.best_evaluation_return, "best_iteration": progress.best_iteration,
+                "checkpoints": progress.checkpoints, "started_at": 1.0, "ended_at": 2.0,
+            }
+        )
+    )  # fmt: skip

@@ -1,0 +1,154 @@
+"""What is chosen as the best is what was written, and scored what it says; the rest is left out, with a warning."""
+
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+from sweep_folders import make_sweep_folder
+
+from analysis.selection import NoUsableTrialError
+from policies.errors import CheckpointError
+from tune_jobs import finish, sweeps
+from tune_jobs.candidates import read_trials
+from tune_jobs.record_files import seal
+from tune_jobs.store import SweepStore
+
+SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1"
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
+    return make_sweep_folder(tmp_path_factory.mktemp("template") / "mine").folder
+
+
+@pytest.fixture
+def store(template, tmp_path):
+    return SweepStore(shutil.copytree(template, tmp_path / "mine"))
+
+
+@pytest.fixture
+def old_store(tmp_path):
+    """Written by a version without seals."""
+    return SweepStore(shutil.copytree(SAMPLE, tmp_path / "old"))
+
+
+def edit(path, *, sealed=False, **changes):
+    data = json.loads(path.read_text()) | changes
+    if sealed:
+        data["sha256"] = seal(data)
+    path.write_text(json.dumps(data))
+
+
+def manifest(store, trial_id, iteration):
+    return store.trial(trial_id).checkpoint_folder(iteration) / "manifest.json"
+
+
+def chosen(store):
+    best = sweeps.best(store.folder, num_episodes=1)
+    return best.checkpoint.trial_id, best.checkpoint.iteration, best.selection_score
+
+
+def warnings_of(caplog):
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_the_best_of_an_untouched_sweep_is_chosen_without_a_warning(store, caplog):
+    assert chosen(store) == ("t0003", 6, 36.0)
+    assert warnings_of(caplog) == []
+
+
+def test_the_best_of_an_old_sweep_is_chosen_without_a_warning(old_store, caplog):
+    assert old_store.read_best().checkpoint.trial_id == "t0001"
+    assert chosen(old_store) == ("t0001", 2, 12.0)
+    assert warnings_of(caplog) == []
+
+
+@pytest.mark.parametrize("sealed", [False, True])
+@pytest.mark.parametrize("changes", [{"evaluation_return": 924.5}, {"evaluation_return": 36.0, "num_env_steps": 1}])
+def test_an_edited_score_does_not_win(store, caplog, sealed, changes):
+    """Sealed by somebody who knows how, it contradicts the results."""
+    edit(manifest(store, "t0000", 6), sealed=sealed, **changes)
+    assert chosen(store) == ("t0003", 6, 36.0)
+    (warning,) = warnings_of(caplog)
+    assert "t0000/checkpoints/000006" in warning
+    assert [len(trial.checkpoints) for trial in read_trials(store)] == [1, 2, 2, 2]
+
+
+def test_an_edited_score_of_an_old_sweep_does_not_win(old_store, caplog):
+    edit(manifest(old_store, "t0000", 2), evaluation_return=924.5)
+    assert chosen(old_store) == ("t0001", 2, 12.0)
+    (warning,) = warnings_of(caplog)
+    assert "says that it scored 924.5 after 200 env steps; results.jsonl says 2.0 after 200" in warning
+
+
+def test_the_others_of_a_trial_still_compete(store):
+    edit(manifest(store, "t0003", 6), evaluation_return=924.5)
+    assert chosen(store) == ("t0003", 5, 35.0)
+
+
+def test_results_that_were_edited_leave_their_checkpoint_out_too(store, caplog):
+    path = store.trial("t0003").results_path
+    path.write_text(path.read_text().replace('"evaluation_return":36.0', '"evaluation_return":37.0'))
+    assert chosen(store) == ("t0003", 5, 35.0)
+    assert len(warnings_of(caplog)) == 1
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"\xff\n[]\n7\n{}\n")])
+def test_results_that_cannot_be_read_contradict_nothing(store, damage):
+    damage(store.trial("t0003").results_path)
+    assert chosen(store) == ("t0003", 6, 36.0)
+
+
+def test_a_winner_whose_files_are_damaged_gives_way_to_the_next(store, caplog):
+    for iteration in (5, 6):
+        folder = store.trial("t0003").checkpoint_folder(iteration)
+        (folder / "policy.safetensors").write_bytes(b"")
+    # Without t0003 its point lacks a seed, so the other one comes first.
+    assert chosen(store) == ("t0001", 6, 16.0)
+    text = "\n".join(warnings_of(caplog))
+    assert "t0003/checkpoints/000005" in text
+    assert "t0003/checkpoints/000006" in text
+
+
+def test_with_nothing_left_there_is_no_best(store, caplog):
+    for path in store.folder.glob("trials/*/checkpoints/*/policy.json"):
+        path.write_text("{}")
+    with pytest.raises(NoUsableTrialError):
+        sweeps.best(store.folder, num_episodes=1)
+    assert len(warnings_of(caplog)) == 8
+
+
+@pytest.mark.parametrize("changes", [{"point_index": 1}, {"seed_index": 0, "index": 3}, {"point_index": 77}])
+def test_which_point_a_trial_is_of_follows_from_its_number(store, changes):
+    before = [(trial.index, trial.point_index, trial.seed_index) for trial in read_trials(store)]
+    edit(store.trial("t0001").record_path, **changes)
+    assert [(trial.index, trial.point_index, trial.seed_index) for trial in read_trials(store)] == before
+    assert before == [(0, 0, 0), (1, 0, 1), (2, 1, 0), (3, 1, 1)]
+    assert chosen(store) == ("t0003", 6, 36.0)
+
+
+def test_an_edited_evaluation_of_the_best_is_not_shown_but_made_anew(store, caplog):
+    sweeps.best(store.folder, num_episodes=1)
+    edit(store.best_folder / "evaluation.json", selection_score=924.5)
+    with pytest.raises(CheckpointError, match=r"evaluation\.json is not the best record that was written"):
+        store.read_best()
+    page = finish.make_report(store).read_text()
+    assert "924.5" not in page
+    assert store.read_best().selection_score == 36.0
+    assert "evaluation.json" in warnings_of(caplog)[0]
+
+
+def test_a_checkpoint_that_is_pruned_meanwhile_is_no_reason_to_warn(store, caplog, monkeypatch):
+    trial = store.trial("t0003")
+    real = type(trial).checkpoint
+
+    def pruned(self, iteration):
+        if self.trial_id == "t0003" and iteration == 5:
+            shutil.rmtree(self.checkpoint_folder(5))
+        return real(self, iteration)
+
+    monkeypatch.setattr(type(trial), "checkpoint", pruned)
+    assert [record.iteration for record in read_trials(store)[3].checkpoints] == [6]
+    assert warnings_of(caplog) == []

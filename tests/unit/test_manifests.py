@@ -1,0 +1,125 @@
+"""A manifest covers every file of its checkpoint, and itself."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from trial_runs import Trial
+
+from policies.errors import CheckpointError
+from tune_jobs.manifests import read_manifest, verify_checkpoint
+from tune_jobs.record_files import seal
+
+SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1" / "trials" / "t0001" / "checkpoints" / "000002"
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    trial = Trial(tmp_path / "mine", stop={"num_iterations": 2})
+    trial.run()
+    folder = trial.store.checkpoint_folder(2)
+    # Both are made of the same files.
+    assert sorted(path.name for path in SAMPLE.iterdir() if path.is_file()) == sorted(
+        path.name for path in folder.iterdir() if path.is_file()
+    )
+    return folder
+
+
+@pytest.fixture
+def old_checkpoint(tmp_path):
+    """Of format 1, which had no seals."""
+    return shutil.copytree(SAMPLE, tmp_path / "old")
+
+
+def edit(checkpoint, change, *, sealed=True):
+    path = checkpoint / "manifest.json"
+    data = json.loads(path.read_text())
+    change(data)
+    if sealed and data["format_version"] > 1:
+        data["sha256"] = seal(data)
+    path.write_text(json.dumps(data))
+
+
+ENTRY = {"bytes": 0, "sha256": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"}
+BAD_FILES = {
+    "none": (lambda data: data.pop("files"), "files is missing"),
+    "null": (lambda data: data.update(files=None), "files is missing"),
+    "a list": (lambda data: data.update(files=[]), r"files is \[\]"),
+    "empty": (lambda data: data.update(files={}), "policy.json"),
+    "no policy": (lambda data: data["files"].pop("policy.json"), "policy.json"),
+    "no weights": (lambda data: data["files"].pop("policy.safetensors"), "policy.safetensors"),
+    "no engine": (lambda data: data["files"].pop("engine.json"), "engine.json|nothing that training"),
+    "one too many": (lambda data: data["files"].update(more=ENTRY), "lacks the file more"),
+    "no hash": (lambda data: data["files"]["policy.json"].pop("sha256"), "files.policy.json"),
+    "a number as hash": (lambda data: data["files"]["policy.json"].update(sha256=1), "files.policy.json"),
+    "a word as size": (lambda data: data["files"]["policy.json"].update(bytes="1"), "files.policy.json"),
+    "a truth as size": (lambda data: data["files"]["policy.json"].update(bytes=True), "files.policy.json"),
+    "an entry of another type": (lambda data: data["files"].update({"policy.json": 7}), "files.policy.json is 7"),
+    **{
+        f"the name {name!r}": (lambda data, name=name: data["files"].update({name: ENTRY}), "no file in the folder")
+        for name in ("../x", "/etc/passwd", "a/../../x", "", ".", "./policy.json", "a//b", "nul\0", "a/")
+    },
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+@pytest.mark.parametrize("kind", ["checkpoint", "old_checkpoint"])
+def test_a_manifest_that_does_not_cover_the_folder_is_refused(request, kind, case):
+    folder, (change, words) = request.getfixturevalue(kind), BAD_FILES[case]
+    verify_checkpoint(folder)
+    edit(folder, change)
+    with pytest.raises(CheckpointError, match=words) as raised:
+        verify_checkpoint(folder)
+    assert str(folder) in raised.value.message
+
+
+@pytest.mark.parametrize("name", ["more.pkl", "rllib/algorithm_state.pkl", ".hidden"])
+@pytest.mark.parametrize("kind", ["checkpoint", "old_checkpoint"])
+def test_a_file_that_the_manifest_does_not_name_is_refused(request, kind, name):
+    folder = request.getfixturevalue(kind)
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("something that would be unpickled")
+    with pytest.raises(CheckpointError, match=f"holds the file {name}"):
+        verify_checkpoint(folder)
+
+
+@pytest.mark.parametrize("name", ["policy.json", "manifest.json", "rllib"])
+def test_links_in_a_checkpoint_are_refused(checkpoint, tmp_path, name):
+    if (checkpoint / name).exists():
+        (checkpoint / name).rename(tmp_path / name)
+    (checkpoint / name).symlink_to(tmp_path / name)
+    with pytest.raises(CheckpointError, match="symbolic link"):
+        verify_checkpoint(checkpoint)
+
+
+@pytest.mark.parametrize("changes", [{"evaluation_return": 924.5}, {"num_env_steps": 1}, {"trial_id": "t0007"}])
+def test_a_changed_manifest_is_refused(checkpoint, changes):
+    """However small: 2.0 became 924.5, and won."""
+    assert read_manifest(checkpoint).evaluation_return == 2.0
+    edit(checkpoint, lambda data: data.update(changes), sealed=False)
+    for read in (read_manifest, verify_checkpoint):
+        with pytest.raises(CheckpointError, match=r"manifest\.json is not the checkpoint manifest that was written"):
+            read(checkpoint)
+
+
+def test_a_seal_that_is_gone_is_missed(checkpoint):
+    edit(checkpoint, lambda data: data.pop("sha256"), sealed=False)
+    with pytest.raises(CheckpointError, match="that was written"):
+        read_manifest(checkpoint)
+
+
+def test_a_manifest_that_is_only_laid_out_otherwise_is_the_same(checkpoint):
+    path = checkpoint / "manifest.json"
+    path.write_text(json.dumps(dict(reversed(json.loads(path.read_text()).items()))))
+    assert verify_checkpoint(checkpoint).evaluation_return == 2.0
+
+
+def test_a_manifest_of_format_1_is_read(old_checkpoint):
+    record = verify_checkpoint(old_checkpoint)
+    assert (record.trial_id, record.iteration, record.num_env_steps, record.evaluation_return) == (
+        "t0001",
+        2,
+        200,
+        12.0,
+    )
