@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from policies.arguments import checked
 from policies.errors import SpecError
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
@@ -27,6 +28,7 @@ _SHARED = ("policies", "analysis")
 _allowed: set[str] = set()
 
 
+@checked
 def allow_modules(names: Iterable[str]) -> None:
     """Allow modules, for as long as this process lives.
 

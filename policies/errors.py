@@ -5,7 +5,7 @@ Hierarchy: every error below is a `TuneJobsError`; the subclass decides the exit
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 class TuneJobsError(Exception):
@@ -59,3 +59,12 @@ class CannotRunError(TuneJobsError):
     """This machine or cluster cannot run it: resources, storage, address."""
 
     exit_code = 5
+
+
+def shortened(value: Any) -> str:
+    """A value's repr, at most 80 characters of it."""
+    try:
+        text = repr(value)
+    except Exception:  # noqa: BLE001 - an object of a user's own may raise anything
+        return "a value"
+    return text if len(text) <= 80 else f"{text[:77]}..."

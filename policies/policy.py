@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from policies.action_bounds import ToBounds
+from policies.arguments import checked
 from policies.envs import check_env
 from policies.errors import TuneJobsError
 from policies.forward import ForwardPass
@@ -250,6 +251,7 @@ def policy_from_portable(portable: PortablePolicy, description: str | None = Non
     return policy
 
 
+@checked
 def load_policy(path: str | Path) -> Policy:
     """Read a policy from its portable file; needs no Ray and no torch, and executes nothing in the file.
 

@@ -53,7 +53,9 @@ def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's sign
 @cli.command()
 @click.argument("spec")
 @set_option
-@click.option("--name", help="Name of the sweep.  [default: made from SPEC and the time]")
+@click.option(
+    "--name", help="Name of the sweep.  [default: SPEC's `name`, else the file's or preset's, with a number if taken]"
+)
 @click.option("--dry-run", is_flag=True, help="Print the plan and start nothing.")
 @run_options
 @click.pass_context
@@ -72,9 +74,10 @@ def launch(
     """Run a sweep: all trials, then the best policy, its video and a report."""
     if dry_run:
         from tune_jobs import cli_plan
+        from tune_jobs.dry_run import planned
 
         with stdout_for(as_json=as_json):
-            loaded, plan = _plan(spec, overrides, name=name, address=options["address"])
+            loaded, plan = planned(spec, overrides, name=name, storage=storage, address=options["address"])
         cli_plan.show_plan(loaded, plan, as_json=as_json)
         return
     from tune_jobs import cli_output, sweeps
@@ -83,22 +86,6 @@ def launch(
         result = sweeps.launch(spec, overrides=overrides, name=name, storage=storage, **options)
     cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
-
-
-def _plan(spec: str, overrides: tuple[str, ...], *, name: str | None, address: str | None) -> tuple[Any, Any]:
-    from tune_jobs.machine import local_machine
-    from tune_jobs.plan import make_plan
-    from tune_jobs.spec import check_sweep_name
-    from tune_jobs.spec_file import load_spec
-
-    loaded = load_spec(spec, overrides)
-    if name is not None:
-        loaded = loaded.model_copy(update={"name": check_sweep_name(name)})
-    if address is None:
-        return loaded, make_plan(loaded, local_machine())
-    from tune_jobs import sweeps
-
-    return loaded, make_plan(loaded, sweeps.machine(address))
 
 
 @cli.command(name="list")

@@ -23,8 +23,8 @@ from tune_jobs.machine import Machine
 from tune_jobs.monitor import SweepMonitor
 from tune_jobs.own_code import modules_of
 from tune_jobs.plan import SweepPlan, TrialPlan
-from tune_jobs.spec import SweepSpec, check_sweep_name
-from tune_jobs.store import SweepStore, name_taken
+from tune_jobs.spec import SweepSpec
+from tune_jobs.store import SweepStore
 
 if TYPE_CHECKING:
     from tune_jobs.cluster import Connection
@@ -53,29 +53,6 @@ class SweepResult:
         if self.interrupted:
             return 130
         return 3 if any(trial.status == "failed" for trial in self.trials) else 0
-
-
-def choose_store(name: str | None, stem: str, storage: Path) -> SweepStore:
-    """The folder of a new sweep, not made yet.
-
-    Args:
-        name: The name that was asked for; None: `stem`, with a number if it is taken.
-        stem: Name of the sweep file or preset.
-        storage: Folder for sweeps.
-
-    Raises:
-        SpecError: The name that was asked for is taken, or is none that a folder can have.
-    """
-    if name is not None:
-        store = SweepStore(storage / check_sweep_name(name))
-        if store.folder.exists():
-            raise name_taken(store.folder)
-        return store
-    # Only the folder's own creation decides who has a name; this finds one that is likely free.
-    number = 1
-    while (storage / (candidate := stem if number == 1 else f"{stem}-{number}")).exists():
-        number += 1
-    return SweepStore(storage / check_sweep_name(candidate))
 
 
 def write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None) -> None:

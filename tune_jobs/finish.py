@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,17 +23,11 @@ from policies.video import record_comparison, record_video
 from tune_jobs.candidates import choose, leave_out, read_trials
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec import SweepSpec
+from tune_jobs.storage import storage_folder
 from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
 
-DEFAULT_STORAGE = "sweeps"
 # The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
 FRESH_SEED = 2**31
-
-
-def storage_folder(storage: str | Path | None) -> Path:
-    """The given folder, else $TUNE_JOBS_STORAGE, else ./sweeps; absolute."""
-    chosen = storage or os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
-    return Path(chosen).expanduser().absolute()
 
 
 def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepStore:

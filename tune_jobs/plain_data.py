@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from policies.errors import SpecError
+from policies.errors import SpecError, shortened
 
 MAX_CHARACTERS = 262_144
 MAX_VALUES = 50_000
@@ -117,12 +117,3 @@ class _Copy:
     def _error(self, path: str, problem: str, hint: str) -> SpecError:
         shown = path if len(path) <= 80 else f"{path[:60]}..."
         return SpecError(f"{self._label}: {shown}{': ' if shown else ''}{problem}", hint)
-
-
-def shortened(value: Any) -> str:
-    """A value's repr, at most 80 characters of it."""
-    try:
-        text = repr(value)
-    except Exception:  # noqa: BLE001 - an object of a user's own may raise anything
-        return "a value"
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError, NotFoundError
-from tune_jobs.spec import describe, dotted
+from tune_jobs.spec_problems import details_of, dotted, explain
 
 _RecordT = TypeVar("_RecordT", bound=BaseModel)
 
@@ -109,7 +109,6 @@ def parse_record(data: dict[str, Any], path: Path, kind: type[_RecordT], what: s
 
 def problems_in(error: ValidationError) -> str:
     """The first field that is wrong, why, and how many more there are."""
-    first, *others = error.errors(include_url=False)
-    place = dotted(first["loc"])
-    text = f"{place} is missing." if first["type"] == "missing" else f"{place} {describe(first['msg'], first['input'])}"
+    first, *others = details_of(error)
+    text = f"{dotted(first['loc'])} {explain(first)}."
     return text.strip()[:300] + (f" (and {len(others)} more)" if others else "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, RandomHyperparams
 from tune_jobs.mutation import FIXED_IN_A_POPULATION
 from tune_jobs.search_space import Grid, num_points
@@ -32,6 +33,21 @@ def search_problems(spec: SweepSpec) -> Found:
         text = f"is for pbt alone, and scheduler.type is {spec.scheduler.type}: take out one, or set the other"
         found.append(("scheduler.perturb_every_env_steps", text))
     return found
+
+
+def check_extendable(spec: SweepSpec) -> None:
+    """Check that more samples are other points than those there are.
+
+    Raises:
+        SpecError: The space has nothing random to draw, and no search method or scheduler chooses values.
+    """
+    chosen = spec.search.type != "random" or spec.scheduler.type == "pbt"
+    if not chosen and not any(domain.is_random for domain in spec.space.values()):
+        why = "its space has grids alone" if spec.space else "it has no space"
+        raise SpecError(
+            f"The sweep cannot be extended: {why}, so more samples would be the same points again.",
+            "Launch a new sweep: with a larger seeds_per_point for more seeds, with more grid values for more points.",
+        )
 
 
 def _learns(spec: SweepSpec) -> bool:

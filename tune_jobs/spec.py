@@ -161,7 +161,7 @@ class SweepSpec(_Section):
     name: str | None = Field(
         None,
         pattern=f"^{_NAME_PATTERN}$",
-        description="Name of the sweep and of its folder; null: made from the file's name and the time.",
+        description="Name of the sweep and of its folder; null: the file's or preset's, with a number if it is taken.",
     )
     env: Annotated[EnvSpec, _from_text("id")] = Field(description="Gymnasium id, or a mapping of id and args.")
     algorithm: Algorithm = Field(description="ppo or dqn; or a baseline that does not learn: random or constant.")

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from policies.errors import SpecError
+from policies.arguments import checked
+from policies.errors import SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tune_jobs.plain_data import MAX_CHARACTERS, shortened, to_plain
+from tune_jobs.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.search_space import Domain
 from tune_jobs.spec import NAME_RULE, SweepSpec, hyperparam_problems
 from tune_jobs.spec_problems import Problem, ProblemsError, details_of, did_you_mean, dotted, explain
@@ -95,6 +96,7 @@ def find_preset(name: str) -> Preset:
     return presets[name]
 
 
+@checked
 def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> SweepSpec:
     """Read and validate a sweep.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from tune_jobs.plain_data import shortened
+from policies.errors import shortened
 
 
 class Problem(NamedTuple):

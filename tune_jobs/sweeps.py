@@ -12,34 +12,37 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from analysis.records import BestRecord, EvaluationRecord, SweepRecord, TrialRecord
+from analysis.records import BestRecord, EvaluationRecord, SweepRecord
+from policies.arguments import NumEpisodes, PositiveInt, Seed, checked
 from policies.env_modules import allow_modules
-from policies.errors import SpecError
 from tune_jobs.driving import (
     SweepResult,
     check_same_trials,
-    choose_store,
     connected,
     pending_record,
     run_sweep,
     write_new,
 )
-from tune_jobs.machine import Machine, local_machine
+from tune_jobs.machine import local_machine
 from tune_jobs.own_code import Source, load_source
 from tune_jobs.plan import make_plan
+from tune_jobs.results import dataframe, report, trials
+from tune_jobs.search_checks import check_extendable
 from tune_jobs.spec import SweepSpec
+from tune_jobs.storage import choose_store, create_store, stem_of, storage_folder
 from tune_jobs.store import SweepStore, list_sweep_stores
 
 if TYPE_CHECKING:
-    import pandas as pd
     from ray.rllib.algorithms.algorithm import Algorithm
 
 __all__ = [
-    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "machine",
+    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps",
     "report", "restore", "resume", "status", "stop", "trials", "video",
 ]  # fmt: skip
+
+Progress = Literal["auto", "none"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class SweepStatus:
     """Whether a process runs it now."""
 
 
+@checked
 def launch(
     source: Source,
     *,
@@ -61,7 +65,7 @@ def launch(
     storage: str | Path | None = None,
     address: str | None = None,
     finish: bool = True,
-    progress: str = "auto",
+    progress: Progress = "auto",
     rl_module: type[Any] | str | None = None,
 ) -> SweepResult:
     """Run a new sweep to its end.
@@ -84,11 +88,9 @@ def launch(
         SpecError: The sweep is wrong, or its name is taken. Nothing was written.
         CannotRunError: It cannot run here. Nothing was written.
     """
-    from tune_jobs.finish import storage_folder
-
     spec = load_source(source, overrides, rl_module)
-    stem = Path(source).stem if isinstance(source, str | Path) else "sweep"
-    store = choose_store(name if name is not None else spec.name, stem, storage_folder(storage))
+    names = (name if name is not None else spec.name, stem_of(source), storage_folder(storage))
+    choose_store(*names)
     # Here and not only on the cluster's machine, so that a bad env or point is known before Ray starts.
     machine = local_machine() if address is None else None
     plan = make_plan(spec, machine) if machine is not None else None
@@ -96,7 +98,7 @@ def launch(
         if plan is None:
             connection = stack.enter_context(connected(address, None))
             plan = make_plan(spec, connection.machine)
-        store.create()
+        store = create_store(*names)
         try:
             stack.enter_context(store.lock())
             if address is not None:
@@ -111,13 +113,14 @@ def launch(
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
+@checked
 def resume(
     sweep: str | Path,
     *,
     storage: str | Path | None = None,
     address: str | None = None,
     finish: bool = True,
-    progress: str = "auto",
+    progress: Progress = "auto",
     retry_failed: bool = False,
 ) -> SweepResult:
     """Run what is missing of a sweep: trials that had begun go on from their latest checkpoints.
@@ -137,14 +140,15 @@ def resume(
     return _go_on(sweep, storage, address, 0, finish=finish, progress=progress, retry_failed=retry_failed)
 
 
+@checked
 def extend(
     sweep: str | Path,
-    num_samples: int,
+    num_samples: PositiveInt,
     *,
     storage: str | Path | None = None,
     address: str | None = None,
     finish: bool = True,
-    progress: str = "auto",
+    progress: Progress = "auto",
 ) -> SweepResult:
     """Add samples to a sweep and run them (and whatever else is missing).
 
@@ -161,8 +165,6 @@ def extend(
         NotFoundError: No such sweep.
         CannotRunError: It is being run by another process, or cannot run here.
     """
-    if num_samples < 1:
-        raise SpecError(f"num_samples is {num_samples}.", "Add at least 1 sample.")
     return _go_on(sweep, storage, address, num_samples, finish=finish, progress=progress, retry_failed=False)
 
 
@@ -173,7 +175,7 @@ def _go_on(
     num_samples: int,
     *,
     finish: bool,
-    progress: str,
+    progress: Progress,
     retry_failed: bool,
 ) -> SweepResult:
     from tune_jobs.finish import find_sweep
@@ -184,6 +186,8 @@ def _go_on(
         record = store.read_record()
         allow_modules(record.allowed_modules)
         spec = SweepSpec.model_validate(record.spec)
+        if num_samples:
+            check_extendable(spec)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
         machine = local_machine() if address is None else None
         if machine is None:
@@ -204,6 +208,7 @@ def _go_on(
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
+@checked
 def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
     """Ask the process that runs a sweep to stop; its running trials save a checkpoint first.
 
@@ -219,6 +224,7 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
     return True
 
 
+@checked
 def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStatus:
     """How a sweep stands.
 
@@ -230,10 +236,9 @@ def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStat
     return _status(find_sweep(sweep, storage))
 
 
+@checked
 def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
     """How every sweep in a storage folder stands, by name."""
-    from tune_jobs.finish import storage_folder
-
     return [_status(store) for store in list_sweep_stores(storage_folder(storage))]
 
 
@@ -247,33 +252,8 @@ def _status(store: SweepStore) -> SweepStatus:
     return SweepStatus(record, {name: number for name, number in counts.items() if number}, alive)
 
 
-def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[TrialRecord]:
-    """A sweep's trials, by index.
-
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from tune_jobs.candidates import read_trials
-    from tune_jobs.finish import find_sweep
-
-    return read_trials(find_sweep(sweep, storage))
-
-
-def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.DataFrame:
-    """A sweep's trials as a pandas DataFrame, one row a trial.
-
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from analysis.tables import trials_frame
-    from tune_jobs.candidates import read_trials
-    from tune_jobs.finish import find_sweep, read_results
-
-    store = find_sweep(sweep, storage)
-    return trials_frame(read_trials(store), read_results(store))
-
-
-def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: int = 100) -> BestRecord:
+@checked
+def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: NumEpisodes = 100) -> BestRecord:
     """Choose a sweep's winner, confirm it on fresh seeds, and copy its policy to best/.
 
     Raises:
@@ -284,12 +264,13 @@ def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: 
     return choose_best(find_sweep(sweep, storage), num_episodes)
 
 
+@checked
 def evaluate(
     source: str | Path,
     *,
     storage: str | Path | None = None,
-    num_episodes: int = 100,
-    first_seed: int | None = None,
+    num_episodes: NumEpisodes = 100,
+    first_seed: Seed | None = None,
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
 ) -> tuple[EvaluationRecord, EvaluationRecord]:
@@ -311,8 +292,6 @@ def evaluate(
     """
     from tune_jobs import finish
 
-    if num_episodes < 1:
-        raise SpecError(f"num_episodes is {num_episodes}.", "Ask for at least 1 episode.")
     found = finish.find_policy(source, storage, env_id, action)
     first = finish.FRESH_SEED if first_seed is None else first_seed
     seeds = tuple(range(first, first + num_episodes))
@@ -321,12 +300,13 @@ def evaluate(
     return record, finish.run_evaluation(baseline, found.env_id, found.env_args, seeds)
 
 
+@checked
 def video(
     source: str | Path,
     *,
     storage: str | Path | None = None,
     output: str | Path | None = None,
-    seed: int | None = None,
+    seed: Seed | None = None,
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
 ) -> dict[str, Path]:
@@ -358,17 +338,7 @@ def video(
     return finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed)
 
 
-def report(sweep: str | Path, *, storage: str | Path | None = None) -> Path:
-    """Write a sweep's report; returns its index.html.
-
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from tune_jobs.finish import find_sweep, make_report
-
-    return make_report(find_sweep(sweep, storage))
-
-
+@checked
 def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorithm:
     """Restore a checkpoint as an RLlib `Algorithm` that can train on.
 
@@ -390,13 +360,3 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
 
     is_packed = (folder / "packed").is_dir()
     return algorithm_from_checkpoint(folder) if is_packed else restore.restore_algorithm(folder / "rllib", network)
-
-
-def machine(address: str) -> Machine:
-    """What a Ray cluster has to run on.
-
-    Raises:
-        CannotRunError: Nothing answers at the address.
-    """
-    with connected(address, None) as connection:
-        return connection.machine

@@ -1,14 +1,17 @@
 """The command line: dry runs and bad input by the real validation, presets, schema, and what is imported when."""
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
 
 from tune_jobs.cli import cli
+from tune_jobs.machine import Machine
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
@@ -78,20 +81,75 @@ def test_a_dry_run_says_what_is_not_packed_and_why(run):
     assert "note:" not in output
 
 
-def test_a_dry_run_says_that_memory_makes_packs_smaller(run, sweeps):
-    from tune_jobs.machine import Machine
+@pytest.fixture
+def cluster(monkeypatch):
+    """A stand-in for a cluster, whose machine is `.machine`; `.checked` are the folders its nodes were asked for."""
+    found = types.SimpleNamespace(machine=None, checked=[])
+    joined = contextlib.nullcontext(found)
+    monkeypatch.setattr("tune_jobs.dry_run.connected", lambda address, here: joined)
+    monkeypatch.setattr("tune_jobs.dry_run._check_nodes", lambda folder: found.checked.append(folder.is_dir()))
+    return found
 
-    sweeps.machine = lambda address: Machine(7, source=f"the cluster at {address}", memory_bytes=2e7)
+
+def test_a_dry_run_says_that_memory_makes_packs_smaller(run, cluster):
+    cluster.machine = Machine(7, source="the cluster at auto", memory_bytes=2e7)
     output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
     assert "note: Packs are planned smaller: 7 x 3 trials at once may take" in output
 
 
-def test_a_dry_run_for_a_cluster_plans_for_the_clusters_machine(run, sweeps):
-    from tune_jobs.machine import Machine
-
-    sweeps.machine = lambda address: Machine(7, source=f"the cluster at {address}")
+def test_a_dry_run_for_a_cluster_plans_for_the_clusters_machine(run, cluster, tmp_path):
+    cluster.machine = Machine(7, source="the cluster at auto")
     output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
     assert "20 in 7 packs of up to 3, each pack on 1 CPU; the cluster at auto has 7 CPUs" in output
+    assert cluster.checked == [True]
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- a dry run refuses what a launch does, in the same words
+
+
+REFUSED = {
+    "a file name with a space": ("my sweep.yaml", ["would be called 'my sweep', after its file", "--name"]),
+    "a file name of other letters": ("übung.yaml", ["would be called 'übung'", "--name"]),
+    "a name that is taken": ("x.yaml --name taken", ["A sweep 'taken' is already in"]),
+    "a name in the file that is taken": ("named.yaml", ["A sweep 'taken' is already in"]),
+    "a name of a wrong form": ("x.yaml --name a/b", ["The sweep name 'a/b' is not allowed"]),
+    "storage that is a file": ("x.yaml --storage x.yaml", ["cannot be written: File exists"]),
+    "storage below a file": ("x.yaml --storage x.yaml/a/b", ["cannot be written: Not a directory"]),
+    "storage that nobody writes": ("x.yaml --storage /proc/nothing", ["/proc/nothing cannot be written"]),
+    "an address that is none": ("x.yaml --address here", ["here"]),
+    "an address where nothing listens": ("x.yaml --address 127.0.0.1:9", ["127.0.0.1:9"]),
+    "an empty storage": ("x.yaml --storage=", ["storage is ''"]),
+    "an empty name": ("x.yaml --name=", ["name"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
+def test_a_dry_run_refuses_what_a_launch_refuses(run, tmp_path, case):
+    arguments, parts = case
+    for name in ("my sweep.yaml", "übung.yaml", "x.yaml"):
+        Path(name).write_text(SMALL)
+    Path("named.yaml").write_text(SMALL + "name: taken\n")
+    Path("sweeps/taken").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    source, _, options = arguments.partition(".yaml")
+    command = ("launch", f"{source}.yaml", *options.split())
+    launched, planned = run(*command), run(*command, "--dry-run")
+    assert launched.exit_code == planned.exit_code
+    assert launched.exit_code in (2, 5)
+    assert launched.stderr == planned.stderr
+    for part in parts:
+        assert part in planned.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_dry_run_leaves_storage_as_it_was(run, tmp_path):
+    Path("x.yaml").write_text(SMALL)
+    assert run("launch", "x.yaml", "--dry-run", "--storage", "a/b").exit_code == 0
+    Path("sweeps/x").mkdir(parents=True)
+    # The automatic name is taken; a launch takes the next.
+    assert run("launch", "x.yaml", "--dry-run").exit_code == 0
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["sweeps", "x", "x.yaml"]
 
 
 BAD_INPUT = {

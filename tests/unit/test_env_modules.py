@@ -105,7 +105,7 @@ def test_a_submodule_alone_brings_no_other(own):
         import_allowed("own_package.inner:THING")
 
 
-@pytest.mark.parametrize("name", ["own_walks.py", "own walks", "", "a..b", "a:b", "1a", ".a", "a/b", 3])
+@pytest.mark.parametrize("name", ["own_walks.py", "own walks", "", "a..b", "a:b", "1a", ".a", "a/b"])
 def test_what_is_no_modules_name_cannot_be_allowed(own, name):
     with pytest.raises(SpecError, match="not the name of a Python module"):
         allow_modules(["own_walks", name])

@@ -1,0 +1,166 @@
+"""The arguments of public functions, checked against their annotations before anything is done with them.
+
+What a caller gave wrong is told at once, by its name, instead of failing somewhere below. NumPy's numbers become
+Python's, and paths of any library pathlib's.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import numbers
+import os
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from policies.errors import SpecError, shortened
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_WRONG = object()
+_LONGEST_NAME, _LONGEST_PATH = 255, 4096
+
+
+class Range(NamedTuple):
+    """Of a whole number, both ends included; for use in `Annotated`."""
+
+    low: int
+    high: int | None = None
+
+
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+PositiveInt = Annotated[int, Range(1)]
+NumEpisodes = Annotated[int, Range(1, 2**18)]
+
+
+def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function: its arguments are checked against its annotations.
+
+    Raises:
+        SpecError: By the function, when an argument is of a kind that it does not take.
+    """
+    signature = inspect.signature(function)
+
+    @functools.cache
+    def kinds() -> dict[str, Any]:
+        # Without what is returned: that may be named for type checkers alone.
+        given = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
+        holder = types.SimpleNamespace(__annotations__=given)
+        return get_type_hints(holder, globalns=function.__globals__, include_extras=True)
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        bound = signature.bind(*args, **kwargs)
+        for name, value in bound.arguments.items():
+            fitted = _fit(value, kinds()[name])
+            if fitted is _WRONG:
+                raise SpecError(f"The argument {name} is {shortened(value)}.", f"Give {_words(kinds()[name])}.")
+            bound.arguments[name] = fitted
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+def _fit(value: Any, kind: Any) -> Any:
+    """The value as the kind, or `_WRONG`."""
+    origin = get_origin(kind)
+    if origin in (Union, types.UnionType):
+        return _fit_one_of(value, get_args(kind))
+    if origin is Literal:
+        return value if isinstance(value, str) and value in get_args(kind) else _WRONG
+    if origin is Annotated:
+        return _fit_range(value, *get_args(kind))
+    if origin in (Sequence, Iterable):
+        return _fit_items(value, origin, get_args(kind)[0])
+    if kind in _FITS:
+        return _FITS[kind](value)
+    return value if kind is Any or isinstance(value, origin or kind) else _WRONG
+
+
+def _fit_one_of(value: Any, kinds: tuple[Any, ...]) -> Any:
+    if isinstance(value, str) and Path in kinds and not _can_be_path(value):
+        return _WRONG
+    return next((fitted for kind in kinds if (fitted := _fit(value, kind)) is not _WRONG), _WRONG)
+
+
+def _fit_range(value: Any, kind: Any, limits: Range) -> Any:
+    number = _fit(value, kind)
+    inside = number is not _WRONG and limits.low <= number and (limits.high is None or number <= limits.high)
+    return number if inside else _WRONG
+
+
+def _fit_items(value: Any, container: Any, kind: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    # A text is a sequence of its letters, which nobody means.
+    if isinstance(value, str | bytes | bytearray | Mapping) or not isinstance(value, container):
+        return _WRONG
+    items = tuple(_fit(item, kind) for item in value)
+    return _WRONG if any(item is _WRONG for item in items) else items
+
+
+def _text(value: Any) -> Any:
+    return str(value) if isinstance(value, str) else _WRONG
+
+
+def _path(value: Any) -> Any:
+    if not isinstance(value, os.PathLike):
+        return _WRONG
+    text = os.fspath(value)
+    return Path(text) if isinstance(text, str) and _can_be_path(text) else _WRONG
+
+
+def _can_be_path(text: str) -> bool:
+    """Whether the system can be asked for a file of that name."""
+    try:
+        data = os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+    longest = max(map(len, data.split(b"/")))
+    return bool(data) and b"\0" not in data and longest <= _LONGEST_NAME and len(data) < _LONGEST_PATH
+
+
+def _flag(value: Any) -> Any:
+    return bool(value) if isinstance(value, bool | np.bool_) else _WRONG
+
+
+def _scalar(value: Any) -> Any:
+    return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+
+
+def _whole(value: Any) -> Any:
+    value = _scalar(value)
+    return int(value) if isinstance(value, numbers.Integral) and not isinstance(value, bool) else _WRONG
+
+
+def _number(value: Any) -> Any:
+    value = _scalar(value)
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return float(value) if is_number and math.isfinite(value) else _WRONG
+
+
+_FITS: dict[Any, Callable[[Any], Any]] = {str: _text, Path: _path, bool: _flag, int: _whole, float: _number}
+_NAMES = {
+    str: "a text", Path: "a path", bool: "True or False", int: "a whole number", float: "a number",
+    type(None): "None", Mapping: "a mapping", type: "a class",
+}  # fmt: skip
+
+
+def _words(kind: Any) -> str:
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_words, parts))
+    if origin is Literal:
+        return " or ".join(map(repr, parts))
+    if origin is Annotated:
+        low, high = parts[1]
+        return f"a whole number from {low:,} to {high:,}" if high is not None else f"a whole number of at least {low:,}"
+    if origin in (Sequence, Iterable):
+        return f"a list, each of its items {_words(parts[0])}"
+    known = origin or kind
+    return _NAMES.get(known, f"a {getattr(known, '__name__', known)}")

@@ -1,0 +1,154 @@
+"""The Python API answers a wrong argument, whichever it is, by its name and with what it takes."""
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+from spec_errors import MINIMAL
+
+import tune_jobs
+from policies.arguments import NumEpisodes, Seed, checked
+from policies.errors import SpecError, TuneJobsError
+
+FUNCTIONS = {name: thing for name in tune_jobs._HOME if inspect.isfunction(thing := getattr(tune_jobs, name))}
+
+# -- what each argument takes, by kinds of values
+
+VALUES = {
+    "none": [None],
+    "flag": [True, False, np.bool_(True)],
+    "whole": [3, np.int64(3), np.array(3)],
+    "zero": [0],
+    "negative": [-1, np.int32(-1)],
+    "huge": [2**40],
+    "fraction": [1.5, np.float32(0.5)],
+    "not finite": [float("nan"), float("inf"), np.nan],
+    "empty text": [""],
+    "text": ["x", "loud"],
+    "no path": ["x\0y", "x" * 5_000, "a/" * 5_000],
+    "path": [Path("x")],
+    "bytes": [b"x", bytearray(b"x")],
+    "object": [object(), len, lambda: None, Ellipsis, 1j],
+    "class": [int],
+    "empty list": [[], ()],
+    "numbers": [[1, 2.5], (3,), np.array([0.5])],
+    "texts": [["a=1"], ("a", "b")],
+    "mixed": [["a", 3], [None], [object()], [[1]], [b"x"]],
+    "empty mapping": [{}],
+    "mapping": [{"x": 1}],
+    "set": [{"x"}],
+}
+PATH = {"text", "path"}
+TAKES = {
+    "source": PATH,
+    "sweep": PATH,
+    "path": PATH,
+    "storage": PATH | {"none"},
+    "output": PATH | {"none"},
+    # Any text is a name, an address or an id as far as its kind goes.
+    "name": {"text", "none", "empty text", "no path"},
+    "address": {"text", "none", "empty text", "no path"},
+    "env_id": {"text", "none", "empty text", "no path"},
+    "rl_module": {"text", "none", "empty text", "no path", "class"},
+    "overrides": {"texts", "empty list"},
+    "names": {"texts", "empty list", "set"},
+    "progress": set(),
+    "finish": {"flag"},
+    "retry_failed": {"flag"},
+    "num_samples": {"whole", "huge"},
+    "num_episodes": {"whole"},
+    "first_seed": {"whole", "zero", "none"},
+    "seed": {"whole", "zero", "none"},
+    "action": {"whole", "zero", "negative", "huge", "numbers", "empty list", "none"},
+}
+MORE = {("launch", "source"): {"mapping", "empty mapping"}, ("load_spec", "source"): {"mapping", "empty mapping"}}
+CASES = [
+    (name, argument) for name, function in FUNCTIONS.items() for argument in inspect.signature(function).parameters
+]
+
+
+def call(name, argument, value):
+    function = FUNCTIONS[name]
+    given = {key: "nothing" for key, one in inspect.signature(function).parameters.items() if one.default is one.empty}
+    given |= {"num_samples": 1} if "num_samples" in given else {}
+    return function(**{**given, argument: value})
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """An empty folder, in which no sweep is found."""
+    monkeypatch.chdir(tmp_path)
+
+
+def test_the_whole_api_is_looked_at():
+    assert len(FUNCTIONS) == 17
+    assert {argument for _, argument in CASES} == set(TAKES)
+
+
+@pytest.mark.parametrize(("name", "argument"), CASES)
+def test_a_value_of_a_wrong_kind_is_refused_by_the_arguments_name(name, argument):
+    taken = TAKES[argument] | MORE.get((name, argument), set())
+    wrong = [value for kind, values in VALUES.items() if kind not in taken for value in values]
+    for value in wrong:
+        with pytest.raises(SpecError) as caught:
+            call(name, argument, value)
+        assert caught.value.message.startswith(f"The argument {argument} is "), value
+        assert caught.value.hint.startswith("Give ")
+
+
+@pytest.mark.parametrize(("name", "argument"), CASES)
+def test_a_value_of_the_right_kind_gives_at_most_an_error_of_ours(name, argument):
+    taken = TAKES[argument] | MORE.get((name, argument), set())
+    for kind in sorted(taken - {"class"}):
+        for value in VALUES[kind]:
+            try:
+                call(name, argument, value)
+            except TuneJobsError as error:
+                assert not error.message.startswith("The argument"), value  # noqa: PT017 - any error of ours is right
+
+
+def test_what_is_given_wrong_often_is_told_in_words():
+    with pytest.raises(SpecError) as caught:
+        tune_jobs.launch(MINIMAL, progress="loud")
+    assert str(caught.value) == "The argument progress is 'loud'.\nGive 'auto' or 'none'."
+    with pytest.raises(SpecError) as caught:
+        tune_jobs.allow_modules("my_envs")
+    assert str(caught.value) == "The argument names is 'my_envs'.\nGive a list, each of its items a text."
+    with pytest.raises(SpecError) as caught:
+        tune_jobs.best("x", num_episodes=0)
+    assert str(caught.value) == "The argument num_episodes is 0.\nGive a whole number from 1 to 262,144."
+    with pytest.raises(SpecError) as caught:
+        tune_jobs.launch(3)
+    assert caught.value.hint == "Give a text or a path or a mapping or a SweepSpec."
+    with pytest.raises(SpecError, match="overrides is 'a=1'"):
+        tune_jobs.load_spec(MINIMAL, "a=1")
+
+
+# -- the decorator
+
+
+@checked
+def example(count: NumEpisodes, seed: Seed | None = None, *, items: "list[int] | None" = None, flag: bool = False):
+    return count, seed, items, flag
+
+
+def test_numpys_numbers_arrive_as_pythons():
+    given = example(np.int64(3), np.uint8(4), flag=np.bool_(True))
+    assert given == (3, 4, None, True)
+    assert [type(value) for value in given] == [int, int, type(None), bool]
+
+
+def test_a_checked_function_keeps_its_signature_and_pythons_own_errors():
+    assert list(inspect.signature(example).parameters) == ["count", "seed", "items", "flag"]
+    with pytest.raises(TypeError, match="count"):
+        example()
+    with pytest.raises(TypeError, match="colour"):
+        example(1, colour=2)
+
+
+def test_numpys_numbers_are_taken_by_the_api(tmp_path):
+    with pytest.raises(TuneJobsError, match="No sweep"):
+        tune_jobs.extend("x", np.int64(3), finish=np.bool_(False))
+    first, _ = tune_jobs.evaluate("random", env_id="CartPole-v1", num_episodes=np.int64(2), first_seed=np.array(5))
+    assert first.seeds == (5, 6)

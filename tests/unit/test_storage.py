@@ -1,0 +1,66 @@
+"""Which folder a new sweep gets, also when several begin at once; which sweeps can be extended."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from spec_errors import MINIMAL
+
+from policies.errors import SpecError
+from tune_jobs import sweeps
+from tune_jobs.driving import write_new
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec_file import load_spec
+from tune_jobs.storage import create_store, storage_folder
+
+
+def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path):
+    number = 16
+    barrier = threading.Barrier(number)
+
+    def begin(_):
+        barrier.wait()
+        return create_store(None, "mine", tmp_path).name
+
+    with ThreadPoolExecutor(number) as pool:
+        names = set(pool.map(begin, range(number)))
+    assert names == {"mine", *(f"mine-{index}" for index in range(2, number + 1))}
+
+
+def test_an_automatic_name_that_is_taken_meanwhile_gives_way_to_the_next(tmp_path, monkeypatch):
+    from tune_jobs import storage
+
+    def choose(name, stem, folder, real=storage.choose_store):
+        store = real(name, stem, folder)
+        if store.name == "mine":
+            # Another process makes it between the look and the making.
+            store.folder.mkdir()
+        return store
+
+    monkeypatch.setattr(storage, "choose_store", choose)
+    assert create_store(None, "mine", tmp_path).name == "mine-2"
+    with pytest.raises(SpecError, match="already in"):
+        create_store("mine", "x", tmp_path)
+
+
+def test_storage_is_what_is_given_else_the_environments_else_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
+    assert storage_folder(None) == tmp_path / "sweeps"
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "theirs")
+    assert storage_folder(None) == tmp_path / "theirs"
+    assert storage_folder("mine") == tmp_path / "mine"
+
+
+@pytest.mark.parametrize(
+    ("space", "why"), [({}, "it has no space"), ({"lr": {"grid": [0.1, 0.2]}}, "its space has grids alone")]
+)
+def test_a_sweep_of_the_same_points_again_is_not_extended(tmp_path, space, why):
+    spec = load_spec({**MINIMAL, "space": space})
+    store = create_store("mine", "x", tmp_path)
+    write_new(store, spec, make_plan(spec, Machine(1)), None)
+    before = {path: path.read_bytes() for path in store.folder.rglob("*.json")}
+    with pytest.raises(SpecError, match=f"cannot be extended: {why}.*\n.*seeds_per_point"):
+        sweeps.extend("mine", 1, storage=tmp_path)
+    assert {path: path.read_bytes() for path in store.folder.rglob("*.json")} == before

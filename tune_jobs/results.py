@@ -1,0 +1,52 @@
+"""What a sweep came to: its trials as records and as a table, and its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from analysis.records import TrialRecord
+from policies.arguments import checked
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@checked
+def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[TrialRecord]:
+    """A sweep's trials, by index.
+
+    Raises:
+        NotFoundError: No such sweep.
+    """
+    from tune_jobs.candidates import read_trials
+    from tune_jobs.finish import find_sweep
+
+    return read_trials(find_sweep(sweep, storage))
+
+
+@checked
+def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.DataFrame:
+    """A sweep's trials as a pandas DataFrame, one row a trial.
+
+    Raises:
+        NotFoundError: No such sweep.
+    """
+    from analysis.tables import trials_frame
+    from tune_jobs.candidates import read_trials
+    from tune_jobs.finish import find_sweep, read_results
+
+    store = find_sweep(sweep, storage)
+    return trials_frame(read_trials(store), read_results(store))
+
+
+@checked
+def report(sweep: str | Path, *, storage: str | Path | None = None) -> Path:
+    """Write a sweep's report; returns its index.html.
+
+    Raises:
+        NotFoundError: No such sweep.
+    """
+    from tune_jobs.finish import find_sweep, make_report
+
+    return make_report(find_sweep(sweep, storage))
