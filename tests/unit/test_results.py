@@ -1,5 +1,7 @@
 """What a sweep came to, read from its folder."""
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 from synthetic_sweep import make_sweep
@@ -52,3 +54,27 @@ def test_without_a_threshold_the_stop_rules_return_counts(make_store, tmp_path):
     stop = {"training_return": 195}
     store.write_record(synthetic.sweep.model_copy(update={"spec": {**synthetic.sweep.spec, "stop": stop}}))
     assert tune_jobs.dataframe(store.folder)["num_env_steps_to_solve"].notna().any()
+
+
+@pytest.mark.parametrize(
+    ("output", "expected"),
+    [
+        (None, "random-CartPole-v1"),
+        ("there", "there/random-CartPole-v1"),
+        (Path("there"), "there/random-CartPole-v1"),
+        ("new/", "new/random-CartPole-v1"),
+        ("film", "film"),
+        ("film.mp4", "film"),
+        ("film.GIF", "film"),
+        ("cartpole-v0.5", "cartpole-v0.5"),
+        ("new/film.gif", "new/film"),
+    ],
+)
+def test_a_film_goes_where_output_says(tmp_path, monkeypatch, output, expected):
+    monkeypatch.chdir(tmp_path)
+    Path("there").mkdir()
+    asked = []
+    monkeypatch.setattr("tune_jobs.finish.make_video", lambda policy, path, *more: asked.append(path) or {})
+    tune_jobs.video("random", env_id="CartPole-v1", output=output)
+    # Either ending gives both files.
+    assert [path.with_suffix("") for path in asked] == [Path(expected)]
