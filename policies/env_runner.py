@@ -30,6 +30,7 @@ from policies.action_bounds import ToBounds
 from policies.env_modules import allow_modules
 from policies.env_wrappers import FailurePenalty
 from policies.envs import ALLOWED_MODULES, FAILURE_PENALTY, make_vector_env
+from policies.parents import end_with_parent
 from policies.replay import NStep, Transitions
 from policies.spaces import observation_dtype
 
@@ -85,6 +86,9 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._seed_override: int | None = None
         self._just_ended: NDArray[np.bool_] | None = None
         self._n_step: NStep | None = None
+        if kwargs.get("worker_index", 0):
+            # A process of its own: it must not outlive the Ray that started it, whatever its env does.
+            end_with_parent()
         super().__init__(**kwargs)
 
     def pop_finished_episodes(self) -> list[tuple[float, int]]:
