@@ -1,7 +1,7 @@
 """What can be read of a `results.jsonl`, and what can't.
 
-A process that is killed while it writes leaves half a line at the end. Elsewhere a line that can't be read is damage, of
-the disk, an editor, or two processes that wrote at once. One such line must not cost the others: who reads leaves it
+A process that is killed while it writes leaves half a line at the end. Elsewhere a line that can't be read is damage:
+of the disk, an editor, or two processes that wrote at once. One such line must not cost the others: who reads leaves it
 out and says so; who goes on with the trial moves it to a file of its own, `results.damaged`.
 """
 
