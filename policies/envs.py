@@ -21,6 +21,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from policies.env_faults import close_env, is_of_env
 from policies.env_ids import find_env, normalize_env_id
 from policies.env_wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError
@@ -114,7 +115,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         _check_action_space(info, algorithm)
         _check_reset(env, info)
     finally:
-        env.close()  # type: ignore[no-untyped-call]
+        close_env(env)
     return info
 
 
@@ -144,7 +145,7 @@ def make_env(
     try:
         # The passive checker only prints warnings, at each env made, and slows every step.
         return wrappers.wrap(gym.make(spec, disable_env_checker=True, **kwargs))
-    except Exception as error:  # an env's constructor may raise anything
+    except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
 
 
@@ -183,7 +184,7 @@ def make_vector_env(
                 wrappers=(wrappers.wrap_pixels,), **kwargs,
             )  # fmt: skip
         env = wrappers.wrap_vector(env)
-    except Exception as error:  # an env's constructor may raise anything
+    except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
     if failure_penalty is None:
         return env
@@ -219,7 +220,7 @@ def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
     if isinstance(spec.entry_point, str):
         try:
             creator: Callable[..., Any] = load_env_creator(spec.entry_point)
-        except Exception as error:  # importing an env's module may raise anything
+        except BaseException as error:  # importing an env's module may raise anything
             raise _cannot_make(env_id, {}, error) from error
         return creator
     return spec.entry_point
@@ -277,7 +278,9 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
     return True
 
 
-def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: Exception) -> EnvError:
+def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:
+    if not is_of_env(error):
+        raise error
     if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
         return error
     detail = str(error).strip().rstrip(".") or "no message"

@@ -14,6 +14,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from ray import tune
 
+from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
 from policies.evaluate import Evaluator
 from tune_jobs.engines.protocol import PackEngine
@@ -59,6 +60,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         run = owner_of_run(config)
         self._owner = Owner.take(self._files.owner_path, run)
         end_with_driver(config, self._owner)
+        note_signals()
         self._log = TrialLog()
         self._file: IO[bytes] = self._log.open(self._files.log_path)
         self._files.begin_log()

@@ -22,6 +22,7 @@ import ray
 from ray import tune
 
 from policies.baselines import BASELINES
+from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
 from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
@@ -181,6 +182,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the trial; it is built in the first step, so that every error comes from there."""
+        note_signals()
         self._log = TrialLog()
         self._engine: TrainingEngine | None = None
         self._evaluators: dict[str, Evaluator] = {}

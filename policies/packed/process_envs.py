@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from policies.child_processes import entry
+from policies.env_faults import note_signals
 from policies.env_modules import allow_modules, allowed_modules
 from policies.errors import EnvError
 from policies.packed.sub_envs import HostDiedError, SubEnvs
@@ -97,6 +98,7 @@ def serve(
     end_with_parent(parent=pid, by_kernel=by_kernel)
     # Ctrl-C in a terminal reaches this process too; when it ends is the other's to say.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    note_signals()
     allow_modules(modules)
     sub_envs = SubEnvs(env_id, env_args)
     while True:
