@@ -48,6 +48,8 @@ class _Sweep:
     results: Mapping[str, Sequence[IterationRecord]]
     best: BestRecord | None
     goal: float | None
+    why_no_best: tuple[str, str] | None = None
+    """What is wrong, and what to do; None: it is found in the trials."""
 
     @property
     def axis(self) -> str | None:
@@ -85,6 +87,7 @@ def build_report(
     results: Mapping[str, Sequence[IterationRecord]],
     best: BestRecord | None,
     videos: Mapping[str, Path],
+    why_no_best: tuple[str, str] | None = None,
 ) -> Path:
     """Write the report of a sweep into its folder.
 
@@ -95,6 +98,7 @@ def build_report(
         results: Iterations by trial id, oldest first; a trial may have none.
         best: The confirmed winner; None: the report says why there is none.
         videos: Files to embed, by "before", "after" or another name; those that do not exist are left out.
+        why_no_best: Why the winner could not be confirmed, and what to do; None: it is found in the trials.
 
     Returns:
         Path of index.html.
@@ -107,7 +111,7 @@ def build_report(
     write_csv(target / "trials.csv", trials_frame(trials, results, threshold=goal))
     write_csv(target / "iterations.csv", iterations_frame(results))
     write_csv(target / "steps_to_solve.csv", steps_to_solve_frame(trials, results, threshold=goal))
-    source = _Sweep(folder, sweep, trials, results, best, goal)
+    source = _Sweep(folder, sweep, trials, results, best, goal, why_no_best)
     figures = []
     for picture in _pictures(source):
         write_atomic(target / "figures" / f"{picture.stem}.png", to_png(picture.draw(_WIDE)))
@@ -140,7 +144,9 @@ def _content(source: _Sweep) -> dict[str, Any]:
         "goal": goal,
         "headline": report_data.headline(sweep, trials, results, goal),
         "winner": None if best is None else report_data.winner_card(best, trials, sweep, source.folder),
-        "why_no_best": None if best is not None else report_data.why_no_best(trials, source.folder),
+        "why_no_best": None
+        if best is not None
+        else source.why_no_best or report_data.why_no_best(trials, source.folder),
         "sweep_path": wording.shown_path(source.folder),
         "trial_table": report_tables.trial_table(trials, results, goal=goal, best=best),
         "group_table": report_tables.group_table(trials, results, groups, goal=goal),

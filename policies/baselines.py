@@ -53,6 +53,7 @@ class ConstantPolicy(Policy):
         )
         if problem := action_problem(action, own_space):
             raise SpecError(f"The constant action of {env_id}: {problem}.", "Choose one of the actions.")
+        self.action = action
         self._action = np.array(action, dtype=own_space.dtype).reshape(own_space.shape or ())
 
     @classmethod

@@ -8,17 +8,19 @@ package that is allowed brings its submodules.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import importlib.util
 import os
 import re
 import sys
 from collections.abc import Iterable
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from policies.arguments import checked
-from policies.env_faults import is_of_env
 from policies.errors import SpecError
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
@@ -62,21 +64,38 @@ def is_allowed(module: str) -> bool:
 
 
 def module_folders() -> list[str]:
-    """The folders on this process's path that hold the allowed modules it has imported, for other processes' paths."""
+    """The folders on this process's path that hold the allowed modules, for other processes' paths.
+
+    Those that this process has not imported are looked for, not imported.
+    """
     found = []
     for name in allowed_modules():
-        # Of the module itself: two projects may share a package, as a user's own `policies` does with this one.
-        module = sys.modules.get(name) or sys.modules.get(name.partition(".")[0])
-        file = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
-        if module is None or file is None:
+        file, depth = _file_of(name)
+        if file is None:
             continue
         path = Path(file).absolute()
         # Of a package, __file__ is its __init__.py.
         place = path.parent if path.name == "__init__.py" else path
-        folder = str(place.parents[module.__name__.count(".")])
+        folder = str(place.parents[depth])
         if folder in {os.path.abspath(entry) for entry in sys.path}:  # noqa: PTH100 (sys.path holds strings)
             found.append(folder)
     return list(dict.fromkeys(found))
+
+
+def _file_of(name: str) -> tuple[str | None, int]:
+    """The file (or the folder) of a module or of the package that it is in, and how many packages that is in."""
+    top = name.partition(".")[0]
+    # Of the module itself: two projects may share a package, as a user's own `policies` does with this one.
+    module: Any = sys.modules.get(name) or (None if top in _SHARED else sys.modules.get(top))
+    if module is not None:
+        file = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
+        return file, module.__name__.count(".")
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(name) if top in _SHARED else PathFinder.find_spec(top)
+    if spec is None:
+        return None, 0
+    return spec.origin or next(iter(spec.submodule_search_locations or ()), None), spec.name.count(".")
 
 
 def import_module_allowed(module: str) -> ModuleType:
@@ -115,9 +134,7 @@ def import_module_allowed(module: str) -> ModuleType:
             "Run the command in the folder that holds it, or add that folder to PYTHONPATH, on every machine that "
             "runs trials.",
         ) from error
-    except BaseException as error:  # a user's module may raise anything
-        if not is_of_env(error):
-            raise
+    except Exception as error:  # a user's module may raise anything
         raise _failed(module, error) from error
 
 
@@ -126,7 +143,7 @@ def _is_part(missing: str | None, module: str) -> bool:
     return missing is not None and (module == missing or module.startswith(f"{missing}."))
 
 
-def _failed(module: str, error: BaseException) -> SpecError:
+def _failed(module: str, error: Exception) -> SpecError:
     return SpecError(
         f"The module {module!r} cannot be imported: {type(error).__name__}: {error}.",
         f'Try `python -c "import {module}"`, and mend what it says.',

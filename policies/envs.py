@@ -10,6 +10,7 @@ training.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import difflib
 import inspect
@@ -21,11 +22,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from policies.env_faults import close_env, is_of_env
+from policies import calls
+from policies.calls import Call
 from policies.env_ids import find_env, normalize_env_id
 from policies.env_wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError
 from policies.failures import FailureRule, check_failure_penalty, failure_rule
+from policies.first_step import check_first_step
 from policies.hyperparams import Algorithm
 from policies.rendering import draw_without_display
 
@@ -34,6 +37,7 @@ __all__ = [
     "FAILURE_PENALTY",
     "EnvInfo",
     "check_env",
+    "close_env",
     "make_env",
     "make_vector_env",
     "normalize_env_id",
@@ -85,7 +89,7 @@ class EnvInfo:
 
 
 def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algorithm | None = None) -> EnvInfo:
-    """Make and reset an environment once and check that an algorithm can train on it.
+    """Make an environment, reset it and step it once, and check that an algorithm can train on it.
 
     Args:
         env_id: Gymnasium id.
@@ -93,8 +97,8 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         algorithm: Check the action space for this one; None: for any.
 
     Raises:
-        EnvError: The id is not registered, an argument is wrong, the env cannot be made, or its spaces are of
-            a kind that the algorithm cannot take.
+        EnvError: The id is not registered, an argument is wrong, the env cannot be made, its spaces are of a kind
+            that the algorithm cannot take, or what it returns is not what Gymnasium asks for.
     """
     env = make_env(env_id, env_args)
     try:
@@ -113,7 +117,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         )
         _check_observation_space(info)
         _check_action_space(info, algorithm)
-        _check_reset(env, info)
+        check_first_step(env, info.env_id, info.env_args)
     finally:
         close_env(env)
     return info
@@ -132,10 +136,7 @@ def make_env(
     Raises:
         EnvError: The id is not registered, an argument is wrong, or the constructor failed.
     """
-    env_id, spec = find_env(env_id)
-    kwargs = copy.deepcopy(dict(env_args or {}))
-    wrappers = ObservationWrappers.take_from(kwargs)
-    _check_args(env_id, spec, kwargs)
+    env_id, spec, kwargs, wrappers = _find(env_id, env_args)
     if wrappers.pixels:
         if render_mode not in (None, _RGB_ARRAY):
             raise EnvError(f"{env_id} observes pixels, so it cannot have the render mode {render_mode!r}.", "Use none.")
@@ -143,9 +144,11 @@ def make_env(
     if render_mode is not None:
         kwargs["render_mode"] = render_mode
     try:
-        # The passive checker only prints warnings, at each env made, and slows every step.
-        return wrappers.wrap(gym.make(spec, disable_env_checker=True, **kwargs))
-    except BaseException as error:  # an env's constructor may raise anything
+        with calls.inside(Call.CONSTRUCTOR):
+            # The passive checker only prints warnings, at each env made, and slows every step.
+            env = gym.make(spec, disable_env_checker=True, **kwargs)
+        return calls.watch_env(wrappers.wrap(env))
+    except Exception as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
 
 
@@ -167,24 +170,22 @@ def make_vector_env(
     Raises:
         EnvError: As `make_env`; or there is a penalty, and the env has no failure.
     """
-    env_id, spec = find_env(env_id)
-    kwargs = copy.deepcopy(dict(env_args or {}))
-    wrappers = ObservationWrappers.take_from(kwargs)
-    _check_args(env_id, spec, kwargs)
+    env_id, spec, kwargs, wrappers = _find(env_id, env_args)
     # Before the render mode joins them.
     own_args = dict(kwargs)
     try:
-        if not wrappers.pixels and _takes_vector_entry_point(spec, kwargs):
-            env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
-        else:
-            if wrappers.pixels:
-                kwargs["render_mode"] = _prepare_pixels(env_id, spec)
-            env = gym.make_vec(
-                spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
-                wrappers=(wrappers.wrap_pixels,), **kwargs,
-            )  # fmt: skip
-        env = wrappers.wrap_vector(env)
-    except BaseException as error:  # an env's constructor may raise anything
+        with calls.inside(Call.CONSTRUCTOR):
+            if not wrappers.pixels and _takes_vector_entry_point(spec, kwargs):
+                env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+            else:
+                if wrappers.pixels:
+                    kwargs["render_mode"] = _prepare_pixels(env_id, spec)
+                env = gym.make_vec(
+                    spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
+                    wrappers=(wrappers.wrap_pixels,), **kwargs,
+                )  # fmt: skip
+        env = calls.watch_env(wrappers.wrap_vector(env))
+    except Exception as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
     if failure_penalty is None:
         return env
@@ -192,6 +193,22 @@ def make_vector_env(
     scalar = inner.envs[0] if isinstance(inner, gym.vector.SyncVectorEnv) else _creator(env_id, spec)
     rule = failure_rule(env_id, spec, getattr(scalar, "metadata", {}), own_args)
     return FailurePenalty(env, check_failure_penalty(env_id, rule, failure_penalty), failure_penalty)
+
+
+def close_env(env: gym.Env[Any, Any]) -> None:
+    """Close an environment that nobody needs any more; that it cannot be closed harms nobody."""
+    with contextlib.suppress(Exception):  # an env may raise anything
+        env.close()  # type: ignore[no-untyped-call]
+
+
+def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec, dict[str, Any], ObservationWrappers]:
+    """The normalised id, what the env is made from, its constructor's arguments, and the wrappers around it."""
+    kwargs = copy.deepcopy(dict(env_args or {}))
+    with calls.inside(Call.IMPORT):
+        env_id, spec = find_env(env_id)
+        wrappers = ObservationWrappers.take_from(kwargs)
+        _check_args(env_id, spec, kwargs)
+    return env_id, spec, kwargs, wrappers
 
 
 def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
@@ -220,7 +237,7 @@ def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
     if isinstance(spec.entry_point, str):
         try:
             creator: Callable[..., Any] = load_env_creator(spec.entry_point)
-        except BaseException as error:  # importing an env's module may raise anything
+        except Exception as error:  # importing an env's module may raise anything
             raise _cannot_make(env_id, {}, error) from error
         return creator
     return spec.entry_point
@@ -278,9 +295,7 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
     return True
 
 
-def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:
-    if not is_of_env(error):
-        raise error
+def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: Exception) -> EnvError:
     if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
         return error
     detail = str(error).strip().rstrip(".") or "no message"
@@ -292,24 +307,6 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
     if isinstance(error, (ImportError, gym.error.DependencyNotInstalled)):
         return EnvError(message, "Install the package that the message names, on every machine that runs trials.")
     return EnvError(message, "Check the env's arguments against its documentation.")
-
-
-def _check_reset(env: gym.Env[Any, Any], info: EnvInfo) -> None:
-    """Reset once: many envs look at the values of their arguments only then."""
-    try:
-        observation, _ = env.reset(seed=0)
-        shape = np.shape(observation)
-    except Exception as error:  # an env may raise anything
-        raise EnvError(
-            f"The environment {info.env_id!r} with arguments {info.env_args!r} cannot be reset: "
-            f"{type(error).__name__}: {error}.",
-            "Check the env's arguments, or mend its reset().",
-        ) from error
-    if shape != info.observation_space.shape:
-        raise EnvError(
-            f"{info.env_id} returns observations of shape {shape} but declares {info.observation_space.shape}.",
-            "Mend the env: its observations must be of the shape of its observation_space.",
-        )
 
 
 def _check_observation_space(info: EnvInfo) -> None:

@@ -39,6 +39,10 @@ class EnvError(SpecError):
     """An environment is not registered, cannot be made, or does not go with the algorithm."""
 
 
+class EnvFailedError(EnvError):
+    """An environment raised an error, hung, or ended its process while it ran."""
+
+
 class TrialsFailedError(TuneJobsError):
     """The sweep finished but some trials failed."""
 

@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from policies.envs import make_env
+from policies.envs import close_env, make_env
 from policies.errors import EnvError, SpecError
 from policies.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
 from policies.movies import GifWriter, Mp4Writer
@@ -172,7 +172,7 @@ class _Stage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._env.close()  # type: ignore[no-untyped-call]
+        close_env(self._env)
 
     def play(self, seed: int) -> Iterator[_Panel]:
         """The episode of a seed, a panel for the reset and for each step."""
@@ -239,7 +239,7 @@ def _make_drawable_env(env_id: str, env_args: Mapping[str, Any] | None) -> gym.E
         warnings.simplefilter("ignore")
         plain = make_env(env_id, env_args)
         modes = list(plain.metadata.get("render_modes") or [])
-        plain.close()  # type: ignore[no-untyped-call]
+        close_env(plain)
         if "rgb_array" not in modes:
             raise EnvError(
                 f"{env_id} cannot be filmed: it has no render mode 'rgb_array' (it has: {', '.join(modes) or 'none'}).",

@@ -9,6 +9,15 @@ import pytest
 PLUGIN = Path(__file__).parent / "ray" / "env_plugin"
 
 
+@pytest.fixture(scope="session", autouse=True)
+def guard():
+    """One guard's child for all tests here: each plan would start one of its own."""
+    from policies.guard import guarding
+
+    with guarding():
+        yield
+
+
 @pytest.fixture(scope="session")
 def env_plugin(tmp_path_factory):
     """Install `env_plugin` for this process and those it starts: a metadata folder with Gymnasium's entry point."""

@@ -6,11 +6,13 @@ standard output holds one JSON document, also when a command fails; everything e
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import click
 
 from policies.errors import SpecError
+from policies.guard import guarding
 from tune_jobs.cli_base import (
     DEBUG,
     CommandGroup,
@@ -71,6 +73,8 @@ def launch(
     **options: Any,
 ) -> None:
     """Run a sweep: all trials, then the best policy, its video and a report."""
+    # Its child starts while this process still imports what it needs itself.
+    ctx.with_resource(guarding(start=True))
     if dry_run:
         from tune_jobs import cli_plan
         from tune_jobs.dry_run import planned
@@ -221,7 +225,7 @@ def evaluate(
 
 @cli.command()
 @click.argument("source")
-@click.option("--output", metavar="PATH", help="File to write, as .mp4 and .gif; or a folder, ending with /.")
+@click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the files go.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
 @action_option
@@ -231,7 +235,7 @@ def evaluate(
 def video(
     *,
     source: str,
-    output: str | None,
+    output: Path | None,
     seed: int | None,
     env_id: str | None,
     action: int | tuple[float, ...] | None,

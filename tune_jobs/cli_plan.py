@@ -67,13 +67,14 @@ def _engine_fact(plan: SweepPlan) -> str:
     packs = plan.packs
     if packs is None:
         return told
-    measured = "" if packs.env_step_us is None else f", {packs.env_step_us:.3g} us a step"
     kind = (
         f"{counted(packs.num_env_processes, 'process', 'processes')} a pack"
         if packs.num_env_processes
         else packs.env_kind
     )
-    return f"{told}; environments: {kind}{measured}"
+    if packs.env_kind == "vectorised" and packs.env_step_us is not None:
+        return f"{told}; environments: {kind}, {packs.env_step_us:.3g} us a step"
+    return f"{told}; environments: {kind}" + (f" ({packs.why_env_kind})" if packs.why_env_kind else "")
 
 
 def _at_once(plan: SweepPlan) -> str:

@@ -17,12 +17,11 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, TuneJobsError
+from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from tune_jobs.address import check_address
 from tune_jobs.machine import Machine
 from tune_jobs.monitor import SweepMonitor
 from tune_jobs.own_code import modules_of
-from tune_jobs.ownership import OWNER_FILE, Owner
 from tune_jobs.plan import SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
@@ -47,13 +46,15 @@ class SweepResult:
     interrupted: bool = False
     notes: tuple[str, ...] = ()
     """What could not be made (a video of an environment that can't be drawn, say), and why."""
+    finish_failed: bool = False
+    """Whether no winner could be confirmed, or the environment failed where it was filmed."""
 
     @property
     def exit_code(self) -> int:
-        """130 if it was interrupted, 3 if a trial failed, else 0."""
+        """130 if it was interrupted, 3 if a trial failed or what comes after the trials did, else 0."""
         if self.interrupted:
             return 130
-        return 3 if any(trial.status == "failed" for trial in self.trials) else 0
+        return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
 
 
 def write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None) -> None:
@@ -157,8 +158,6 @@ def run_sweep(
 ) -> SweepResult:
     """Run the unfinished trials of a sweep whose lock is held, then what comes after."""
     started = time.time()
-    # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
-    run = Owner.take(store.folder / OWNER_FILE)
     store.clear_stop_request()
     record = store.read_record()
     store.write_record(
@@ -173,9 +172,8 @@ def run_sweep(
         max_concurrent=plan.max_concurrent,
     )
     if todo:
-        _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
-    with run.held():
-        interrupted = _close(store, started)
+        _run_trials(store, plan, todo, monitor, address=address, machine=machine, progress=progress)
+    interrupted = _close(store, started)
     from tune_jobs.candidates import read_trials
 
     records = read_trials(store)
@@ -188,7 +186,6 @@ def _run_trials(
     plan: SweepPlan,
     todo: tuple[str, ...],
     monitor: SweepMonitor,
-    run: Owner,
     *,
     address: str | None,
     machine: Machine | None,
@@ -200,13 +197,7 @@ def _run_trials(
         from tune_jobs.runner import RunJob, run_trials
 
         job = RunJob(
-            store.folder,
-            todo,
-            plan.cpus_per_trial,
-            plan.gpus_per_trial,
-            plan.max_concurrent,
-            packs=plan.packs,
-            run=run.token,
+            store.folder, todo, plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent, packs=plan.packs
         )
         # Signals are handled anew once Ray is joined: it sets a handler of its own for SIGTERM, which ends the process.
         with (
@@ -250,25 +241,36 @@ def _finished(store: SweepStore, result: SweepResult) -> SweepResult:
     from tune_jobs import finish
 
     chosen: BestRecord | None = None
-    why: str | None = None
+    why: TuneJobsError | None = None
     notes: list[str] = []
     artifacts: dict[str, Path] = {}
     try:
         chosen = finish.choose_best(store)
         artifacts["policy"] = store.best_folder / "policy.json"
     except TuneJobsError as error:
-        why = str(error)
+        why = error
+    failed = why is not None
 
-    def attempt(what: str, make: Callable[[], dict[str, Path]]) -> None:
+    def attempt(what: str, make: Callable[[], dict[str, Path]]) -> bool:
+        """Whether it went well, or could not have: not every environment can be drawn."""
         try:
             artifacts.update(make())
         except TuneJobsError as error:
             notes.append(f"No {what}: {error}")
+            return not isinstance(error, EnvFailedError)
+        return True
 
     if chosen is not None:
-        attempt("video", lambda: finish.make_videos(store))
-    attempt("report", lambda: {"report": finish.make_report(store)})
-    return replace(result, best=chosen, why_no_best=why, artifacts=artifacts, notes=tuple(notes))
+        failed |= not attempt("video", lambda: finish.make_videos(store))
+    attempt("report", lambda: {"report": finish.make_report(store, why)})
+    return replace(
+        result,
+        best=chosen,
+        why_no_best=None if why is None else str(why),
+        artifacts=artifacts,
+        notes=tuple(notes),
+        finish_failed=failed,
+    )
 
 
 @contextlib.contextmanager

@@ -13,13 +13,12 @@ from analysis.selection import NoUsableTrialError, score_trial
 from policies.baselines import BASELINES, ConstantPolicy
 from policies.env_modules import allow_modules
 from policies.env_wrappers import FRAME_STACK, PIXELS
-from policies.envs import check_env
-from policies.errors import CheckpointError, NotFoundError, SpecError
-from policies.evaluate import evaluate_policy
+from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
+from policies.guard import CALL_TIMEOUT_S, guarding
+from policies.guarded import check_env, evaluate_policy, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
 from policies.policy import Policy, RandomPolicy, load_policy, policy_from_portable
 from policies.portable import PolicyNetwork, read_policy, save_policy
-from policies.video import record_comparison, record_video
 from tune_jobs.candidates import choose, leave_out, read_trials
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec import SweepSpec
@@ -57,35 +56,41 @@ def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
     return {record.trial_id: store.trial(record.trial_id).read_iterations() for record in store.read_trials()}
 
 
+@guarding()
 def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
     """Select the winner, confirm it on seeds it was not chosen on, and copy its policy to best/.
 
     Raises:
         NoUsableTrialError: No trial can win; the message says why.
         CheckpointError: The record of the sweep or of a trial is damaged.
+        EnvError: The environment raised an error, hung, or ended its process.
     """
     sweep = _trusted(store).read_record()
     spec = SweepSpec.model_validate(sweep.spec)
     selection, portable = choose(store, read_trials(store))
     seeds = confirmation_seeds(spec.seed, num_episodes)
     policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
-    env_args = spec.env.wrapped_args
+    env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
+    random = random_policy(env_id, env_args, timeout_s)
     record = BestRecord(
         checkpoint=selection.checkpoint,
         point=selection.trial.point_at(selection.checkpoint.iteration),
         seed=selection.trial.seed,
         selection_score=selection.score,
-        confirmation=run_evaluation(policy, spec.env.id, env_args, seeds),
-        random=run_evaluation(random_policy(spec.env.id, env_args), spec.env.id, env_args, seeds),
+        confirmation=run_evaluation(policy, env_id, env_args, seeds, timeout_s),
+        random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
     )
     save_policy(portable, store.best_folder)
     store.write_best(record)
     return record
 
 
-def run_evaluation(policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int]) -> EvaluationRecord:
-    """Greedy episodes of a policy, one a seed."""
-    episodes = evaluate_policy(policy, env_id=env_id, env_args=env_args, seeds=seeds)
+@guarding()
+def run_evaluation(
+    policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int], timeout_s: float = CALL_TIMEOUT_S
+) -> EvaluationRecord:
+    """Greedy episodes of a policy, one a seed; `timeout_s` is how long one call of the environment may take."""
+    episodes = evaluate_policy(policy, env_id=env_id, env_args=env_args, seeds=seeds, timeout_s=timeout_s)
     return EvaluationRecord(
         policy=policy.description,
         env_id=env_id,
@@ -93,13 +98,14 @@ def run_evaluation(policy: Policy, env_id: str, env_args: dict[str, Any], seeds:
         seeds=episodes.seeds,
         returns=episodes.returns,
         lengths=episodes.lengths,
-        threshold=check_env(env_id, env_args).threshold,
+        threshold=check_env(env_id, env_args, timeout_s=timeout_s).threshold,
     )
 
 
-def random_policy(env_id: str, env_args: dict[str, Any]) -> RandomPolicy:
+def random_policy(env_id: str, env_args: dict[str, Any], timeout_s: float = CALL_TIMEOUT_S) -> RandomPolicy:
     """What trained policies are held against, in an environment."""
-    return RandomPolicy.for_env(env_id, env_args)
+    env = check_env(env_id, env_args, timeout_s=timeout_s)
+    return RandomPolicy(env.observation_space, env.action_space, env_id=env.env_id, env_args=env.env_args)
 
 
 @dataclass(frozen=True)
@@ -111,8 +117,11 @@ class PolicySource:
     env_args: dict[str, Any]
     store: SweepStore | None = None
     """The sweep, where the policy is a sweep's best."""
+    timeout_s: float = CALL_TIMEOUT_S
+    """How long one call of the environment may take."""
 
 
+@guarding()
 def find_policy(
     source: str | Path,
     storage: str | Path | None = None,
@@ -139,6 +148,7 @@ def find_policy(
     _refuse_action(text, action)
     path = Path(text).expanduser()
     store: SweepStore | None = None
+    timeout_s = CALL_TIMEOUT_S
     if (path / MANIFEST).is_file():
         verify_checkpoint(path)
         policy = load_policy(path)
@@ -146,6 +156,7 @@ def find_policy(
         policy = load_policy(path)
     else:
         store, trial_id = _sweep_and_trial(text, storage)
+        timeout_s = SweepSpec.model_validate(store.read_record().spec).iteration_timeout_s
         if trial_id is None:
             if not (store.best_folder / "evaluation.json").is_file():
                 choose_best(store)
@@ -158,8 +169,8 @@ def find_policy(
     if env_id is not None and env_id != policy.env_id:
         # Its constructor's arguments are the other environment's; what the policy observes is its own.
         wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS)}
-        return PolicySource(policy, env_id, wrappers)
-    return PolicySource(policy, policy.env_id, dict(policy.env_args), store)
+        return PolicySource(policy, env_id, wrappers, timeout_s=timeout_s)
+    return PolicySource(policy, policy.env_id, dict(policy.env_args), store, timeout_s)
 
 
 def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | None) -> PolicySource:
@@ -173,7 +184,21 @@ def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | Non
     if action is None:
         action = ConstantHyperparams().action
     chosen = action if isinstance(action, int) else tuple(float(number) for number in action)
-    return PolicySource(ConstantPolicy.for_env(env_id, {}, chosen), env_id, {})
+    env = check_env(env_id, {})
+    policy = ConstantPolicy(env.observation_space, env.action_space, chosen, env_id=env.env_id, env_args=env.env_args)
+    return PolicySource(policy, env_id, {})
+
+
+@guarding()
+def evaluate(
+    source: PolicySource, num_episodes: int, first_seed: int | None
+) -> tuple[EvaluationRecord, EvaluationRecord]:
+    """Greedy episodes of a policy, and of a random one on the same seeds; see `sweeps.evaluate`."""
+    first = FRESH_SEED if first_seed is None else first_seed
+    seeds = range(first, first + num_episodes)
+    env_id, env_args, timeout_s = source.env_id, source.env_args, source.timeout_s
+    record = run_evaluation(source.policy, env_id, env_args, seeds, timeout_s)
+    return record, run_evaluation(random_policy(env_id, env_args, timeout_s), env_id, env_args, seeds, timeout_s)
 
 
 def _refuse_action(source: str, action: int | Sequence[float] | None) -> None:
@@ -264,6 +289,7 @@ def find_trained_checkpoint(source: str | Path, storage: str | Path | None = Non
     return folder, saved.network
 
 
+@guarding()
 def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     """Film a random policy (before) and the winner (after) on one seed, alone and side by side, into best/.
 
@@ -273,7 +299,7 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     source = find_policy(store.folder)
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
-    before = random_policy(source.env_id, source.env_args)
+    before = random_policy(source.env_id, source.env_args, source.timeout_s)
     names = {
         "before_mp4": "before.mp4",
         "after_mp4": "after.mp4",
@@ -296,6 +322,7 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
         right_mp4=paths["after_mp4"],
         right_gif=paths["after_gif"],
         both_mp4=paths["before_after_mp4"],
+        timeout_s=source.timeout_s,
     )
     return paths
 
@@ -305,23 +332,29 @@ def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]
     mp4, gif = output.with_suffix(".mp4"), output.with_suffix(".gif")
     record_video(
         source.policy, env_id=source.env_id, env_args=source.env_args, seeds=seed, mp4=mp4, gif=gif,
+        timeout_s=source.timeout_s,
     )  # fmt: skip
     return {"mp4": mp4, "gif": gif}
 
 
-def make_report(store: SweepStore) -> Path:
-    """Write the sweep's tables, figures and HTML report; works without a winner, and says why there is none."""
+@guarding()
+def make_report(store: SweepStore, why_no_best: TuneJobsError | None = None) -> Path:
+    """Write the sweep's tables, figures and HTML report; works without a winner, and says why there is none.
+
+    Args:
+        store: The sweep.
+        why_no_best: Why its winner could not be confirmed just now; None: it was, or nobody tried.
+    """
     from analysis.report import build_report
 
-    try:
-        best = store.read_best()
-    except NotFoundError as error:
-        if isinstance(error, CheckpointError):
-            leave_out(error)
+    best = None
+    if why_no_best is None:
         try:
-            best = choose_best(store)
-        except NoUsableTrialError:
-            best = None
+            best = _known_best(store)
+        except (EnvError, NoUsableTrialError) as error:
+            why_no_best = error
+    if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
+        why_no_best = None
     videos = {
         key: path
         for key, name in (("before", "before.mp4"), ("after", "after.mp4"))
@@ -333,5 +366,16 @@ def make_report(store: SweepStore) -> Path:
         trials=read_trials(store),
         results=read_results(store),
         best=best,
-        videos=videos,
+        why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
+        videos=videos if why_no_best is None else {},
     )
+
+
+def _known_best(store: SweepStore) -> BestRecord:
+    """The confirmed winner, confirmed now if it has not been."""
+    try:
+        return store.read_best()
+    except NotFoundError as error:
+        if isinstance(error, CheckpointError):
+            leave_out(error)
+        return choose_best(store)

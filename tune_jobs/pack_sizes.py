@@ -27,6 +27,8 @@ Few at once cost little: the sweep is as many times longer as its proposals are 
 # The other half is for the processes themselves, whatever else runs, and what the estimate leaves out.
 _SHARE_OF_MEMORY = 0.5
 
+_OTHERS = "other trials need the idle CPUs"
+
 
 @dataclass(frozen=True)
 class Member:
@@ -37,6 +39,8 @@ class Member:
     """See `packs.pack_key`; None: its point is not known."""
     num_bytes: float
     """Memory it takes, as an estimate."""
+    num_envs: int = 1
+    """Its sub-environments; where its point is not known, the fewest that it may have."""
 
 
 def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[Member], *, may_spread: bool) -> PackPlan:
@@ -51,10 +55,14 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[Member], *, 
     cpus, gpus = float(spec.resources.num_cpus or 1), spec.resources.num_gpus
     num_packs, slots = _by_cpus(spec, machine.fitting(cpus, gpus), len(members))
     num_packs, slots, notes = _by_memory(machine, members, num_packs, slots, cpus)
-    spare = _spare_cpus(machine, num_packs, cpus, gpus, slots) if may_spread else 0
+    from policies.guarded import measure_step
     from policies.packed.envs import choose_kind
 
-    choice = choose_kind(spec.env.id, spec.env.wrapped_args, spare_cpus=spare)
+    step = measure_step(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s)
+    # A pack's sub-environments are shared out over its processes: more of these than of those have nothing to do.
+    most = slots * min(member.num_envs for member in members)
+    spare, why_none = _spare_cpus(machine, num_packs, cpus, gpus, most) if may_spread else (0, _OTHERS)
+    choice = choose_kind(step, spare_cpus=spare, why_none=why_none)
     num_processes = spare if choice.kind == "processes" else 0
     return PackPlan(
         num_packs=num_packs,
@@ -116,13 +124,16 @@ def _budget(machine: Machine, num_packs: int, cpus: float) -> float | None:
     return None if share is None else share * _SHARE_OF_MEMORY
 
 
-def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, slots: int) -> int:
-    """CPUs that each pack may have beside its own, so that as many packs still fit."""
-    most = 0
-    # A process steps the environments of whole trials: one trial alone has nothing to share out.
-    while slots > 1 and most < slots and machine.fitting(cpus + most + 1, gpus) >= num_packs:
-        most += 1
-    return most
+def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most: int) -> tuple[int, str]:
+    """CPUs that each pack may have beside its own, so that as many packs still fit; and why there are none, if so."""
+    if most < 2:
+        return 0, "there is one sub-environment, which nothing can be shared out of"
+    spare = 0
+    while spare < most and machine.fitting(cpus + spare + 1, gpus) >= num_packs:
+        spare += 1
+    if spare or machine.num_cpus < num_packs * cpus + 1:
+        return spare, "no CPU is idle"
+    return 0, f"there is not an idle CPU for each of the {num_packs} packs"
 
 
 def _in_stacks(members: Sequence[Member]) -> list[Member]:

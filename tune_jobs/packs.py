@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from policies.errors import EnvError, SpecError
+from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
     HYPERPARAMS_BY_ALGORITHM,
     DQNHyperparams,
@@ -53,7 +53,7 @@ class PackPlan:
     env_kind: EnvKind
     """How the environments of a pack step."""
     env_step_us: float | None
-    """Microseconds of one env step, as measured; None: not measured."""
+    """Microseconds of one env step, as measured; None: the env raised an error before one could be."""
     num_env_processes: int
     """Processes that step environments for one pack; 0: its own does."""
     notes: tuple[str, ...] = ()
@@ -185,10 +185,12 @@ def choose_engines(
 
 def _why_not_seeded(spec: SweepSpec) -> str | None:
     """Why the environment's episodes do not depend on their seeds alone, or None if they do."""
-    from policies.packed.envs import check_seedable
+    from policies.guarded import check_seedable
 
     try:
-        check_seedable(spec.env.id, spec.env.wrapped_args)
+        check_seedable(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s)
+    except EnvFailedError:
+        raise
     except EnvError as error:
         return error.message.rstrip(".")
     return None

@@ -15,8 +15,10 @@ from pydantic import ValidationError
 
 from analysis.records import FINISHED, TrialRecord
 from analysis.wording import counted
-from policies.envs import EnvInfo, check_env
+from policies.envs import EnvInfo
 from policies.errors import CannotRunError, SpecError
+from policies.guard import guarding
+from policies.guarded import check_env
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
 from tune_jobs.env_rules import check_env_args, check_env_rules
 from tune_jobs.machine import Machine
@@ -108,6 +110,7 @@ def trial_id(index: int) -> str:
     return f"t{index:04d}"
 
 
+@guarding()
 def make_plan(
     spec: SweepSpec, machine: Machine, records: Sequence[TrialRecord] = (), *, retry_failed: bool = False
 ) -> SweepPlan:
@@ -128,7 +131,7 @@ def make_plan(
     if spec.search.type == "tpe":
         check_installed()
     check_env_args(spec)
-    env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm)
+    env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
     check_rl_module(spec)
     num_trials = _num_trials(spec)
     if num_trials > MAX_TRIALS:
@@ -218,11 +221,14 @@ def _trials(
 def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[Member]:
     """Those of the trials that are packed; `memory` is of each point's trials."""
     members = []
+    # Points that are chosen later have as many sub-environments as the others, or it is not known how many.
+    fewest_known = min((values.num_envs for _, values in points if values is not None), default=1)
     for trial in to_run:
         if trial.engine == "packed":
             values = points[trial.point_index][1]
             key = None if values is None else pack_key(values)
-            members.append(Member(trial.trial_id, key, memory[trial.point_index]))
+            fewest = fewest_known if values is None else values.num_envs
+            members.append(Member(trial.trial_id, key, memory[trial.point_index], fewest))
     return members
 
 

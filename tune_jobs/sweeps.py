@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from analysis.records import BestRecord, EvaluationRecord, SweepRecord
 from policies.arguments import NumEpisodes, PositiveInt, Seed, checked
 from policies.env_modules import allow_modules
+from policies.guard import guarding
 from tune_jobs.driving import (
     SweepResult,
     check_same_trials,
@@ -56,6 +57,7 @@ class SweepStatus:
     """Whether a process runs it now."""
 
 
+@guarding(start=True)
 @checked
 def launch(
     source: Source,
@@ -168,6 +170,7 @@ def extend(
     return _go_on(sweep, storage, address, num_samples, finish=finish, progress=progress, retry_failed=False)
 
 
+@guarding()
 def _go_on(
     sweep: str | Path,
     storage: str | Path | None,
@@ -264,6 +267,7 @@ def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: 
     return choose_best(find_sweep(sweep, storage), num_episodes)
 
 
+@guarding(start=True)
 @checked
 def evaluate(
     source: str | Path,
@@ -292,14 +296,10 @@ def evaluate(
     """
     from tune_jobs import finish
 
-    found = finish.find_policy(source, storage, env_id, action)
-    first = finish.FRESH_SEED if first_seed is None else first_seed
-    seeds = tuple(range(first, first + num_episodes))
-    record = finish.run_evaluation(found.policy, found.env_id, found.env_args, seeds)
-    baseline = finish.random_policy(found.env_id, found.env_args)
-    return record, finish.run_evaluation(baseline, found.env_id, found.env_args, seeds)
+    return finish.evaluate(finish.find_policy(source, storage, env_id, action), num_episodes, first_seed)
 
 
+@guarding()
 @checked
 def video(
     source: str | Path,
@@ -315,9 +315,8 @@ def video(
     Args:
         source: As `evaluate`.
         storage: Folder for sweeps.
-        output: File to write, as .mp4 and as .gif; or a folder, that exists or whose name ends with `/`, for files
-            called after policy and environment. None: into a sweep's best/ (with the random policy before, and both
-            side by side), else into the current folder.
+        output: File to write (its ending is replaced by .mp4 and .gif); None: into a sweep's best/ (with the random
+            policy before, and both side by side), else `./<policy>.mp4`.
         seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
         env_id: Another environment than the policy's own; needed for a baseline.
         action: What `constant` does; None: 0.
@@ -335,19 +334,8 @@ def video(
     if output is None and found.store is not None:
         return finish.make_videos(found.store, seed)
     name = str(source).replace("/", "-").lstrip(".-") or "policy"
-    target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
+    target = Path(output) if output is not None else Path(f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
     return finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed)
-
-
-def _film_path(output: str | Path | None, name: str) -> Path:
-    """The file of a film, which is called so where `output` names no file."""
-    if output is None:
-        return Path(name)
-    path = Path(output).expanduser()
-    if str(output).endswith("/") or path.is_dir():
-        return path / name
-    # Of another ending, such as that of `cartpole-v0.5`, nothing is cut.
-    return path if path.suffix.lower() in (".mp4", ".gif") else path.with_name(f"{path.name}.mp4")
 
 
 @checked

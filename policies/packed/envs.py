@@ -107,12 +107,22 @@ class PackedEnvs(Protocol):
 
 
 @dataclass(frozen=True)
+class StepTime:
+    """What was measured of an environment."""
+
+    us: float | None
+    """Microseconds of one env step, the resets after episodes' ends with it; None: it has raised before."""
+    is_vectorised: bool = False
+    """Whether one object steps all of a pack's environments at once."""
+
+
+@dataclass(frozen=True)
 class EnvChoice:
     """How a pack's environments are stepped, and why."""
 
     kind: EnvKind
-    step_us: float
-    """Measured: microseconds of one env step, the resets after episodes' ends with it."""
+    step_us: float | None
+    """See `StepTime.us`."""
     why: str
     """A phrase for the plan."""
 
@@ -149,13 +159,8 @@ def make_packed_envs(
     return ScalarEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty, num_processes=num_processes)
 
 
-def choose_kind(env_id: str, env_args: Mapping[str, Any] | None, *, spare_cpus: int) -> EnvChoice:
-    """How to step an environment for a pack: all at once if it can be, in processes if it is slow and CPUs are idle.
-
-    Args:
-        env_id: Gymnasium id, or `module:Name`.
-        env_args: As `policies.envs.make_env` takes them.
-        spare_cpus: CPUs that nothing else would use.
+def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
+    """Measure how long a step of an environment takes in a pack.
 
     Raises:
         EnvError: The environment cannot be made.
@@ -164,15 +169,29 @@ def choose_kind(env_id: str, env_args: Mapping[str, Any] | None, *, spare_cpus: 
 
     if (rows := CartPoleRows.make(env_id, env_args)) is not None:
         rows.close()
-        return EnvChoice("vectorised", _vectorised_step_us(env_id, env_args), "one object steps them all at once")
-    step_us = _scalar_step_us(env_id, env_args)
-    took = f"a step takes {step_us / 1000:.1f} ms" if step_us >= 1000 else f"a step takes {step_us:.0f} us"
-    if step_us <= _SLOW_STEP_US:
-        return EnvChoice("scalar", step_us, took)
+        return StepTime(_vectorised_step_us(env_id, env_args), is_vectorised=True)
+    return StepTime(_scalar_step_us(env_id, env_args))
+
+
+def choose_kind(step: StepTime, *, spare_cpus: int, why_none: str = "no CPU is idle") -> EnvChoice:
+    """How to step an environment for a pack: all at once if it can be, in processes if it is slow and CPUs are idle.
+
+    Args:
+        step: As `measure_step` found it.
+        spare_cpus: CPUs that nothing else would use.
+        why_none: Why there are none, if so.
+    """
+    if step.is_vectorised:
+        return EnvChoice("vectorised", step.us, "one object steps them all at once")
+    if step.us is None:
+        return EnvChoice("scalar", None, "no step could be measured")
+    took = f"a step takes {step.us / 1000:.1f} ms" if step.us >= 1000 else f"a step takes {step.us:.0f} us"
+    if step.us <= _SLOW_STEP_US:
+        return EnvChoice("scalar", step.us, took)
     if spare_cpus < 1:
-        return EnvChoice("scalar", step_us, f"{took}, but no CPU is idle")
+        return EnvChoice("scalar", step.us, f"{took}, but {why_none}")
     idle = "one CPU" if spare_cpus == 1 else f"{spare_cpus} CPUs"
-    return EnvChoice("processes", step_us, f"{took}, and {idle} would be idle")
+    return EnvChoice("processes", step.us, f"{took}, and {idle} would be idle")
 
 
 def check_seedable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
@@ -218,10 +237,12 @@ def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> floa
     return 1e6 * seconds / (num_steps * num_envs)
 
 
-def _scalar_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float:
-    """Of steps with random actions; the first, which may load things, does not count."""
+def _scalar_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float | None:
+    """Of steps with random actions; the first, which may load things, counts only where it is the only one."""
     moments = [time.perf_counter() for _ in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
-    return 1e6 * (moments[-1] - moments[1]) / (len(moments) - 2) if len(moments) > 2 else 0.0
+    if len(moments) == 2:
+        return 1e6 * (moments[1] - moments[0])
+    return 1e6 * (moments[-1] - moments[1]) / (len(moments) - 2) if len(moments) > 2 else None
 
 
 class _Seen(NamedTuple):

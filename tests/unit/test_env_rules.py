@@ -1,29 +1,21 @@
 """An environment and the settings that have to go with it: refused when the sweep is planned, with both names."""
 
-import gymnasium as gym
-import numpy as np
 import pytest
 
+from policies import env_modules
+from policies.env_modules import allow_modules
 from policies.errors import EnvError, SpecError
 from tune_jobs.machine import Machine
 from tune_jobs.plan import make_plan
 from tune_jobs.spec_file import load_spec
 
-
-class Images(gym.Env):
-    metadata = {"render_modes": []}  # noqa: RUF012
-    observation_space = gym.spaces.Box(0, 255, (20, 16, 3), np.uint8)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros((20, 16, 3), np.uint8), {}
+IMAGES = "odd_envs:Images"
 
 
 @pytest.fixture(autouse=True)
-def _images():
-    gym.register("TestImages-v0", Images)
-    yield
-    del gym.registry["TestImages-v0"]
+def _own_modules(monkeypatch):
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["odd_envs"])
 
 
 def plan(env, algorithm="ppo", **spec):
@@ -35,7 +27,7 @@ FILTERS = [[16, 8, 4], [32, 4, 2]]
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_images_go_with_convolutions_and_vectors_without(algorithm):
-    made = plan("TestImages-v0", algorithm, hyperparams={"conv_filters": [[8, 4, 2]]})
+    made = plan(IMAGES, algorithm, hyperparams={"conv_filters": [[8, 4, 2]]})
     assert made.env.observes_images
     made = plan(
         {"id": "CartPole-v1", "pixels": True, "frame_stack": 4}, algorithm, hyperparams={"conv_filters": FILTERS}
@@ -48,7 +40,7 @@ def test_images_go_with_convolutions_and_vectors_without(algorithm):
 @pytest.mark.parametrize(
     ("env", "spec", "words"),
     [
-        ("TestImages-v0", {}, r"TestImages-v0 has images.*but hyperparams\.conv_filters is null"),
+        (IMAGES, {}, r"odd_envs:Images has images.*but hyperparams\.conv_filters is null"),
         ({"id": "CartPole-v1", "pixels": True}, {}, r"CartPole-v1 has images.*conv_filters"),
         ("CartPole-v1", {"hyperparams": {"conv_filters": FILTERS}}, r"hyperparams\.conv_filters is.*CartPole-v1.*flat"),
         (
@@ -57,14 +49,14 @@ def test_images_go_with_convolutions_and_vectors_without(algorithm):
             r"space\.conv_filters is .*CartPole-v1.*flat",
         ),
         (
-            "TestImages-v0",
+            IMAGES,
             {"space": {"conv_filters": {"choice": [[[8, 4, 2]], None]}}, "num_samples": 1},
-            r"TestImages-v0 has images.*space\.conv_filters is null",
+            r"odd_envs:Images has images.*space\.conv_filters is null",
         ),
         (
-            "TestImages-v0",
+            IMAGES,
             {"hyperparams": {"conv_filters": [[8, 17, 1]]}},
-            r"hyperparams\.conv_filters does not go with TestImages-v0: .*17 x 17",
+            r"hyperparams\.conv_filters does not go with odd_envs:Images: .*17 x 17",
         ),
     ],
 )
@@ -75,10 +67,10 @@ def test_an_encoder_and_observations_that_do_not_go_together_are_refused_with_bo
 
 @pytest.mark.parametrize("algorithm", ["random", "constant"])
 def test_baselines_need_no_encoder(algorithm):
-    assert plan("TestImages-v0", algorithm).env.observes_images
+    assert plan(IMAGES, algorithm).env.observes_images
 
 
-@pytest.mark.parametrize("env_id", ["Acrobot-v1", "MountainCar-v0", "Pendulum-v1", "TestImages-v0"])
+@pytest.mark.parametrize("env_id", ["Acrobot-v1", "MountainCar-v0", "Pendulum-v1", IMAGES])
 def test_a_penalty_for_an_env_without_failure_is_refused_with_both_names(env_id):
     with pytest.raises(SpecError, match=rf"env\.failure_penalty is -1, but {env_id} has no failure") as caught:
         plan({"id": env_id, "failure_penalty": -1}, hyperparams={})
@@ -103,5 +95,5 @@ def test_a_sweep_file_cannot_tell_env_runners_which_modules_are_allowed():
 
 
 def test_pixels_of_an_env_that_is_not_drawn_are_refused():
-    with pytest.raises(EnvError, match=r"TestImages-v0 has pixels: true.*rgb_array"):
-        plan({"id": "TestImages-v0", "pixels": True})
+    with pytest.raises(EnvError, match=r"odd_envs:Images has pixels: true.*rgb_array"):
+        plan({"id": IMAGES, "pixels": True})

@@ -11,10 +11,20 @@ import numpy as np
 import pytest
 from policy_factory import register_test_envs
 
+from policies import env_modules
+from policies.env_modules import allow_modules
 from policies.envs import check_env, make_env, make_vector_env, normalize_env_id
 from policies.errors import EnvError
 
 register_test_envs()
+
+
+@pytest.fixture(autouse=True)
+def _own_modules(monkeypatch):
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["hostile_envs"])
+
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -183,3 +193,62 @@ def test_a_vectorised_version_that_cannot_keep_the_time_limit_is_not_used():
                 assert isinstance(make_vector_env("TestVector-v0", None, 2), gym.vector.SyncVectorEnv)
         finally:
             del gym.registry["TestVector-v0"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("alone", r"reset\(\) of \S+ returns array.* not the two values"),
+        ("no info", "None as info, not a dict"),
+        ("shape", r"observations of shape \(3,\) but declares \(2,\)"),
+        ("none", r"observations of shape \(\) but declares \(2,\)"),
+        ("text", "observations of dtype <U1 but declares float32"),
+        ("nan", r"observations that are not finite: nan at \[1\]"),
+        ("nothing", "None, not the two values"),
+    ],
+)
+@pytest.mark.parametrize("limit", [None, 100])
+def test_a_malformed_reset_is_refused_with_what_it_returns(fault, words, limit):
+    args = {"reset": fault} | ({} if limit is None else {"max_episode_steps": limit})
+    with pytest.raises(EnvError, match=words) as caught:
+        check_env("hostile_envs:Malformed", args, "ppo")
+    assert "(observation, info)" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("four values", r"step\(\) of \S+ returns a tuple of 4, not the five values"),
+        ("no reward", "None as reward, not a number"),
+        ("text reward", "'1.0' as reward, not a number"),
+        ("nan reward", "the reward nan"),
+        ("two rewards", "as reward, not a number"),
+        ("number terminated", r"0 \(int\) as terminated, not a bool"),
+        ("no truncated", r"None \(NoneType\) as truncated, not a bool"),
+        ("shape", r"observations of shape \(2, 1\) but declares \(2,\)"),
+        ("complex", "observations of dtype complex64 but declares float32"),
+        ("infinite", r"observations that are not finite: inf at \[0\]"),
+        ("no info", "a list of 2 as info, not a dict"),
+        ("nothing", "None, not the five values"),
+    ],
+)
+@pytest.mark.parametrize("limit", [None, 100])
+def test_a_malformed_first_step_is_refused_with_what_it_returns(fault, words, limit):
+    args = {"step": fault} | ({} if limit is None else {"max_episode_steps": limit})
+    with pytest.raises(EnvError, match=words) as caught:
+        check_env("hostile_envs:Malformed", args, "ppo")
+    assert "(observation, reward, terminated, truncated, info)" in caught.value.hint
+
+
+@pytest.mark.parametrize("kind", ["float64", "list", "reward in an array"])
+def test_what_is_harmless_in_a_step_passes(kind):
+    assert check_env("hostile_envs:Malformed", {"step": kind}, "ppo").action_space.n == 2
+
+
+def test_a_first_step_that_raises_is_refused():
+    with pytest.raises(EnvError, match=r"cannot be stepped, with the action [01] after a reset: ValueError: the motor"):
+        check_env("hostile_envs:Hostile", {"how": "fail"}, "ppo")
+
+
+def test_an_env_that_cannot_be_closed_is_none_the_worse():
+    assert check_env("hostile_envs:Hostile", {"how": "fail", "where": "close"}, "ppo").action_space.n == 2

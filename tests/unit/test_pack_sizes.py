@@ -1,32 +1,17 @@
 """Packs: how many there are, how many trials at once in each, and how their environments step."""
 
-import dataclasses
-
 import pytest
 from pack_plans import DQN, TPE, fake_reasons, plan
 
-from policies.packed import envs as packed_envs
+from policies import guarded
+from policies.packed.envs import StepTime
 from tune_jobs.machine import Machine
-
-
-@dataclasses.dataclass(frozen=True)
-class Choice:
-    kind: str
-    step_us: float
-    why: str
 
 
 @pytest.fixture
 def slow_env(monkeypatch):
-    """Let every environment be one whose steps take long; returns how many spare CPUs were offered."""
-    offered = []
-
-    def choose_kind(env_id, env_args, *, spare_cpus):
-        offered.append(spare_cpus)
-        return Choice("processes" if spare_cpus else "scalar", 5000.0, "a step takes 5,000 us")
-
-    monkeypatch.setattr(packed_envs, "choose_kind", choose_kind)
-    return offered
+    """Let every environment be one whose steps take long."""
+    monkeypatch.setattr(guarded, "measure_step", lambda env_id, env_args, *, timeout_s: StepTime(5000.0))
 
 
 def packs(machine=2, **fields):
@@ -154,28 +139,59 @@ def test_the_plan_says_how_environments_step():
     assert made.env_step_us is None or made.env_step_us > 0
 
 
-def test_idle_cpus_step_slow_environments(slow_env):
-    # One GPU, so one pack, and 7 CPUs beside it.
-    made = plan(Machine(8, 1), resources={"num_gpus": 1}).packs
-    assert (made.env_kind, made.num_env_processes, made.cpus_per_pack) == ("processes", 7, 8)
-    assert (made.env_step_us, made.why_env_kind) == (5000.0, "a step takes 5,000 us")
-    made = plan(Machine(64, 1), resources={"num_gpus": 1}).packs
-    # No more than trials in a pack, whose environments stay together.
-    assert (made.slots, made.num_env_processes) == (10, 10)
-    # On one node, or the pack would wait for ever.
-    made = plan(Machine(64, 1, nodes=((4, 1), (60, 0))), resources={"num_gpus": 1}).packs
-    assert (made.num_env_processes, made.cpus_per_pack) == (3, 4)
+ONE_GPU = {"resources": {"num_gpus": 1}}
+FOUR_ENVS = {"hyperparams": {"num_envs": 4, "train_batch_size": 64, "minibatch_size": 32}}
 
 
-def test_no_idle_cpus_no_processes(slow_env):
-    assert plan(2).packs.env_kind == "scalar"
-    # Each trial has a pack of its own, and nothing to share out.
-    assert plan(16).packs.num_env_processes == 0
-    assert slow_env == [0, 0]
+@pytest.mark.parametrize(
+    ("machine", "fields", "packs", "processes"),
+    [
+        # One GPU, so one pack of ten trials, and 7 CPUs beside it.
+        (Machine(8, 1), ONE_GPU, 1, 7),
+        # On one node, or the pack would wait for ever.
+        (Machine(64, 1, nodes=((4, 1), (60, 0))), ONE_GPU, 1, 3),
+        # No more than sub-environments: four of each of ten trials, of one.
+        (Machine(64, 1), {**ONE_GPU, **FOUR_ENVS}, 1, 40),
+        (Machine(64), {"num_samples": 1, **FOUR_ENVS}, 1, 4),
+        # One trial alone has its sub-environments to share out.
+        (4, {"num_samples": 1, **FOUR_ENVS}, 1, 3),
+        (2, {"num_samples": 1, **FOUR_ENVS}, 1, 1),
+        # As many for each pack.
+        (4, {"num_samples": 2, **FOUR_ENVS}, 2, 1),
+        (9, {"num_samples": 2, **FOUR_ENVS}, 2, 3),
+        (16, {"resources": {"max_concurrent": 2}, **FOUR_ENVS}, 2, 4),
+        (8, {"num_samples": 1, "resources": {"num_cpus": 3}, **FOUR_ENVS}, 1, 4),
+        # Chosen when it starts, a point has as many as those that are known.
+        (4, {**TPE, "num_samples": 12, "resources": {"max_concurrent": 1}, **FOUR_ENVS}, 1, 3),
+    ],
+)
+def test_idle_cpus_step_slow_environments(slow_env, machine, fields, packs, processes):
+    made = plan(machine, **fields).packs
+    assert (made.env_kind, made.num_packs, made.num_env_processes) == ("processes", packs, processes)
+    assert made.cpus_per_pack == fields.get("resources", {}).get("num_cpus", 1) + processes
+    idle = "one CPU" if processes == 1 else f"{processes} CPUs"
+    assert (made.env_step_us, made.why_env_kind) == (5000.0, f"a step takes 5.0 ms, and {idle} would be idle")
+
+
+@pytest.mark.parametrize(
+    ("machine", "fields", "why"),
+    [
+        (2, {}, "no CPU is idle"),
+        (1, {"num_samples": 1}, "no CPU is idle"),
+        # Ten packs, and six CPUs beside them.
+        (16, {}, "there is not an idle CPU for each of the 10 packs"),
+        (16, {"num_samples": 1, "hyperparams": {"num_envs": 1}}, "there is one sub-environment"),
+    ],
+)
+def test_no_idle_cpus_no_processes(slow_env, machine, fields, why):
+    made = plan(machine, **fields).packs
+    assert (made.env_kind, made.num_env_processes) == ("scalar", 0)
+    assert made.why_env_kind.startswith(f"a step takes 5.0 ms, but {why}")
 
 
 def test_cpus_that_other_trials_need_are_not_idle(slow_env, monkeypatch):
     fake_reasons(monkeypatch, [0.2])
     space = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1, "resources": {"num_gpus": 1}}
-    assert plan(Machine(8, 1), **space).packs.num_env_processes == 0
-    assert slow_env == [0]
+    made = plan(Machine(8, 1), **space).packs
+    assert made.num_env_processes == 0
+    assert made.why_env_kind.endswith("but other trials need the idle CPUs")

@@ -5,7 +5,7 @@ from policy_factory import register_test_envs
 from test_packed_envs import own_modules
 
 from policies.errors import EnvError
-from policies.packed.envs import check_seedable, choose_kind
+from policies.packed.envs import StepTime, check_seedable, choose_kind, measure_step
 
 __all__ = ["own_modules"]
 
@@ -13,33 +13,41 @@ register_test_envs()
 
 
 def test_cartpole_is_vectorised():
-    choice = choose_kind("CartPole-v1", {"max_episode_steps": 200}, spare_cpus=4)
-    assert choice.kind == "vectorised"
-    assert choice.step_us > 0
-    assert choose_kind("CartPole-v1", {"frame_stack": 2}, spare_cpus=4).kind == "scalar"
+    step = measure_step("CartPole-v1", {"max_episode_steps": 200})
+    assert step.us > 0
+    assert choose_kind(step, spare_cpus=4).kind == "vectorised"
+    assert choose_kind(measure_step("CartPole-v1", {"frame_stack": 2}), spare_cpus=4).kind == "scalar"
 
 
 def test_a_fast_env_stays_in_the_process():
-    choice = choose_kind("Pendulum-v1", None, spare_cpus=4)
-    assert choice.kind == "scalar"
-    assert 0 < choice.step_us < 1000
-    assert choice.why == f"a step takes {choice.step_us:.0f} us"
+    step = measure_step("Pendulum-v1", None)
+    assert step.us > 0
+    choice = choose_kind(StepTime(80.4), spare_cpus=4)
+    assert (choice.kind, choice.why) == ("scalar", "a step takes 80 us")
 
 
 def test_a_slow_env_gets_processes_where_cpus_are_idle():
-    choice = choose_kind("odd_envs:Slow", None, spare_cpus=2)
+    step = measure_step("odd_envs:Slow", None)
+    assert step.us > 2000
+    choice = choose_kind(step, spare_cpus=2)
     assert choice.kind == "processes"
-    assert 2000 < choice.step_us < 20_000
     assert choice.why.endswith("ms, and 2 CPUs would be idle")
-    choice = choose_kind("odd_envs:Slow", None, spare_cpus=0)
+    choice = choose_kind(step, spare_cpus=0, why_none="no CPU is idle")
     assert choice.kind == "scalar"
     assert choice.why.endswith("ms, but no CPU is idle")
 
 
+def test_a_step_longer_than_all_the_time_for_measuring_is_measured():
+    step = measure_step("odd_envs:VerySlow", None)
+    assert step.us > 250_000
+    assert choose_kind(step, spare_cpus=1).kind == "processes"
+
+
 @pytest.mark.parametrize("fail_at", [1, 2, 3, 50])
 def test_an_env_that_raises_is_left_to_its_trial(fail_at):
-    choice = choose_kind("TestWalk-v0", {"fail_at": fail_at}, spare_cpus=0)
-    assert choice.kind == "scalar"
+    step = measure_step("TestWalk-v0", {"fail_at": fail_at})
+    assert (step.us is None) == (fail_at == 1)
+    assert choose_kind(step, spare_cpus=0).kind == "scalar"
     check_seedable("TestWalk-v0", {"fail_at": fail_at})
 
 

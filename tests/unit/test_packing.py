@@ -6,9 +6,9 @@ import pytest
 from pack_plans import DQN, LR, TPE, fake_reasons, plan
 from spec_errors import MINIMAL, errors
 
+from policies import guarded
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import make_hyperparams
-from policies.packed import envs as packed_envs
 from tune_jobs.driving import check_same_trials, pending_record, write_new
 from tune_jobs.machine import Machine
 from tune_jobs.packs import pack_key, why_not_packed
@@ -21,10 +21,10 @@ IMAGES = {"env": {"id": "CartPole-v1", "pixels": True}, "hyperparams": {"conv_fi
 
 @pytest.fixture
 def unseedable_env(monkeypatch):
-    def check_seedable(env_id, env_args):
+    def check_seedable(env_id, env_args, *, timeout_s):
         raise EnvError(f"{env_id} gives other observations with the same seed.", "Set engine: rllib.")
 
-    monkeypatch.setattr(packed_envs, "check_seedable", check_seedable)
+    monkeypatch.setattr(guarded, "check_seedable", check_seedable)
 
 
 # -- which engine

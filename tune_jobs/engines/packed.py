@@ -12,7 +12,7 @@ import torch
 
 from policies.errors import CheckpointError
 from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
-from policies.packed.envs import EnvKind, choose_kind, make_packed_envs
+from policies.packed.envs import EnvKind, choose_kind, make_packed_envs, measure_step
 from policies.packed.initial import new_member
 from policies.packed.member import Member
 from policies.packed.portable_member import portable_policy
@@ -86,7 +86,7 @@ class PackedEngine:
         return min(((*kind, turn) for turn in range(num_turns)), key=num_members)
 
     def _make_stack(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Stack:
-        kind = self._env_kind or choose_kind(task.env_id, task.env_args, spare_cpus=0).kind
+        kind = self._env_kind or choose_kind(measure_step(task.env_id, task.env_args), spare_cpus=0).kind
         envs = make_packed_envs(
             task.env_id,
             task.env_args,

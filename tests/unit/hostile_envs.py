@@ -1,0 +1,150 @@
+"""Environments that hang, end their process or return nonsense; child processes find them as `hostile_envs:Name`."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from pathlib import Path
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+
+def hang():
+    while True:
+        time.sleep(0.1)
+
+
+def hang_without_python():
+    # By PyDLL it keeps the interpreter's lock: no thread of Python runs any more.
+    ctypes.PyDLL(None).pause()
+
+
+def segfault():
+    ctypes.string_at(0)
+
+
+def leave():
+    raise SystemExit(5)
+
+
+def fail():
+    raise ValueError("the motor broke")
+
+
+WAYS = {
+    "hang": hang,
+    "hang_without_python": hang_without_python,
+    "exit": lambda: os._exit(7),
+    "segfault": segfault,
+    "leave": leave,
+    "fail": fail,
+}
+
+
+class Hostile(gym.Env):
+    """Steps along a line; at the given call of the given method it does what its `how` says.
+
+    Args:
+        how: One of `WAYS`.
+        where: constructor, reset, step, render or close.
+        at: Which call of it, in this object, from 1.
+        num_steps: Length of an episode.
+        step_s: Seconds that a step takes.
+        only_after: Hostile only where this file exists.
+        pids: A file to which each object writes its process's id, when it is first reset.
+    """
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(
+        self, *, how=None, where="step", at=1, num_steps=20, step_s=0.0, only_after=None, pids=None, render_mode=None
+    ):
+        self.how, self.where, self.at, self.num_steps = how, where, at, num_steps
+        self.step_s, self.only_after, self.pids = step_s, only_after, pids
+        self.render_mode = render_mode
+        self.calls = {}
+        self.steps = 0
+        self._arrive("constructor")
+
+    def _arrive(self, where):
+        self.calls[where] = self.calls.get(where, 0) + 1
+        is_time = self.how is not None and where == self.where and self.calls[where] == self.at
+        if is_time and (self.only_after is None or Path(self.only_after).exists()):
+            WAYS[self.how]()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._arrive("reset")
+        if self.pids is not None and self.calls["reset"] == 1:
+            with Path(self.pids).open("a") as file:
+                file.write(f"{os.getpid()} {os.getppid()}\n")
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self._arrive("step")
+        time.sleep(self.step_s)
+        self.steps += 1
+        return np.full(2, self.steps, np.float32), 1.0, self.steps >= self.num_steps, False, {}
+
+    def render(self):
+        self._arrive("render")
+        return np.zeros((64, 64, 3), np.uint8)
+
+    def close(self):
+        self._arrive("close")
+
+
+class Malformed(gym.Env):
+    """Returns what its arguments say.
+
+    Args:
+        reset: Name of a fault of reset() in `RESETS`; None: it has none.
+        step: Name of a fault of step() in `STEPS`.
+    """
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    GOOD = np.zeros(2, np.float32)
+    RESETS: ClassVar = {
+        "alone": GOOD,
+        "no info": (GOOD, None),
+        "shape": (np.zeros(3, np.float32), {}),
+        "none": (None, {}),
+        "text": (np.array(["a", "b"]), {}),
+        "nan": (np.array([0.0, np.nan], np.float32), {}),
+        "nothing": None,
+    }
+    STEPS: ClassVar = {
+        "four values": (GOOD, 1.0, False, {}),
+        "no reward": (GOOD, None, False, False, {}),
+        "text reward": (GOOD, "1.0", False, False, {}),
+        "nan reward": (GOOD, float("nan"), False, False, {}),
+        "two rewards": (GOOD, np.zeros(2), False, False, {}),
+        "number terminated": (GOOD, 1.0, 0, False, {}),
+        "no truncated": (GOOD, 1.0, False, None, {}),
+        "shape": (np.zeros((2, 1), np.float32), 1.0, False, False, {}),
+        "complex": (np.zeros(2, np.complex64), 1.0, False, False, {}),
+        "infinite": (np.array([np.inf, 0.0], np.float32), 1.0, False, False, {}),
+        "no info": (GOOD, 1.0, False, False, [1, 2]),
+        "nothing": None,
+        # Harmless.
+        "float64": (np.zeros(2), 1.0, False, False, {}),
+        "list": ([0, 0], 1, np.bool_(0), np.array(False), {}),
+        "reward in an array": (GOOD, np.ones(1), False, False, {}),
+    }
+
+    def __init__(self, *, reset=None, step=None):
+        self.reset_fault, self.step_fault = reset, step
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return (self.GOOD, {}) if self.reset_fault is None else self.RESETS[self.reset_fault]
+
+    def step(self, action):
+        return (self.GOOD, 1.0, False, False, {}) if self.step_fault is None else self.STEPS[self.step_fault]

@@ -1,0 +1,257 @@
+"""Environments outside of trials: whatever they do, this process goes on, and says what they did."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from policy_factory import make_policy, register_test_envs
+
+from policies import env_modules, guarded
+from policies.env_modules import allow_modules
+from policies.errors import EnvError, EnvFailedError
+from policies.evaluate import evaluate_policy
+from policies.guard import EnvGuard, guarding
+from policies.policy import RandomPolicy
+
+register_test_envs()
+
+HOSTILE = "hostile_envs:Hostile"
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def _own_modules(monkeypatch):
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["hostile_envs"])
+
+
+def policy_for_hostile():
+    info = guarded.check_env(HOSTILE, {})
+    return RandomPolicy(info.observation_space, info.action_space, env_id=info.env_id)
+
+
+def is_running(pid):
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"
+
+
+def until(condition, what, timeout_s=60.0):
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {what}"
+        time.sleep(0.05)
+    return found
+
+
+# -- the plan's check
+
+
+@pytest.mark.parametrize("how", ["hang", "hang_without_python"])
+@pytest.mark.parametrize("where", ["constructor", "reset", "step", "close"])
+def test_an_env_that_hangs_is_cut_off_with_its_place(how, where):
+    place = "its constructor" if where == "constructor" else rf"{where}\(\)"
+    with pytest.raises(EnvFailedError, match=f"{HOSTILE} hangs in {place}.* nothing came back for 0.7 s") as caught:
+        guarded.check_env(HOSTILE, {"how": how, "where": where}, timeout_s=0.7)
+    function = "hang" if how == "hang" else "hang_without_python"
+    assert re.search(rf'File "[^"]*hostile_envs.py", line \d+ in {function}\n', caught.value.message)
+    assert "policies" not in caught.value.message
+    assert "iteration_timeout_s" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("exit", "ended with exit code 7 in"),
+        ("segfault", r"was ended by SIGSEGV \(segmentation fault\) in"),
+        ("leave", "raised SystemExit in"),
+    ],
+)
+@pytest.mark.parametrize("where", ["constructor", "step"])
+def test_an_env_that_ends_its_process_ends_another_one(how, words, where):
+    place = "its constructor" if where == "constructor" else r"step\(\)"
+    with pytest.raises(EnvFailedError, match=f"{HOSTILE} {words} {place}"):
+        guarded.check_env(HOSTILE, {"how": how, "where": where})
+    # The next job has a child again.
+    assert guarded.check_env(HOSTILE, {}).action_space.n == 2
+
+
+def test_a_segmentation_fault_is_told_with_its_place():
+    with pytest.raises(EnvFailedError, match=r'hostile_envs.py", line \d+ in segfault'):
+        guarded.check_env(HOSTILE, {"how": "segfault"})
+
+
+def test_the_import_of_a_module_is_a_call_too(tmp_path, monkeypatch):
+    (tmp_path / "endless_module.py").write_text("while True: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    allow_modules(["endless_module"])
+    with pytest.raises(EnvFailedError, match=r"hangs in the import of its module.*\n.*endless_module.py"):
+        guarded.check_env("endless_module:Env", {}, timeout_s=0.7)
+
+
+def test_what_the_child_finds_wrong_is_raised_as_here():
+    with pytest.raises(EnvError, match="No environment 'Nothing-v0' is registered") as caught:
+        guarded.check_env("Nothing-v0", {})
+    assert not isinstance(caught.value, EnvFailedError)
+    assert caught.value.hint
+    here = guarded.check_env("Pendulum-v1", {"g": 9.0}, "ppo")
+    from policies.envs import check_env
+
+    assert here == check_env("Pendulum-v1", {"g": 9.0}, "ppo")
+    assert guarded.check_env("CartPole-v1", {}).failure == check_env("CartPole-v1", {}).failure
+
+
+def test_an_env_that_only_this_process_registered_is_refused_as_trials_would():
+    with pytest.raises(EnvError, match="'TestWalk-v0' is registered with Gymnasium in this process alone") as caught:
+        guarded.check_env("TestWalk-v0", {})
+    assert "my_envs:TestWalk-v0" in caught.value.hint
+
+
+def test_arguments_that_no_file_holds_are_refused():
+    with pytest.raises(EnvError, match="not such as a sweep file can hold"):
+        guarded.check_env(HOSTILE, {"how": object()})
+
+
+# -- episodes
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("hang", r"hangs in step\(\), step 17 after reset\(\)"),
+        ("exit", r"ended with exit code 7 in step\(\), step 17 after reset\(\)"),
+        ("fail", r"raised an error in step\(\) of the episode with seed 3, after 16 steps: ValueError: the motor"),
+    ],
+)
+def test_an_env_that_fails_later_fails_in_words(how, words):
+    args = {"how": how, "at": 17}
+    with pytest.raises(EnvFailedError, match=words):
+        guarded.evaluate_policy(policy_for_hostile(), env_id=HOSTILE, env_args=args, seeds=[3], timeout_s=0.7)
+
+
+def test_time_counts_by_call_and_not_by_episode():
+    args = {"step_s": 0.05, "num_steps": 40}
+    done = guarded.evaluate_policy(policy_for_hostile(), env_id=HOSTILE, env_args=args, seeds=[1], timeout_s=1.5)
+    # Two seconds in all.
+    assert done.lengths == (40,)
+
+
+@pytest.mark.parametrize("make", [make_policy, RandomPolicy.for_env])
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_episodes_are_those_of_this_process(make, env_id):
+    policy = make(env_id)
+    expected = evaluate_policy(policy, env_id=env_id, seeds=range(5, 12), max_episode_steps=60)
+    assert guarded.evaluate_policy(policy, env_id=env_id, seeds=range(5, 12), max_episode_steps=60) == expected
+
+
+@pytest.mark.parametrize(("how", "where"), [("hang", "render"), ("exit", "step"), ("fail", "step")])
+def test_a_film_that_breaks_off_leaves_nothing(tmp_path, how, where):
+    args = {"how": how, "where": where, "at": 5}
+    policy = policy_for_hostile()
+    with pytest.raises(EnvFailedError, match=rf" in {where}\(\)"):
+        guarded.record_video(
+            policy, env_id=HOSTILE, env_args=args, seeds=1, mp4=tmp_path / "a.mp4", gif=tmp_path / "a.gif",
+            timeout_s=1.0,
+        )  # fmt: skip
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- the child
+
+
+def test_what_an_env_prints_is_not_on_standard_output(tmp_path):
+    (tmp_path / "loud_envs.py").write_text(
+        "import os\nfrom hostile_envs import Hostile\n"
+        "class Loud(Hostile):\n"
+        "    def reset(self, **kwargs):\n"
+        "        print('by Python', flush=True)\n"
+        "        os.write(1, b'by the system\\n')\n"
+        "        return super().reset(**kwargs)\n"
+    )
+    code = "from policies import guarded; print(guarded.check_env('loud_envs:Loud', {}).env_id)"
+    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parent), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": paths, "TUNE_JOBS_ALLOWED_MODULES": "loud_envs"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "loud_envs:Loud\n"
+    assert "by Python" in done.stderr
+    assert "by the system" in done.stderr
+
+
+def test_a_child_is_used_again_and_ends_with_its_block():
+    with EnvGuard() as guard:
+        guard.start()
+        pid = guard._child.process.pid
+        for _ in range(2):
+            guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
+        assert guard._child.process.pid == pid
+    assert not is_running(pid)
+
+
+def test_one_block_within_another_shares_its_guard():
+    with guarding() as outer, guarding() as inner:
+        assert inner is outer
+
+
+def test_modules_that_are_allowed_no_more_are_seen_no_more(tmp_path, monkeypatch):
+    with EnvGuard() as guard:
+        guard.run("check_env", HOSTILE, env_args={}, algorithm=None)
+        monkeypatch.setattr(env_modules, "_allowed", set())
+        with pytest.raises(EnvError, match="hostile_envs' is not allowed"):
+            guard.run("check_env", HOSTILE, env_args={}, algorithm=None)
+
+
+def test_a_child_does_not_outlive_a_killed_parent(tmp_path):
+    pids = tmp_path / "pids"
+    code = (
+        "from policies import guarded\n"
+        f"guarded.check_env({HOSTILE!r}, {{'how': 'hang_without_python', 'where': 'step', 'pids': {str(pids)!r}}})\n"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), str(ROOT)])
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": paths, "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},
+    )
+    try:
+        child, its_parent = map(int, until(lambda: pids.exists() and pids.read_text().split(), "the env is reset"))
+        assert its_parent == parent.pid
+        parent.send_signal(signal.SIGKILL)
+    finally:
+        parent.kill()
+        parent.wait()
+    until(lambda: not is_running(child), "the child has ended")
+
+
+def test_an_interrupted_parent_ends_its_child(tmp_path):
+    pids = tmp_path / "pids"
+    code = (
+        "from policies import guarded\n"
+        "try:\n"
+        f"    guarded.check_env({HOSTILE!r}, {{'how': 'hang', 'where': 'step', 'pids': {str(pids)!r}}})\n"
+        "except KeyboardInterrupt:\n"
+        "    print('interrupted')\n"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), str(ROOT)])
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": paths, "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        child, _ = map(int, until(lambda: pids.exists() and pids.read_text().split(), "the env is reset"))
+        parent.send_signal(signal.SIGINT)
+        out, _ = parent.communicate(timeout=60)
+    finally:
+        parent.kill()
+        parent.wait()
+    assert (parent.returncode, out) == (0, "interrupted\n")
+    assert not is_running(child)
