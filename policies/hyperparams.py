@@ -160,7 +160,8 @@ class DQNHyperparams(_Hyperparams):
     target_network: bool = Field(True, description="Bootstrap from a target network; false: from the online one.")
     target_update_freq: PositiveInt | None = Field(
         None,
-        description="target_update_units between target updates; null: 500 if hard, every update if soft.",
+        description="Env steps or episodes (target_update_unit) between target updates; null: 500 if hard, each update "
+        "if soft.",
     )
     target_update_unit: Literal["env_step", "episode"] = Field(
         "env_step", description="What target_update_freq counts."
@@ -185,12 +186,14 @@ class DQNHyperparams(_Hyperparams):
     epsilon_unit: Literal["env_step", "episode"] = Field("env_step", description="What the schedule counts.")
     epsilon_initial: Fraction = Field(1.0, description="Share of random actions at the start.")
     epsilon_final: Fraction = Field(0.05, description="Share of random actions at the end.")
-    epsilon_decay: PositiveFloat = Field(10_000, description="Length or scale of the decay, in epsilon_units.")
-    epsilon_start: int = Field(0, ge=0, description="epsilon_units before the decay begins.")
+    epsilon_decay: PositiveFloat = Field(
+        10_000, description="Length or scale of the decay, in env steps or episodes (epsilon_unit)."
+    )
+    epsilon_start: int = Field(0, ge=0, description="Env steps or episodes (epsilon_unit) before the decay begins.")
 
     @property
     def target_update_interval(self) -> int | None:
-        """`target_update_units` between target updates; None: every update is followed by one."""
+        """Env steps or episodes (`target_update_unit`) between target updates; None: one follows every update."""
         if self.target_update_freq is not None:
             return self.target_update_freq
         return 500 if self.tau == 1.0 else None

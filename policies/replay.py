@@ -62,7 +62,7 @@ class NStep:
         """Those that are complete after these steps, oldest first; there may be none.
 
         Args:
-            columns: As `ArrayEnvRunner.sample_columns` gives them: obs (T + 1, N, ...), the others (T, N).
+            columns: T steps of N sub-environments: obs of shape (T + 1, N, ...), the others (T, N).
         """
         if self._n_step == 1:
             mask = columns["stepped"]

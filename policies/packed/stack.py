@@ -12,7 +12,7 @@ from policies.packed.member import Member, MemberStats
 class Stack(Protocol):
     """Trains its members together. They may come and go between iterations; the others do not notice.
 
-    They are equal in `policies.packed.shape.shape_of` and in the environment.
+    They are equal in `tune_jobs.packs.pack_key` and in the environment.
     """
 
     envs: PackedEnvs

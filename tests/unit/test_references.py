@@ -1,0 +1,232 @@
+"""What docstrings, comments, documents, messages and the JSON Schema name is there: code, files, commands, keys."""
+
+import ast
+import builtins
+import io
+import keyword
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from pydantic import BaseModel
+
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.cli import cli
+from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import json_schema
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("policies", "analysis", "tune_jobs")
+CODE = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+# CHANGELOG.md names what was: it is not looked at.
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+# Names of other projects, of examples, and of what a decision speaks against.
+ELSEWHERE = {
+    # RLlib, Ray Tune, Gymnasium, torch, TensorBoard
+    "AutoresetMode", "NEXT_STEP", "DefaultModelConfig", "Learner", "MultiRLModule", "ResultGrid", "hiddens", "logdir",
+    "episode_return_mean", "get_best_result", "tensorflow", "forward_exploration",
+    # Python
+    "Loader", "MetaPathFinder",
+    # a user's own, and a user's mistakes
+    "Maze", "Net", "maze", "my_nets", "my_plots", "plot_all", "v0", "epochs",
+    # parts of file names, colours and commands
+    "rrggbb", "p00", "bench", "dq", "language", "lunarlander", "docs", "design", "md",
+}  # fmt: skip
+ENDINGS = {"py", "yaml", "json", "jsonl", "log", "txt", "csv", "safetensors", "html", "mp4", "gif", "damaged"}
+
+
+def strings_and_names():
+    """All texts of the code that a reader sees, by place; and every word that the code itself consists of."""
+    names, texts = set(dir(builtins)) | set(keyword.kwlist), []
+    for path in [*CODE, *TESTS]:
+        own = path in CODE
+        source = path.read_text()
+        tree = ast.parse(source)
+        documentation = set()
+        for node in ast.walk(tree):
+            for statement in body if isinstance(body := getattr(node, "body", None), list) else ():
+                if isinstance(statement, ast.Expr) and isinstance(value := statement.value, ast.Constant):
+                    documentation.add(value)
+                    texts += [(f"{path.relative_to(ROOT)}:{value.lineno}", str(value.value))] if own else []
+        for node in ast.walk(tree):
+            names |= names_in(node)
+            if own and isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in documentation:
+                names |= set(re.findall(r"\w+", node.value))
+        if own:
+            comments = tokenize.generate_tokens(io.StringIO(source).readline)
+            texts += [
+                (f"{path.relative_to(ROOT)}:{token.start[0]}", token.string)
+                for token in comments
+                if token.type == tokenize.COMMENT
+            ]
+    names |= {part for path in [*CODE, *TESTS] for part in path.relative_to(ROOT).with_suffix("").parts}
+    texts += [(str(path.relative_to(ROOT)), path.read_text()) for path in DOCUMENTS]
+    return names, texts
+
+
+def names_in(node):
+    match node:
+        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=name):
+            return {name or ""}
+        case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+            return {name}
+        case ast.alias(name=name, asname=other):
+            return {*name.split("."), other or ""}
+        case ast.ImportFrom(module=name):
+            return set((name or "").split("."))
+    return set()
+
+
+SECTIONS = {
+    name: field.annotation.model_fields
+    for name, field in SweepSpec.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+}
+NAMES, TEXTS = strings_and_names()
+
+
+def defined():
+    """What each module and each class has: {"policies.files": {...}, "SweepStore": {...}}."""
+    found = {}
+    for path in CODE:
+        dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        inside = members(ast.parse(path.read_text()))
+        if path.name == "__init__.py":
+            inside |= {other.stem for other in path.parent.iterdir()}
+        found[dotted] = found.get(dotted, set()) | inside
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                found[node.name] = found.get(node.name, set()) | members(node)
+    return found
+
+
+def members(tree):
+    inside = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef() | ast.ClassDef() | ast.AsyncFunctionDef():
+                inside.add(node.name)
+            case ast.Assign():
+                inside |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+                inside |= {target.attr for target in node.targets if isinstance(target, ast.Attribute)}
+            case ast.AnnAssign(target=ast.Name() | ast.Attribute() as target):
+                inside.add(target.id if isinstance(target, ast.Name) else target.attr)
+            case ast.alias():
+                inside.add(node.asname or node.name)
+    return inside
+
+
+def quoted(text):
+    """What stands between backticks, outside of blocks of code."""
+    for match in re.finditer(r"``?([^`\n]+)``?", re.sub(r"```.*?```", "", text, flags=re.DOTALL)):
+        yield match.group(1)
+
+
+def test_every_word_in_backticks_is_one_of_the_code():
+    missing = {
+        f"{place}: `{reference}`"
+        for place, text in TEXTS
+        for reference in quoted(text)
+        for word in re.findall(r"[A-Za-z_]\w*", reference)
+        if word not in NAMES and word not in ELSEWHERE
+    }
+    assert missing == set()
+
+
+def test_what_is_allowed_from_elsewhere_is_named_somewhere():
+    words = {word for _, text in TEXTS for reference in quoted(text) for word in re.findall(r"[A-Za-z_]\w*", reference)}
+    assert words >= ELSEWHERE
+
+
+def test_every_dotted_name_of_ours_leads_somewhere():
+    known = defined()
+    by_stem = {}
+    for name, inside in known.items():
+        if "." in name:
+            by_stem.setdefault(name.rpartition(".")[2], set()).update(inside)
+    missing = set()
+    for place, text in TEXTS:
+        for reference in quoted(text):
+            match = re.fullmatch(r"((?:\w+\.)+)(\w+)(\(.*\))?", reference)
+            if match is None:
+                continue
+            head, last = match.group(1).removesuffix("."), match.group(2)
+            if head in SECTIONS:
+                continue
+            inside = known.get(head, by_stem.get(head))
+            if inside is None and head.partition(".")[0] in PACKAGES:
+                missing.add(f"{place}: `{reference}`: no {head}")
+            # A file of data has an ending, no attribute; an inherited one is somebody else's.
+            elif inside is not None and last not in inside and last not in ENDINGS:
+                missing.add(f"{place}: `{reference}`: {head} has no {last}")
+    assert missing == set()
+
+
+def test_every_file_that_is_named_is_there():
+    pattern = re.compile(r"(?<![\w/.<>-])((?:docs|tests|policies|analysis|tune_jobs|docker)/[\w./-]*\w)")
+    missing = {
+        f"{place}: {name}"
+        for place, text in [*TEXTS, ("Makefile", (ROOT / "Makefile").read_text())]
+        for name in pattern.findall(text)
+        if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()
+    }
+    assert missing == set()
+
+
+def test_every_command_with_its_options_exists():
+    pattern = re.compile(r"(^ *(?:\$ )?|[`\"' ]|bin/)tune-jobs ([a-z]+)\b([^`\n\"]*)", re.MULTILINE)
+    wrong = set()
+    for place, text in [*TEXTS, *((str(path.name), path.read_text()) for path in CODE)]:
+        for before, name, rest in pattern.findall(text):
+            command = cli.commands.get(name)
+            if command is None:
+                # In prose any word may stand behind the project's name.
+                if before not in ('"', "'", " ") or rest.startswith(" --"):
+                    wrong.add(f"{place}: tune-jobs {name}")
+                continue
+            options = {option for parameter in command.params for option in parameter.opts} | {"--help"}
+            used = set(re.findall(r"(?<!\S)--[a-z-]+", rest))
+            wrong |= {f"{place}: {name} {option}" for option in used - options}
+    assert wrong == set()
+
+
+def test_every_key_of_a_sweep_file_that_is_named_is_one():
+    known = {name: set(fields) for name, fields in SECTIONS.items() if name != "env"}
+    known["hyperparams"] = known["space"] = {
+        name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields
+    }
+    pattern = re.compile(rf"(?<![\w./])({'|'.join(known)})\.([a-z]\w*)")
+    allowed = {"json", "items", "py", "values", "hiden_sizes"}
+    wrong = {
+        f"{place}: {section}.{name}"
+        for place, text in TEXTS
+        for section, name in pattern.findall(text)
+        if name not in known[section] | allowed
+    }
+    assert wrong == set()
+
+
+def described():
+    """The descriptions of the JSON Schema and the helps of the command line."""
+    stack, found = [json_schema()], []
+    while stack:
+        item = stack.pop()
+        if isinstance(item, dict):
+            found += [item["description"]] if isinstance(item.get("description"), str) else []
+            stack += item.values()
+        elif isinstance(item, list):
+            stack += item
+    found += [CliRunner().invoke(cli, [name, "--help"]).output for name in cli.commands]
+    return found
+
+
+@pytest.mark.parametrize("text", sorted(set(described())))
+def test_the_schema_and_the_helps_name_fields_and_options_that_there_are(text):
+    fields = {name for model in [SweepSpec, *HYPERPARAMS_BY_ALGORITHM.values()] for name in model.model_fields}
+    fields |= {name for inner in SECTIONS.values() for name in inner}
+    words = set(re.findall(r"\b[a-z]+(?:_[a-z]+)+\b", text))
+    assert words <= fields | {"huber_loss", "rl_module", "he_uniform"}
