@@ -123,6 +123,7 @@ class TrialRecord(_Record):
     evaluation_return: float | None = Field(None, description="The newest evaluation.")
     best_evaluation_return: float | None = None
     best_iteration: int | None = None
+    notes: tuple[str, ...] = Field((), description="What of it was damaged, and what it went on from instead.")
     node: str | None = Field(None, description="Address or name of the node it last ran on.")
     pid: int | None = Field(None, description="Process it last ran in.")
     started_at: float | None = Field(None, description="Unix time, seconds.")

@@ -21,6 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from policies.arguments import checked
+from policies.env_faults import is_of_env
 from policies.errors import SpecError
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
@@ -134,7 +135,9 @@ def import_module_allowed(module: str) -> ModuleType:
             "Run the command in the folder that holds it, or add that folder to PYTHONPATH, on every machine that "
             "runs trials.",
         ) from error
-    except Exception as error:  # a user's module may raise anything
+    except BaseException as error:  # a user's module may raise anything
+        if not is_of_env(error):
+            raise
         raise _failed(module, error) from error
 
 
@@ -143,7 +146,7 @@ def _is_part(missing: str | None, module: str) -> bool:
     return missing is not None and (module == missing or module.startswith(f"{missing}."))
 
 
-def _failed(module: str, error: Exception) -> SpecError:
+def _failed(module: str, error: BaseException) -> SpecError:
     return SpecError(
         f"The module {module!r} cannot be imported: {type(error).__name__}: {error}.",
         f'Try `python -c "import {module}"`, and mend what it says.',

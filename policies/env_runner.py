@@ -27,9 +27,11 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from policies.action_bounds import ToBounds
+from policies.checked_envs import CheckedEnvs
 from policies.env_modules import allow_modules
 from policies.env_wrappers import FailurePenalty
 from policies.envs import ALLOWED_MODULES, FAILURE_PENALTY, make_vector_env
+from policies.parents import end_with_parent
 from policies.replay import NStep, Transitions
 from policies.spaces import observation_dtype
 
@@ -53,6 +55,14 @@ class Sample:
 def _returned(fragment: dict[str, NDArray[Any]]) -> NDArray[Any]:
     """The env's own rewards, of which returns are made: without the failure penalty that the learner sees."""
     return fragment.get(_UNPENALIZED, fragment["rewards"])
+
+
+def _checked(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """A vector environment that says what it did wrong; a failure penalty stays outermost."""
+    if not isinstance(env, FailurePenalty):
+        return CheckedEnvs(env, env_id)
+    env.env = CheckedEnvs(env.env, env_id)
+    return env
 
 
 class _Stream:
@@ -85,6 +95,9 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._seed_override: int | None = None
         self._just_ended: NDArray[np.bool_] | None = None
         self._n_step: NStep | None = None
+        if kwargs.get("worker_index", 0):
+            # A process of its own: it must not outlive the Ray that started it, whatever its env does.
+            end_with_parent()
         super().__init__(**kwargs)
 
     def pop_finished_episodes(self) -> list[tuple[float, int]]:
@@ -113,7 +126,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         allow_modules(env_args.pop(ALLOWED_MODULES, ()))
         penalty = env_args.pop(FAILURE_PENALTY, None)
         num_envs = self.config.num_envs_per_env_runner
-        self.env = DictInfoToList(make_vector_env(self.config.env, env_args, num_envs, failure_penalty=penalty))
+        env = make_vector_env(self.config.env, env_args, num_envs, failure_penalty=penalty)
+        self.env = DictInfoToList(_checked(env, self.config.env))
         self.num_envs = self.env.num_envs
         space = self.env.single_action_space
         self._to_bounds = ToBounds(space) if isinstance(space, gym.spaces.Box) else None

@@ -10,7 +10,6 @@ training.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import difflib
 import inspect
@@ -24,6 +23,7 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from policies import calls
 from policies.calls import Call
+from policies.env_faults import close_env, is_of_env
 from policies.env_ids import find_env, normalize_env_id
 from policies.env_wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError
@@ -37,7 +37,6 @@ __all__ = [
     "FAILURE_PENALTY",
     "EnvInfo",
     "check_env",
-    "close_env",
     "make_env",
     "make_vector_env",
     "normalize_env_id",
@@ -148,7 +147,7 @@ def make_env(
             # The passive checker only prints warnings, at each env made, and slows every step.
             env = gym.make(spec, disable_env_checker=True, **kwargs)
         return calls.watch_env(wrappers.wrap(env))
-    except Exception as error:  # an env's constructor may raise anything
+    except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
 
 
@@ -185,7 +184,7 @@ def make_vector_env(
                     wrappers=(wrappers.wrap_pixels,), **kwargs,
                 )  # fmt: skip
         env = calls.watch_env(wrappers.wrap_vector(env))
-    except Exception as error:  # an env's constructor may raise anything
+    except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
     if failure_penalty is None:
         return env
@@ -193,12 +192,6 @@ def make_vector_env(
     scalar = inner.envs[0] if isinstance(inner, gym.vector.SyncVectorEnv) else _creator(env_id, spec)
     rule = failure_rule(env_id, spec, getattr(scalar, "metadata", {}), own_args)
     return FailurePenalty(env, check_failure_penalty(env_id, rule, failure_penalty), failure_penalty)
-
-
-def close_env(env: gym.Env[Any, Any]) -> None:
-    """Close an environment that nobody needs any more; that it cannot be closed harms nobody."""
-    with contextlib.suppress(Exception):  # an env may raise anything
-        env.close()  # type: ignore[no-untyped-call]
 
 
 def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec, dict[str, Any], ObservationWrappers]:
@@ -237,7 +230,7 @@ def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
     if isinstance(spec.entry_point, str):
         try:
             creator: Callable[..., Any] = load_env_creator(spec.entry_point)
-        except Exception as error:  # importing an env's module may raise anything
+        except BaseException as error:  # importing an env's module may raise anything
             raise _cannot_make(env_id, {}, error) from error
         return creator
     return spec.entry_point
@@ -295,7 +288,9 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
     return True
 
 
-def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: Exception) -> EnvError:
+def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:
+    if not is_of_env(error):
+        raise error
     if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
         return error
     detail = str(error).strip().rstrip(".") or "no message"

@@ -19,7 +19,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.envs import close_env, make_env, make_vector_env
+from policies.checked_envs import check_observation, check_reward, is_sound
+from policies.env_faults import close_env, env_failed
+from policies.envs import make_env, make_vector_env
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.policy import Policy
 
@@ -269,8 +271,9 @@ class _Running:
         self.total = 0.0
         try:
             self.observation, _ = env.reset(seed=seed)
-        except Exception as error:  # an env may raise anything
+        except BaseException as error:  # an env may raise anything
             raise self._env_failed("reset", error) from error
+        check_observation(self.observation, self._env_id, 0)
 
     def step(self, action: Any) -> bool:
         """Step once; whether the episode has ended."""
@@ -279,19 +282,25 @@ class _Running:
             action = action.item()
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action)
-        except Exception as error:  # an env may raise anything
+            self.length += 1
+            reward = float(reward)
+            self.total += reward
+        except BaseException as error:  # an env may raise anything
             raise self._env_failed("step", error) from error
-        self.total += float(reward)
-        self.length += 1
+        if not (math.isfinite(reward) and is_sound(np.asarray(self.observation))):
+            check_reward(reward, self._env_id, self.length)
+            check_observation(self.observation, self._env_id, self.length)
         return bool(terminated or truncated)
 
-    def _env_failed(self, method: str, error: Exception) -> EnvFailedError:
-        env_id = self.env.spec.id if self.env.spec is not None else type(self.env.unwrapped).__name__
-        return EnvFailedError(
-            f"{env_id} raised an error in {method}() of the episode with seed {self.seed}, after "
-            f"{self.length} steps: "
-            f"{type(error).__name__}: {error}.",
-            "Mend the env, or choose another one.",
+    @property
+    def _env_id(self) -> str:
+        return self.env.spec.id if self.env.spec is not None else type(self.env.unwrapped).__name__
+
+    def _env_failed(self, method: str, error: BaseException) -> EnvFailedError:
+        return env_failed(
+            f"{self._env_id} raised an error in {method}() of the episode with seed {self.seed}, after {self.length} "
+            "steps",
+            error,
         )
 
 

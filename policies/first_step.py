@@ -14,7 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from policies.errors import EnvError, EnvFailedError
+from policies.env_faults import env_failed
+from policies.errors import EnvError
 
 _STEP_HINT = (
     "Mend its step(): Gymnasium's API wants (observation, reward, terminated, truncated, info), with an observation of "
@@ -68,14 +69,11 @@ def _check_call(
     with _returned_by(env.unwrapped, method) as inner:
         try:
             problem = find_problem(call(), env.observation_space)
-        except Exception as error:  # an env may raise anything
+        except BaseException as error:  # an env may raise anything
             # A wrapper around it may have stumbled over what it returned.
             problem = find_problem(inner[-1], env.unwrapped.observation_space) if inner else None
             if problem is None:
-                raise EnvFailedError(
-                    f"{complaint}: {type(error).__name__}: {error}.",
-                    f"Check the env's arguments, or mend its {method}().",
-                ) from error
+                raise env_failed(complaint, error, f"Check the env's arguments, or mend its {method}().") from error
     if problem is not None:
         raise EnvError(f"{method}() of {env_id} returns {problem}.", hint)
 

@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from policies import calls, env_modules
+from policies import calls, env_faults, env_modules
 from policies.errors import EnvFailedError, TuneJobsError
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ def main(parent: int, connection: int, page: int, dump: int) -> None:
     calls.tell(told)
     import policies.packed.envs  # noqa: F401 (every job needs this much, and the parent is busy yet)
 
+    # Then a KeyboardInterrupt that an env raises is told from one that came by a signal.
+    env_faults.note_signals()
     pipe = Connection(connection)
     while True:
         try:

@@ -19,7 +19,8 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from policies.envs import close_env, make_env
+from policies.env_faults import close_env
+from policies.envs import make_env
 from policies.errors import EnvError, SpecError
 from policies.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
 from policies.movies import GifWriter, Mp4Writer

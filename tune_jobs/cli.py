@@ -6,7 +6,6 @@ standard output holds one JSON document, also when a command fails; everything e
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
@@ -225,7 +224,7 @@ def evaluate(
 
 @cli.command()
 @click.argument("source")
-@click.option("--output", type=click.Path(path_type=Path), metavar="FOLDER", help="Where the files go.")
+@click.option("--output", metavar="PATH", help="File to write, as .mp4 and .gif; or a folder, ending with /.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
 @action_option
@@ -235,7 +234,7 @@ def evaluate(
 def video(
     *,
     source: str,
-    output: Path | None,
+    output: str | None,
     seed: int | None,
     env_id: str | None,
     action: int | tuple[float, ...] | None,

@@ -22,6 +22,7 @@ from tune_jobs.address import check_address
 from tune_jobs.machine import Machine
 from tune_jobs.monitor import SweepMonitor
 from tune_jobs.own_code import modules_of
+from tune_jobs.ownership import OWNER_FILE, Owner
 from tune_jobs.plan import SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
@@ -158,6 +159,8 @@ def run_sweep(
 ) -> SweepResult:
     """Run the unfinished trials of a sweep whose lock is held, then what comes after."""
     started = time.time()
+    # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
+    run = Owner.take(store.folder / OWNER_FILE)
     store.clear_stop_request()
     record = store.read_record()
     store.write_record(
@@ -172,8 +175,9 @@ def run_sweep(
         max_concurrent=plan.max_concurrent,
     )
     if todo:
-        _run_trials(store, plan, todo, monitor, address=address, machine=machine, progress=progress)
-    interrupted = _close(store, started)
+        _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
+    with run.held():
+        interrupted = _close(store, started)
     from tune_jobs.candidates import read_trials
 
     records = read_trials(store)
@@ -186,6 +190,7 @@ def _run_trials(
     plan: SweepPlan,
     todo: tuple[str, ...],
     monitor: SweepMonitor,
+    run: Owner,
     *,
     address: str | None,
     machine: Machine | None,
@@ -197,7 +202,13 @@ def _run_trials(
         from tune_jobs.runner import RunJob, run_trials
 
         job = RunJob(
-            store.folder, todo, plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent, packs=plan.packs
+            store.folder,
+            todo,
+            plan.cpus_per_trial,
+            plan.gpus_per_trial,
+            plan.max_concurrent,
+            packs=plan.packs,
+            run=run.token,
         )
         # Signals are handled anew once Ray is joined: it sets a handler of its own for SIGTERM, which ends the process.
         with (

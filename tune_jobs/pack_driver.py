@@ -143,6 +143,8 @@ class PackDriver:
         for report in reports:
             if report.progress is not None:
                 self._progressed(pack, report.trial_id, report.progress, node, pid)
+            elif report.lost:
+                self._lost(pack, report.trial_id)
             else:
                 self._failed(pack, report)
         self._fill(pack, self._slots)
@@ -212,6 +214,15 @@ class PackDriver:
         else:
             self._keeper.started(trial_id)
 
+    def _lost(self, pack: _Pack, trial_id: str) -> None:
+        """A pack has let a member go that another process took up: no failure, and what that one did is on disk."""
+        if trial_id in pack.ending:
+            self._stopped(pack, trial_id)
+            return
+        self._keeper.lost(trial_id)
+        self._leave(pack, trial_id)
+        self._waiting.append(trial_id)
+
     def _stopped(self, pack: _Pack, trial_id: str) -> None:
         """A member that was to be ended is gone without a word: its checkpoints are those on disk."""
         checkpoints = tuple(self._store.trial(trial_id).checkpoints())
@@ -249,7 +260,8 @@ class PackDriver:
 
     def _write(self, pack: _Pack) -> None:
         failures = {name: self._num_failures[name] for name in pack.staying if self._num_failures[name]}
-        pack.files.write(Assignment(pack.staying, failures))
+        with self._keeper.owned():
+            pack.files.write(Assignment(pack.staying, failures))
 
 
 class PackScheduler(FIFOScheduler):  # type: ignore[misc]

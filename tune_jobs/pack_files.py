@@ -13,6 +13,7 @@ from pathlib import Path
 
 from policies.errors import CheckpointError
 from policies.files import write_atomic
+from tune_jobs.ownership import OWNER_FILE
 from tune_jobs.places import within
 
 _TAIL_BYTES = 20_000
@@ -51,6 +52,11 @@ class PackFiles:
     def log_path(self) -> Path:
         """Of `<pack>.log`."""
         return within(self._sweep_folder, "packs", f"{self.pack_id}.log")
+
+    @property
+    def owner_path(self) -> Path:
+        """Of what says which process is the pack."""
+        return within(self._sweep_folder, "packs", f".{self.pack_id}{OWNER_FILE}")
 
     def write(self, assignment: Assignment) -> None:
         """Replace the assignment."""

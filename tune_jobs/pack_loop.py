@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import os
 import threading
 import time
 import traceback
@@ -23,6 +22,8 @@ from policies.evaluate import Episodes, Evaluator
 from policies.policy import NonFiniteWeightsError, Policy
 from policies.portable import PortablePolicy
 from tune_jobs.engines.protocol import IterationStats, PackEngine, TrialTask
+from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.recovery import write_log
 from tune_jobs.store import SweepStore
 from tune_jobs.trial import Progress, TrialLoop
 
@@ -34,7 +35,7 @@ EvaluateMany = Callable[[Evaluator, Sequence[Policy]], Sequence[Episodes | Excep
 
 @dataclasses.dataclass(frozen=True)
 class MemberReport:
-    """News of one member: how far it is, or that it failed."""
+    """News of one member: how far it is, that it failed, or that another process has it by now."""
 
     trial_id: str
     progress: Progress | None = None
@@ -42,6 +43,8 @@ class MemberReport:
     """What made it fail, and the end of its log."""
     retried: bool = False
     """Whether it goes on from its latest checkpoint: at once, or if it was to leave, when the sweep is resumed."""
+    lost: bool = False
+    """Whether another process has taken it up: no failure of it, and nothing of it is known here any more."""
 
 
 class _MemberEngine:
@@ -120,11 +123,13 @@ class _Member:
 
     def close(self) -> None:
         """Free it; what it did is written."""
-        if self.loop is not None:
-            self.loop.flush()
-        if self.engine is not None:
-            self.engine.close()
-        self.loop = self.engine = self.unreported = None
+        try:
+            if self.loop is not None:
+                self.loop.flush()
+        finally:
+            if self.engine is not None:
+                self.engine.close()
+            self.loop = self.engine = self.unreported = None
 
 
 class PackLoop:
@@ -138,6 +143,7 @@ class PackLoop:
         max_retries: How often a member that fails is tried again.
         watch: Makes what is entered around everything that may hang, for the seconds it may take.
         clock: Seconds, monotonic.
+        under: The pack, as long as it is run: its members are taken up under it.
     """
 
     def __init__(
@@ -150,10 +156,12 @@ class PackLoop:
         max_retries: int,
         watch: Callable[[float], AbstractContextManager[Any]] = contextlib.nullcontext,
         clock: Callable[[], float] = time.perf_counter,
+        under: Owner | None = None,
     ) -> None:
         self._engine = engine
         self._evaluator = evaluator
         self._evaluate = evaluate
+        self._under = under
         self._stop_requested = stop_requested
         self._max_retries = max_retries
         self._watch = watch
@@ -209,9 +217,7 @@ class PackLoop:
                 if (until_evaluated and was_evaluated) or len(self._members) <= few or self._clock() >= deadline:
                     break
         finally:
-            for member in self._members.values():
-                if member.loop is not None:
-                    member.loop.flush()
+            self._attempt({member: member.trial.flush for member in self._all if member.loop}, saves=False)
         for member in self._members.values():
             if member.unreported is not None:
                 self._reports.append(MemberReport(member.task.trial_id, member.unreported))
@@ -283,6 +289,12 @@ class PackLoop:
         if progress.status == "running" and not progress.evaluated:
             member.unreported = progress
             return
+        if progress.status != "running":
+            try:
+                member.trial.flush()
+            except Exception as error:  # noqa: BLE001 (it must not end the others)
+                self._failed(member, error)
+                return
         member.unreported = None
         self._reports.append(MemberReport(member.task.trial_id, progress))
         if progress.status != "running":
@@ -294,7 +306,7 @@ class PackLoop:
 
     def _open(self, member: _Member) -> None:
         member.engine = _MemberEngine(self._engine, member.task.trial_id, self._lock)
-        member.loop = TrialLoop(member.task, member.engine, self._evaluator, self._clock)
+        member.loop = TrialLoop(member.task, member.engine, self._evaluator, self._clock, self._under)
         try:
             with self._watch(member.task.iteration_timeout_s):
                 member.loop.open()
@@ -303,6 +315,13 @@ class PackLoop:
 
     def _failed(self, member: _Member, error: Exception, *, leaves: bool = False) -> None:
         """Report a failure; the member is opened again, if it may be and was not to leave."""
+        if _is_lost(member, error):
+            _log(member.task, "another process trains this trial by now; this one leaves it")
+            self._reports.append(MemberReport(member.task.trial_id, lost=True))
+            with contextlib.suppress(OwnershipLostError):
+                member.close()
+            del self._members[member.task.trial_id]
+            return
         _log(member.task, "".join(traceback.format_exception(error)).rstrip())
         member.num_failures += 1
         retried = leaves or member.num_failures <= self._max_retries
@@ -311,6 +330,20 @@ class PackLoop:
             self._let_go(member)
         else:
             member.close()
+
+
+def _is_lost(member: _Member, error: Exception) -> bool:
+    """Whether what went wrong is that another process has the member, or may come from that."""
+    if isinstance(error, OwnershipLostError):
+        return True
+    try:
+        if member.loop is not None:
+            member.loop.check_owned()
+    except OwnershipLostError:
+        return True
+    except OSError:
+        pass
+    return False
 
 
 def _outcome(act: Callable[[], Progress | None]) -> Progress | Exception | None:
@@ -327,7 +360,4 @@ def _describe(task: TrialTask, error: Exception) -> str:
 
 def _log(task: TrialTask, text: str) -> None:
     """Append to a member's own log; the output of the process goes to the pack's."""
-    path = SweepStore(task.sweep_folder).trial(task.trial_id).log_path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n")
+    write_log(SweepStore(task.sweep_folder).trial(task.trial_id).log_path, text)

@@ -7,7 +7,6 @@ train is in the sweep folder, so a pack that is started again goes on from what 
 from __future__ import annotations
 
 import functools
-import os
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,12 +14,22 @@ from typing import IO, TYPE_CHECKING, Any
 
 from ray import tune
 
+from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
 from policies.evaluate import Evaluator
 from tune_jobs.engines.protocol import PackEngine
+from tune_jobs.ownership import Owner
 from tune_jobs.pack_files import PackFiles
 from tune_jobs.pack_loop import PackLoop
-from tune_jobs.trainable import REPORT_INTERVAL_S, TaskReader, TrialLog, this_node, watchdog
+from tune_jobs.trainable import (
+    REPORT_INTERVAL_S,
+    TaskReader,
+    TrialLog,
+    end_with_driver,
+    owner_of_run,
+    this_node,
+    watchdog,
+)
 
 if TYPE_CHECKING:
     from policies.evaluate import Episodes
@@ -47,8 +56,11 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error comes from there."""
         self._config = config
-        self._parent = os.getppid()
         self._files = PackFiles(Path(config["sweep_folder"]), config["pack_id"])
+        run = owner_of_run(config)
+        self._owner = Owner.take(self._files.owner_path, run)
+        end_with_driver(config, self._owner)
+        note_signals()
         self._log = TrialLog()
         self._file: IO[bytes] = self._log.open(self._files.log_path)
         self._files.begin_log()
@@ -95,20 +107,19 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
             self._engine,
             self._evaluator,
             self.evaluate,
-            stop_requested=self._stop_requested,
+            stop_requested=reader.store.stop_requested,
             max_retries=spec.max_retries,
             watch=functools.partial(watchdog, file=self._file),
+            under=self._owner,
         )
 
-    def _stop_requested(self) -> bool:
-        if os.getppid() != self._parent:
-            # The Ray that started this process is gone, and the driver with it: what is done from here on would get in
-            # the way of whoever goes on with the sweep.
-            os._exit(1)
-        return self._reader.store.stop_requested()
-
     def _arrange(self, loop: PackLoop) -> None:
-        """Make the members those that are assigned."""
+        """Make the members those that are assigned.
+
+        Raises:
+            OwnershipLostError: Another process is this pack by now, and reads the same assignment.
+        """
+        self._owner.check()
         assignment = self._files.read()
         for trial_id in loop.trial_ids:
             if trial_id not in assignment.trial_ids:

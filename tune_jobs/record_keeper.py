@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 from analysis.records import TrialRecord
+from tune_jobs.ownership import Owner
 from tune_jobs.store import SweepStore
 from tune_jobs.tensorboard import ScalarWriter
 from tune_jobs.trial import Progress
@@ -17,6 +20,8 @@ Listener = Callable[[TrialRecord], None]
 
 # A record is synced to disk, which takes about a millisecond: those of running trials are not written more often.
 _WRITES_PER_S = 20.0
+# Of a trial: what was damaged when it was opened, the newest.
+_MAX_NOTES = 20
 
 
 class RecordKeeper:
@@ -29,6 +34,8 @@ class RecordKeeper:
         trial_ids: The trials of this run.
         listener: Called with a trial's record whenever it changes.
         clock: Seconds, monotonic.
+        run: The run whose trials they are; what a run writes that has been taken up by another is an
+            `OwnershipLostError`. None: nobody else can run the sweep.
     """
 
     def __init__(
@@ -37,8 +44,10 @@ class RecordKeeper:
         trial_ids: Sequence[str],
         listener: Listener,
         clock: Callable[[], float] = time.monotonic,
+        run: Owner | None = None,
     ) -> None:
         self._store = store
+        self._run = run
         self._records = {name: store.trial(name).read_record() for name in trial_ids}
         self._others = [record for record in store.read_trials() if record.trial_id not in self._records]
         self._listener = listener
@@ -54,6 +63,14 @@ class RecordKeeper:
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles who drives it into a file that is never read back here; listeners and open files can't be.
         return {}
+
+    def owned(self) -> AbstractContextManager[None]:
+        """What is entered around each write of the process that drives the sweep.
+
+        Raises:
+            OwnershipLostError: Another process runs the sweep by now.
+        """
+        return contextlib.nullcontext() if self._run is None else self._run.held()
 
     def record(self, trial_id: str) -> TrialRecord:
         """A trial's newest record."""
@@ -82,11 +99,18 @@ class RecordKeeper:
         fields["num_iterations"] = fields.pop("iteration")
         if progress.status != "running":
             self.running.discard(trial_id)
+        known = self._records[trial_id].notes
+        fields["notes"] = (*known, *(note for note in progress.notes if note not in known))[-_MAX_NOTES:]
         self._update(trial_id, node=node, pid=pid, **fields)
         self._scalars.write(self._records[trial_id], evaluated=evaluated)
 
     def paused(self, trial_id: str) -> None:
         """A trial was paused that did not tell so itself; it goes on from its latest checkpoint."""
+        self.running.discard(trial_id)
+        self._update(trial_id, status="paused")
+
+    def lost(self, trial_id: str) -> None:
+        """A trial's process ended because another one has the trial: it waits to be gone on with."""
         self.running.discard(trial_id)
         self._update(trial_id, status="paused")
 
@@ -113,7 +137,7 @@ class RecordKeeper:
 
     def flush(self) -> None:
         """Write what is due: first what was written longest ago."""
-        self._scalars.flush()
+        self._write_scalars()
         now = self._clock()
         self._num_writes_due = min(_WRITES_PER_S, self._num_writes_due + (now - self._flushed_at) * _WRITES_PER_S)
         self._flushed_at = now
@@ -128,7 +152,11 @@ class RecordKeeper:
         """Write everything; nothing becomes of any trial any more."""
         for trial_id in sorted(self._changed):
             self._write(trial_id)
-        self._scalars.flush()
+        self._write_scalars()
+
+    def _write_scalars(self) -> None:
+        with self.owned():
+            self._scalars.flush()
 
     def _update(self, trial_id: str, **changes: Any) -> None:
         record = self._records[trial_id].model_copy(update=changes)
@@ -138,6 +166,7 @@ class RecordKeeper:
 
     def _write(self, trial_id: str) -> None:
         record = self._records[trial_id]
-        self._store.trial(trial_id).write_record(record)
+        with self.owned():
+            self._store.trial(trial_id).write_record(record)
         self._written_at[trial_id] = self._clock()
         self._changed.discard(trial_id)

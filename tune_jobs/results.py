@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from analysis.records import TrialRecord
 from policies.arguments import checked
+from policies.errors import NotFoundError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,17 +28,23 @@ def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[Tria
 
 @checked
 def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.DataFrame:
-    """A sweep's trials as a pandas DataFrame, one row a trial.
+    """A sweep's trials as a pandas DataFrame, one row a trial: the table `trials.csv` of its report.
 
     Raises:
         NotFoundError: No such sweep.
     """
+    from analysis.report_data import goal_of
     from analysis.tables import trials_frame
     from tune_jobs.candidates import read_trials
     from tune_jobs.finish import find_sweep, read_results
 
     store = find_sweep(sweep, storage)
-    return trials_frame(read_trials(store), read_results(store))
+    try:
+        best = store.read_best()
+    except NotFoundError:
+        # None was chosen yet, or it can't be read: then the env's own threshold counts.
+        best = None
+    return trials_frame(read_trials(store), read_results(store), threshold=goal_of(store.read_record(), best))
 
 
 @checked

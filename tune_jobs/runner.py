@@ -20,11 +20,13 @@ from ray.tune.schedulers import TrialScheduler
 
 from analysis.records import CheckpointRecord
 from policies.errors import TuneJobsError
+from policies.parents import this_process
+from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.pack_driver import PackDriver, PackScheduler
 from tune_jobs.pack_files import TIMEOUT_MARK
 from tune_jobs.pack_trainable import PackTrainable
 from tune_jobs.packs import PackPlan
-from tune_jobs.places import remove_folder
+from tune_jobs.places import remove_folder, within
 from tune_jobs.population import PopulationScheduler
 from tune_jobs.ray_environment import prepare_environment
 from tune_jobs.record_keeper import Listener, RecordKeeper
@@ -50,6 +52,8 @@ class RunJob:
     max_concurrent: int
     packs: PackPlan | None = None
     """How those of its trials are run that are packed; None: none is."""
+    run: str | None = None
+    """The token of the run, as `Owner` has it; None: the job takes the sweep up itself."""
 
 
 def run_trials(job: RunJob, listener: Listener) -> None:
@@ -58,14 +62,20 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     Args:
         job: What to run; Ray must be connected.
         listener: Called with a trial's record whenever it changes, in this thread.
+
+    Raises:
+        OwnershipLostError: Another process runs the sweep by now; nothing was written over its records.
     """
     prepare_environment()
     store = SweepStore(job.sweep_folder)
-    remove_folder(store.tune_folder)
+    owner_path = within(store.folder, OWNER_FILE)
+    owner = Owner.take(owner_path) if job.run is None else Owner(owner_path, job.run)
+    with owner.held():
+        remove_folder(store.tune_folder)
     wanted = set(job.trial_ids)
     packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
     others = [name for name in job.trial_ids if name not in set(packed)]
-    run = _Run(job, store, listener)
+    run = _Run(job, store, listener, owner)
     try:
         if packed:
             run.packs(packed)
@@ -79,11 +89,13 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 class _Run:
     """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
 
-    def __init__(self, job: RunJob, store: SweepStore, listener: Listener) -> None:
+    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Owner) -> None:
         self._job = job
         self._store = store
+        # What each process is told: which sweep, for which run, and who is gone when it is to end.
+        self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
         self._spec = SweepSpec.model_validate(store.read_record().spec)
-        self.keeper = RecordKeeper(store, job.trial_ids, listener)
+        self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
         self._scheduler = self._build_scheduler()
         chooser = PointChooser(self._spec, self.keeper.all_records, self.keeper.change)
         self._chooser = chooser if self._spec.search.type == "tpe" else None
@@ -105,7 +117,7 @@ class _Run:
         tune.Tuner(
             tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
             param_space={
-                "sweep_folder": str(self._store.folder),
+                **self._config,
                 "pack_id": tune.grid_search(list(driver.pack_ids)),
                 "env_kind": plan.env_kind,
                 "num_env_processes": plan.num_env_processes,
@@ -120,7 +132,7 @@ class _Run:
     def single_trials(self, trial_ids: Sequence[str]) -> None:
         """Run trials one by one, as many at once as fit."""
         spec, job = self._spec, self._job
-        param_space: dict[str, Any] = {"sweep_folder": str(self._store.folder)}
+        param_space: dict[str, Any] = dict(self._config)
         searcher = None
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
@@ -235,14 +247,20 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will be retried."""
-        self._keeper.failed(_trial_id(trial), self._error(trial), retried=True)
+        self._failed(trial, retried=True)
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A failure that will not."""
-        self._keeper.failed(_trial_id(trial), self._error(trial), retried=False)
+        self._failed(trial, retried=False)
 
-    def _error(self, trial: Trial) -> str:
-        return describe_failure(_error_of(trial), self._store.trial(_trial_id(trial)).log_tail())
+    def _failed(self, trial: Trial, *, retried: bool) -> None:
+        trial_id, error = _trial_id(trial), _error_of(trial)
+        if isinstance(getattr(error, "cause", None), OwnershipLostError):
+            # Another process has it: nothing went wrong with the trial.
+            self._keeper.lost(trial_id)
+            return
+        message = describe_failure(error, self._store.trial(trial_id).log_tail())
+        self._keeper.failed(trial_id, message, retried=retried)
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles its callbacks into a file that is never read back here; listeners and open files can't be.

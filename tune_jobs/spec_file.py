@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
 
 from policies.arguments import checked
 from policies.errors import SpecError, shortened
@@ -17,7 +16,7 @@ from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tune_jobs.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.search_space import Domain
 from tune_jobs.spec import NAME_RULE, SweepSpec, hyperparam_problems
-from tune_jobs.spec_problems import Problem, ProblemsError, details_of, did_you_mean, dotted, explain
+from tune_jobs.spec_problems import Detail, Problem, ProblemsError, details_of, did_you_mean, dotted, explain
 from tune_jobs.sweep_yaml import parse_yaml
 
 _HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
@@ -277,7 +276,7 @@ _FORMS = {
 """How fields are written that may have several forms, or one that no type describes."""
 
 
-def _from_detail(detail: ErrorDetails) -> list[Problem]:
+def _from_detail(detail: Detail) -> list[Problem]:
     location = _without_tags(detail["loc"])
     path = dotted(location)
     inner = detail.get("ctx", {}).get("error")

@@ -7,9 +7,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
 from policies.errors import shortened
+
+Detail = Mapping[str, Any]
+"""One thing that pydantic found: type, loc, input, ctx."""
 
 
 class Problem(NamedTuple):
@@ -60,9 +62,9 @@ _WANTED = {
 }
 
 
-def details_of(error: ValidationError) -> list[ErrorDetails]:
+def details_of(error: ValidationError) -> list[Detail]:
     """Everything that pydantic found, each thing once."""
-    details = error.errors(include_url=False)
+    details: list[Detail] = list(error.errors(include_url=False))
     places = [detail["loc"] for detail in details]
     # It misses the wrong values of a list among its values, and calls it too short for that.
     return [
@@ -73,7 +75,7 @@ def details_of(error: ValidationError) -> list[ErrorDetails]:
     ]
 
 
-def explain(detail: ErrorDetails) -> str:
+def explain(detail: Detail) -> str:
     """What is wrong with one value, and what it should be."""
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "value_error":

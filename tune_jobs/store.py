@@ -8,26 +8,24 @@ writes `sweep.json` and every `trial.json`; the process that trains a trial writ
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from analysis.records import (
-    BestRecord,
-    CheckpointRecord,
-    IterationRecord,
-    SweepRecord,
-    TrialRecord,
-)
+from analysis.records import BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.files import write_atomic
 from tune_jobs.locks import held, is_held
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
+from tune_jobs.ownership import OwnedFolder
 from tune_jobs.places import check_trial_id, checkpoint_iteration, is_trial_id, refuse_link, remove_folder, within
 from tune_jobs.record_files import dump, dump_sealed, read_record
+from tune_jobs.results_file import read_results
+
+_LOG = logging.getLogger(__name__)
 
 __all__ = [
     "MANIFEST",
@@ -40,8 +38,8 @@ __all__ = [
 ]
 
 
-class TrialStore:
-    """One trial's folder."""
+class TrialStore(OwnedFolder):
+    """One trial's folder; the process that trains the trial has taken it."""
 
     def __init__(self, sweep_folder: Path, trial_id: str) -> None:
         self.sweep_folder = sweep_folder
@@ -102,30 +100,23 @@ class TrialStore:
         """Append lines to results.jsonl; a line torn by a kill is dropped when it is read."""
         if not records:
             return
-        with self.results_path.open("a", encoding="utf-8") as file:
-            file.write("".join(dump(record, indent=None) for record in records))
+        text = "".join(dump(record, indent=None) for record in records)
+        with self.owned(), self.results_path.open("a", encoding="utf-8") as file:
+            file.write(text)
 
     def read_iterations(self) -> list[IterationRecord]:
-        """Every whole line of results.jsonl, in order; empty if there is no file."""
-        try:
-            lines = self.results_path.read_text(encoding="utf-8").split("\n")
-        except FileNotFoundError:
-            return []
-        records = []
-        for number, line in enumerate(lines[:-1], start=1):
-            try:
-                records.append(IterationRecord.model_validate_json(line))
-            except ValidationError as error:
-                raise CheckpointError(
-                    f"{self.results_path}, line {number}, is not a result: {line[:80]!r}.",
-                    "Delete that line; the trial's other lines are kept.",
-                ) from error
-        return records
+        """Every line of results.jsonl that can be read, in order, with a warning for others; empty without a file."""
+        found = read_results(self.results_path)
+        for bad in found.bad:
+            _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
+        return found.records
 
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
         """Replace results.jsonl by these lines: those up to the checkpoint a trial goes on from."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.results_path, "".join(dump(record, indent=None) for record in records))
+        text = "".join(dump(record, indent=None) for record in records)
+        with self.owned():
+            write_atomic(self.results_path, text)
 
     def checkpoints(self) -> list[CheckpointRecord]:
         """The complete checkpoints, oldest first (those being written have no final name yet).
@@ -169,16 +160,16 @@ class TrialStore:
             CheckpointError: Its place is a symbolic link.
         """
         target = self.checkpoint_folder(record.iteration)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}")
-        remove_folder(temporary)
-        temporary.mkdir(parents=True)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
+        with self.owned():
+            temporary.mkdir(parents=True)
         try:
             write(temporary)
             write_manifest(temporary, record)
-            if target.exists():
-                # A trial that went on from an earlier checkpoint writes this iteration anew.
+            with self.owned():
+                # There is one if the trial went on from an earlier checkpoint and writes this iteration anew.
                 remove_folder(target)
-            temporary.replace(target)
+                temporary.replace(target)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
@@ -191,8 +182,9 @@ class TrialStore:
         """
         folder = self.checkpoint_folder(record.iteration)
         hidden = folder.with_name(f".{folder.name}.deleted")
-        remove_folder(hidden)
-        folder.replace(hidden)
+        with self.owned():
+            remove_folder(hidden)
+            folder.replace(hidden)
         remove_folder(hidden)
 
     def remove_leftovers(self) -> None:

@@ -315,8 +315,9 @@ def video(
     Args:
         source: As `evaluate`.
         storage: Folder for sweeps.
-        output: File to write (its ending is replaced by .mp4 and .gif); None: into a sweep's best/ (with the random
-            policy before, and both side by side), else `./<policy>.mp4`.
+        output: File to write, as .mp4 and as .gif; or a folder, that exists or whose name ends with `/`, for files
+            called after policy and environment. None: into a sweep's best/ (with the random policy before, and both
+            side by side), else into the current folder.
         seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
         env_id: Another environment than the policy's own; needed for a baseline.
         action: What `constant` does; None: 0.
@@ -334,8 +335,19 @@ def video(
     if output is None and found.store is not None:
         return finish.make_videos(found.store, seed)
     name = str(source).replace("/", "-").lstrip(".-") or "policy"
-    target = Path(output) if output is not None else Path(f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
+    target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
     return finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed)
+
+
+def _film_path(output: str | Path | None, name: str) -> Path:
+    """The file of a film, which is called so where `output` names no file."""
+    if output is None:
+        return Path(name)
+    path = Path(output).expanduser()
+    if str(output).endswith("/") or path.is_dir():
+        return path / name
+    # Of another ending, such as that of `cartpole-v0.5`, nothing is cut.
+    return path if path.suffix.lower() in (".mp4", ".gif") else path.with_name(f"{path.name}.mp4")
 
 
 @checked

@@ -22,10 +22,14 @@ import ray
 from ray import tune
 
 from policies.baselines import BASELINES
+from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
 from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
+from policies.parents import end_with_parent, is_gone
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
+from tune_jobs.ownership import OWNER_FILE, Owner
+from tune_jobs.recovery import latest_damaged
 from tune_jobs.schedulers import METRIC, WORST_SCORE, grace_env_steps
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
@@ -153,15 +157,38 @@ def make_engine(algorithm: str) -> TrainingEngine:
     return RLlibEngine()
 
 
+def owner_of_run(config: Mapping[str, Any]) -> Owner | None:
+    """The run that a process was started for; None: it was started for none."""
+    return Owner(Path(config["sweep_folder"]) / OWNER_FILE, config["run"]) if config.get("run") else None
+
+
+def end_with_driver(config: Mapping[str, Any], *owners: Owner | None) -> None:
+    """End this process when its driver has gone, however it went, or another process owns what it works for.
+
+    A driver that is killed takes its Ray along, whose processes this one is a child of. In a Ray that stays there, it
+    is seen itself; on another machine Ray ends this process.
+
+    Args:
+        config: What the process was started with: `driver` is `this_process` of the driver.
+        owners: Of what it works for.
+    """
+    driver = str(config.get("driver", ""))
+    lost = [lambda owner=owner: not owner.is_current() for owner in owners if owner is not None]
+    end_with_parent([lambda: is_gone(driver), *lost])
+
+
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs trials; `config` holds `sweep_folder` and `trial_id`."""
+    """Runs trials; `config` holds `sweep_folder`, `trial_id`, and of the driver `run` and `driver`."""
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the trial; it is built in the first step, so that every error comes from there."""
+        note_signals()
         self._log = TrialLog()
         self._engine: TrainingEngine | None = None
         self._evaluators: dict[str, Evaluator] = {}
         self._node = this_node()
+        self._run = owner_of_run(config)
+        end_with_driver(config, self._run)
         self._take(config)
 
     def reset_config(self, new_config: Mapping[str, Any]) -> bool:
@@ -187,6 +214,9 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             progress = self._watched(self._loop)
         except Exception:
             traceback.print_exc()
+            if self._loop is not None:
+                # Files that are gone under its hands are no failure of a trial that another process has.
+                self._loop.check_owned()
             raise
         if progress.status != "running":
             self._log.close()
@@ -204,7 +234,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         if self._engine is None:
             # All trials of a sweep are of one algorithm, so this process never needs another engine.
             self._engine = make_engine(task.algorithm)
-        loop = TrialLoop(task, self._engine, self._evaluators[key])
+        loop = TrialLoop(task, self._engine, self._evaluators[key], under=self._run)
         with watchdog(task.iteration_timeout_s, self._file):
             loop.open()
         return loop
@@ -245,7 +275,9 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         folder, trial_id = self._trial
         latest = _latest_iteration(folder, trial_id)
         # Newer where the trial went on after a pause and its process died: Tune goes back to the pause's pointer.
-        if pointer["trial_id"] == trial_id and latest < pointer["iteration"]:
+        # Older where the one it points to was damaged, and the trial has gone on from the one before.
+        known = max(latest, latest_damaged(SweepStore(folder).trial(trial_id)))
+        if pointer["trial_id"] == trial_id and known < pointer["iteration"]:
             raise CheckpointError(
                 f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is {latest}.",
                 "Resume the sweep: its trials go on from their latest checkpoints.",

@@ -19,7 +19,9 @@ from policies.policy import NonFiniteWeightsError, Policy, policy_from_portable
 from policies.portable import save_policy
 from tune_jobs.copies import pending_copy, remove_copies
 from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
-from tune_jobs.store import SweepStore, verify_checkpoint
+from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.recovery import take_up_checkpoints, take_up_copy, take_up_results, write_log
+from tune_jobs.store import SweepStore
 
 TRAINING_RETURN_EPISODES = 100
 
@@ -42,6 +44,8 @@ class Progress:
     """running, paused (asked to stop), completed or failed; a pack says stopped of a member that was to be ended."""
     stop_reason: str | None = None
     error: str | None = None
+    notes: tuple[str, ...] = ()
+    """What was damaged when the trial was opened, and what it goes on from instead."""
     checkpoints: tuple[CheckpointRecord, ...] = ()
     started_at: float | None = None
     """Unix time at which the first iteration here began, seconds."""
@@ -60,6 +64,7 @@ class TrialLoop:
         engine: Trains it; reused between trials.
         evaluator: Runs the greedy episodes on the sweep's evaluation seeds; reused between trials.
         clock: Seconds, monotonic.
+        under: The run or the pack that the trial is opened by; None: nobody but who opens the trial next can take it.
     """
 
     def __init__(
@@ -68,11 +73,13 @@ class TrialLoop:
         engine: TrainingEngine,
         evaluator: Evaluator,
         clock: Callable[[], float] = time.perf_counter,
+        under: Owner | None = None,
     ) -> None:
         self.task = task
         self._engine = engine
         self._evaluator = evaluator
         self._clock = clock
+        self._under = under
         self._sweep = SweepStore(task.sweep_folder)
         self._store = self._sweep.trial(task.trial_id)
         self._window: deque[float] = deque(maxlen=TRAINING_RETURN_EPISODES)
@@ -81,6 +88,7 @@ class TrialLoop:
         self._checkpoints: list[CheckpointRecord] = []
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
+        self._notes: list[str] = []
         # The iteration that is not concluded yet, and the stop rule that holds without its evaluation.
         self._taken = self._last
         self._reason: str | None = None
@@ -94,39 +102,65 @@ class TrialLoop:
         """Iterations done."""
         return self._last.iteration
 
-    def open(self) -> None:
-        """Build the trial: from its latest checkpoint or a newer copy of another trial's, else from its seed.
+    def check_owned(self) -> None:
+        """Raise if another process has taken the trial, which may be why something went wrong here.
 
         Raises:
-            CheckpointError: The latest checkpoint is damaged or cannot be restored.
+            OwnershipLostError: It has.
         """
-        self._store.folder.mkdir(parents=True, exist_ok=True)
+        if self._store.is_lost():
+            raise OwnershipLostError(
+                f"Trial {self.task.trial_id} is trained by another process by now.", "Leave it to that one."
+            )
+
+    def open(self) -> None:
+        """Take the trial and build it: from its latest checkpoint or a newer copy of another's, else from its seed.
+
+        A checkpoint whose files are not those that were written is set aside, and the one before it is taken.
+
+        Raises:
+            CheckpointError: The checkpoint is whole but cannot be restored: it is of other hyperparameters, say.
+            OwnershipLostError: Who opens the trial may not any more.
+        """
+        self._store.take(self._under)
         self._store.remove_leftovers()
-        self._checkpoints = self._store.checkpoints()
+        self._checkpoints, self._notes = take_up_checkpoints(self._store)
         self._best = _best_of(self._checkpoints)
         latest = self._checkpoints[-1] if self._checkpoints else None
         change = self.task.changes[-1] if self.task.changes else None
         folder = pending_copy(self._store, change, latest.iteration if latest is not None else 0)
+        if folder is not None:
+            folder, notes = take_up_copy(self._store, folder)
+            self._notes += notes
         self._is_copy = folder is not None
-        start = latest.iteration if latest is not None else 0
+        if folder is None:
+            # Of a copy that does not count, because its driver was killed before it wrote so, nothing is left either.
+            with self._store.owned():
+                remove_copies(self._store)
+        start = latest
         if folder is not None and change is not None:
-            start = change.iteration
+            start = CheckpointRecord(
+                trial_id=self.task.trial_id, iteration=change.iteration, num_env_steps=change.num_env_steps
+            )
         elif latest is not None:
             folder = self._store.checkpoint_folder(latest.iteration)
         self._take_up_results(start, change.iteration if change is not None else 0)
-        if folder is not None:
-            verify_checkpoint(folder)
+        for note in self._notes:
+            write_log(self._store.log_path, f"{self.task.trial_id}: {note}")
         done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
         self._engine.build(done, folder)
         self._started = self._clock() - self._last.time_s
         self._started_at = time.time()
 
-    def _take_up_results(self, start: int, changed_at: int) -> None:
-        """Go on with the results up to the iteration to start from; what came after it is done again.
+    def _take_up_results(self, start: CheckpointRecord | None, changed_at: int) -> None:
+        """Go on with the results up to what the trial starts from; what came after it is done again.
 
         The training return goes on from `changed_at`: episodes before it were played by other weights.
         """
-        kept = [record for record in self._store.read_iterations() if record.iteration <= start]
+        found, notes = take_up_results(self._store)
+        self._notes += notes
+        iteration = start.iteration if start is not None else 0
+        kept = [record for record in found.records if record.iteration <= iteration]
         if self._store.results_path.exists():
             self._store.keep_iterations(kept)
         for record in kept:
@@ -136,6 +170,18 @@ class TrialLoop:
                 self._evaluation_return = record.evaluation_return
         if kept:
             self._last = kept[-1]
+        if start is not None and self._last.iteration < start.iteration:
+            # Its own line could not be read. The curve has a hole there; the counts go on where they were.
+            self._last = self._last.model_copy(
+                update={
+                    "iteration": start.iteration,
+                    "num_env_steps": start.num_env_steps,
+                    "training_return": start.training_return,
+                    "evaluation_return": start.evaluation_return,
+                }
+            )
+            if start.evaluation_return is not None:
+                self._evaluation_return = start.evaluation_return
 
     def advance(self, max_s: float) -> Progress:
         """Train until the next evaluation, the end, or for max_s seconds, whichever comes first.
@@ -288,7 +334,8 @@ class TrialLoop:
         self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]
         self._best = _best_of(self._checkpoints)
         if self.task.changes:
-            remove_copies(self._store)
+            with self._store.owned():
+                remove_copies(self._store)
         self._prune()
 
     def _prune(self) -> None:
@@ -315,6 +362,7 @@ class TrialLoop:
             status=status,
             stop_reason=reason,
             error=error,
+            notes=tuple(self._notes),
             checkpoints=tuple(self._checkpoints),
             started_at=self._started_at,
             ended_at=None if status == "running" else time.time(),

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import signal
+import threading
 import traceback
 from collections.abc import Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
 from policies.child_processes import entry
+from policies.env_faults import note_signals
 from policies.env_modules import allow_modules, allowed_modules
 from policies.errors import EnvError
 from policies.packed.sub_envs import HostDiedError, SubEnvs
+from policies.parents import end_with_parent
 
 _PATIENCE_S = 5.0
 """How long a process may take to close its environments."""
@@ -30,7 +34,7 @@ class ProcessHost:
         self._env_id = env_id
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
-            target=entry(serve), args=(theirs, env_id, dict(env_args or {}), allowed_modules()), daemon=True
+            target=entry(serve), args=(theirs, env_id, dict(env_args or {}), allowed_modules(), _parent()), daemon=True
         )
         self._process.start()
         # Or a pipe whose process has ended would not seem to be closed.
@@ -81,10 +85,20 @@ class ProcessHost:
         )
 
 
-def serve(connection: Connection, env_id: str, env_args: dict[str, Any], modules: tuple[str, ...]) -> None:
-    """Answer a `ProcessHost` until it closes, or its process ends."""
+def _parent() -> tuple[int, bool]:
+    """This process, and whether this thread lives as long as it does."""
+    return os.getpid(), threading.current_thread() is threading.main_thread()
+
+
+def serve(
+    connection: Connection, env_id: str, env_args: dict[str, Any], modules: tuple[str, ...], parent: tuple[int, bool]
+) -> None:
+    """Answer a `ProcessHost` until it closes, or its process ends: then this one ends too, even inside a step."""
+    pid, by_kernel = parent
+    end_with_parent(parent=pid, by_kernel=by_kernel)
     # Ctrl-C in a terminal reaches this process too; when it ends is the other's to say.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    note_signals()
     allow_modules(modules)
     sub_envs = SubEnvs(env_id, env_args)
     while True:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.env_faults import close_env
 from policies.envs import make_env
 from policies.errors import EnvError
 from policies.packed.env_rows import MemberRows, Rows
@@ -67,7 +68,7 @@ class ScalarEnvs:
         self.num_envs = num_envs
         self.observation_space: gym.Space[Any] = env.observation_space
         self.action_space: gym.Space[Any] = env.action_space
-        env.close()  # type: ignore[no-untyped-call]
+        close_env(env)
         self.errors: dict[str, Exception] = {}
         self._penalty = Penalty.find(env_id, self._env_args, failure_penalty)
         self._members = MemberRows(num_envs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -11,6 +10,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.checked_envs import check_observation, check_reward, is_sound
+from policies.env_faults import close_env, env_failed
 from policies.envs import make_env
 from policies.errors import EnvError
 from policies.spaces import observation_dtype
@@ -59,6 +60,14 @@ class SubStep:
     """Members one of whose sub-environments raised; what else is here of these means nothing."""
 
 
+@dataclass(eq=False)
+class _SubEnv:
+    member_id: str
+    env: gym.Env[Any, Any]
+    num_steps: int = 0
+    """Of its running episode."""
+
+
 class SubEnvs:
     """Scalar environments, each of a member, with the wrappers that their arguments ask for.
 
@@ -69,7 +78,7 @@ class SubEnvs:
 
     def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
         self._env_id, self._env_args = env_id, dict(env_args or {})
-        self._envs: list[tuple[str, gym.Env[Any, Any]]] = []
+        self._envs: list[_SubEnv] = []
 
     def add(self, member_id: str, seeds: Sequence[int]) -> list[NDArray[Any]]:
         """Make sub-environments of a member, one for each seed.
@@ -80,13 +89,13 @@ class SubEnvs:
         Raises:
             EnvError: One cannot be made or reset; none is there then.
         """
-        made: list[tuple[str, gym.Env[Any, Any]]] = []
+        made: list[_SubEnv] = []
         try:
             observations = []
             for seed in seeds:
-                env = make_env(self._env_id, self._env_args)
-                made.append((member_id, env))
-                observations.append(self._reset(env, seed))
+                one = _SubEnv(member_id, make_env(self._env_id, self._env_args))
+                made.append(one)
+                observations.append(self._reset(one, seed))
         except EnvError:
             _close(made)
             raise
@@ -95,8 +104,8 @@ class SubEnvs:
 
     def remove(self, member_id: str) -> None:
         """Close a member's sub-environments, if it has any here."""
-        _close([pair for pair in self._envs if pair[0] == member_id])
-        self._envs = [pair for pair in self._envs if pair[0] != member_id]
+        _close([one for one in self._envs if one.member_id == member_id])
+        self._envs = [one for one in self._envs if one.member_id != member_id]
 
     def step(self, actions: NDArray[Any]) -> SubStep:
         """Step all; where an episode ends, begin the next.
@@ -105,7 +114,7 @@ class SubEnvs:
             actions: One for each, as the env takes them.
         """
         num = len(self._envs)
-        space = self._envs[0][1].observation_space
+        space = self._envs[0].env.observation_space
         finals: NDArray[Any] = np.zeros((num, *(space.shape or ())), dtype=observation_dtype(space))
         firsts: dict[int, NDArray[Any]] = {}
         rewards = np.zeros(num, dtype=np.float32)
@@ -113,15 +122,19 @@ class SubEnvs:
         errors: dict[str, EnvError] = {}
         # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
         each = actions.tolist() if actions.ndim == 1 else actions
-        for place, ((member_id, env), action) in enumerate(zip(self._envs, each, strict=True)):
-            if member_id in errors:
+        lengths = [0] * num
+        for place, (one, action) in enumerate(zip(self._envs, each, strict=True)):
+            if one.member_id in errors:
                 continue
             try:
-                rewards[place], terminated[place], truncated[place] = self._step(env, action, finals[place])
+                rewards[place], terminated[place], truncated[place] = self._step(one, action, finals[place])
+                lengths[place] = one.num_steps
                 if terminated[place] or truncated[place]:
-                    firsts[place] = self._reset(env, None)
+                    firsts[place] = self._reset(one, None)
             except EnvError as error:
-                errors[member_id] = error
+                errors[one.member_id] = error
+        if not (is_sound(rewards) and is_sound(finals)):
+            self._find_unsound(rewards, finals, lengths, errors)
         return SubStep(finals, firsts, rewards, terminated, truncated, errors)
 
     def close(self) -> None:
@@ -129,24 +142,40 @@ class SubEnvs:
         _close(self._envs)
         self._envs = []
 
-    def _step(self, env: gym.Env[Any, Any], action: Any, final: NDArray[Any]) -> tuple[float, bool, bool]:
+    def _find_unsound(
+        self, rewards: NDArray[np.float32], finals: NDArray[Any], lengths: Sequence[int], errors: dict[str, EnvError]
+    ) -> None:
+        """The members whose rewards or observations are not finite, into `errors`."""
+        for place, one in enumerate(self._envs):
+            if one.member_id not in errors:
+                try:
+                    check_reward(float(rewards[place]), self._env_id, lengths[place])
+                    check_observation(finals[place], self._env_id, lengths[place])
+                except EnvError as error:
+                    errors[one.member_id] = error
+
+    def _step(self, one: _SubEnv, action: Any, final: NDArray[Any]) -> tuple[float, bool, bool]:
         """Step one; its observation goes into `final`."""
+        one.num_steps += 1
         try:
-            observation, reward, terminated, truncated, _ = env.step(action)
-            self._check_shape(env, observation)
+            observation, reward, terminated, truncated, _ = one.env.step(action)
+            self._check_shape(one.env, observation)
             final[:] = observation
             return float(reward), bool(terminated), bool(truncated)
-        except Exception as error:  # an env may raise anything
+        except BaseException as error:  # an env may raise anything
             raise self._failed("step", error) from error
 
-    def _reset(self, env: gym.Env[Any, Any], seed: int | None) -> NDArray[Any]:
+    def _reset(self, one: _SubEnv, seed: int | None) -> NDArray[Any]:
         try:
-            observation, _ = env.reset(seed=seed)
-            self._check_shape(env, observation)
+            observation, _ = one.env.reset(seed=seed)
+            self._check_shape(one.env, observation)
             # A copy: some envs return the array that they go on writing to.
-            return np.array(observation, dtype=observation_dtype(env.observation_space))
-        except Exception as error:  # an env may raise anything
+            first = np.array(observation, dtype=observation_dtype(one.env.observation_space))
+        except BaseException as error:  # an env may raise anything
             raise self._failed("reset", error) from error
+        one.num_steps = 0
+        check_observation(first, self._env_id, 0)
+        return first
 
     def _check_shape(self, env: gym.Env[Any, Any], observation: Any) -> None:
         if np.shape(observation) != env.observation_space.shape:
@@ -154,11 +183,8 @@ class SubEnvs:
                 f"it returned an observation of shape {np.shape(observation)}, not {env.observation_space.shape}"
             )
 
-    def _failed(self, method: str, error: Exception) -> EnvError:
-        return EnvError(
-            f"{self._env_id} raised an error in {method}(): {type(error).__name__}: {error}.",
-            "Mend the env, or choose another one.",
-        )
+    def _failed(self, method: str, error: BaseException) -> EnvError:
+        return env_failed(f"{self._env_id} raised an error in {method}()", error)
 
 
 class HereHost:
@@ -182,7 +208,6 @@ class HereHost:
         self._sub_envs.close()
 
 
-def _close(envs: Sequence[tuple[str, gym.Env[Any, Any]]]) -> None:
-    for _, env in envs:
-        with contextlib.suppress(Exception):  # what is left of an env that has failed may raise anything
-            env.close()  # type: ignore[no-untyped-call]
+def _close(envs: Sequence[_SubEnv]) -> None:
+    for one in envs:
+        close_env(one.env)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from policies.errors import EnvError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
@@ -324,5 +325,7 @@ def test_what_the_environment_raises_is_raised():
     env_args = {"troubles": {str(SEED): {"how": "raise", "at": 5}}}
     config = build_algorithm_config(PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args=env_args, seed=SEED)
     runner = ArrayEnvRunner(config=config, worker_index=0)
-    with pytest.raises(ZeroDivisionError, match="the cart left the track"):
+    words = r"TestTrouble-v0 raised an error in step\(\): ZeroDivisionError: the cart left the track"
+    with pytest.raises(EnvError, match=words) as caught:
         runner.sample(num_timesteps=40, explore=True)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)

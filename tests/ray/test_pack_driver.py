@@ -220,3 +220,15 @@ def test_nobody_is_handed_out_any_more_when_the_sweep_stops(tmp_path):
     driven.driver.closed("p01")
     assert [driven.status(number)[0] for number in (2, 3)] == ["paused", "paused"]
     assert driven.keeper.running == set()
+
+
+def test_a_member_that_another_process_took_waits_again_and_has_not_failed(tmp_path):
+    driven = Driven(tmp_path, 3, num_packs=1)
+    driven.tell(t0000=(100, 1.0))
+    assert not driven.tell(t0000=MemberReport("t0000", lost=True))
+    # The one that waited has its place.
+    assert driven.assigned() == [1, 2]
+    assert driven.status(0) == ("paused", 0)
+    driven.tell(t0001=(200, "completed"))
+    assert driven.assigned() == [2, 0]
+    assert driven.status(0) == ("running", 0)

@@ -239,7 +239,9 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     assert [trial.num_failures for trial in result.trials] == [0, 2, 1, 1, 1]
     assert (result.exit_code, result.sweep.state) == (3, "completed")
     failed = result.trials[1]
-    assert failed.error.startswith("ZeroDivisionError: the cart left the track")
+    assert failed.error.startswith(
+        "TestTrouble-v0 raised an error in step(): ZeroDivisionError: the cart left the track"
+    )
     # And where, from the end of its log.
     assert "tune_jobs_test_envs.py" in failed.error
     assert failed.ended_at is not None
@@ -251,8 +253,8 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
             assert_results_without_gaps(store, trial)
     logs = {trial.trial_id: store.trial(trial.trial_id).log_path.read_text() for trial in result.trials}
     assert logs["t0000"].count("ZeroDivisionError") == 0
-    assert logs["t0001"].count("ZeroDivisionError: the cart left the track") == 2
-    assert logs["t0002"].count("ZeroDivisionError: the cart left the track") == 1
+    assert logs["t0001"].count("ZeroDivisionError: the cart left the track\n") == 2
+    assert logs["t0002"].count("ZeroDivisionError: the cart left the track\n") == 1
     # Where it hung is in the log.
     assert "Timeout (" in logs["t0004"]
     assert "_go_wrong" in logs["t0004"]

@@ -58,11 +58,21 @@ class Pack:
         scores: Iteration -> evaluation return.
         max_retries: Of a member that fails.
         clock: Seconds.
+        under: The owner of the pack.
         task: Sections of the members' tasks.
     """
 
     def __init__(
-        self, folder, make=lambda trial_id: FakeEngine(), *, scores=float, max_retries=0, clock=None, watch=None, **task
+        self,
+        folder,
+        make=lambda trial_id: FakeEngine(),
+        *,
+        scores=float,
+        max_retries=0,
+        clock=None,
+        watch=None,
+        under=None,
+        **task,
     ):
         self.folder, self.task, self.stop = folder, task, False
         self.engine = FakePackEngine(make)
@@ -75,6 +85,7 @@ class Pack:
             stop_requested=lambda: self.stop,
             max_retries=max_retries,
             clock=clock or FakeClock(),
+            under=under,
             **({} if watch is None else {"watch": watch}),
         )
         self.reports = []

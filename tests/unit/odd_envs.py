@@ -95,6 +95,81 @@ class RefusesSeeds(Fragile):
         return super().reset(seed=seed)
 
 
+class OwnStop(BaseException):
+    """What no `except Exception` takes."""
+
+
+RAISED = {
+    "SystemExit": SystemExit(3),
+    "KeyboardInterrupt": KeyboardInterrupt(),
+    "GeneratorExit": GeneratorExit("over"),
+    "OwnStop": OwnStop("no further"),
+}
+
+
+class Faulty(Fragile):
+    """What it does wrong is an argument, and where: in a method, or in the reward or observation of a step.
+
+    Args:
+        raises: A key of `RAISED`; None: nothing.
+        where: `init`, `reset`, `step`, `close` or `render`; `reward` or `observation`.
+        number: What it gives there: "nan", "inf" or "-inf", or any other.
+        at: Step of an episode.
+        action: Only a step by this action is wrong; None: any.
+        seed: Only a reset from this seed, and what comes after it, is wrong; None: any.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(  # noqa: PLR0917 (an env's arguments come by name)
+        self, where="step", raises=None, number=None, at=3, action=None, seed=None, length=7, render_mode=None
+    ):
+        self.fault, self.raised, self.number = where, raises, None if number is None else float(number)
+        self.at, self.action, self.wrong_seed, self.length = at, action, seed, length
+        self.render_mode, self.steps, self.is_wrong = render_mode, 0, seed is None
+        self.meet("init")
+
+    def meet(self, where):
+        if self.raised is not None and where == self.fault and self.is_wrong:
+            raise RAISED[self.raised]
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None and self.wrong_seed is not None:
+            self.is_wrong = seed == self.wrong_seed
+        self.meet("reset")
+        observation, info = super().reset(seed=seed)
+        return self.spoilt(observation, "reset"), info
+
+    def step(self, action):
+        self.steps += 1
+        is_now = self.steps == self.at and self.action in (None, action)
+        if is_now:
+            self.meet("step")
+        self.state += 0.1 * self.draw()
+        reward = float(self.state.sum())
+        if is_now and self.is_wrong and self.fault == "reward":
+            reward = self.number
+        observation = self.state.copy()
+        return self.spoilt(observation, "observation") if is_now else observation, reward, self.over, False, {}
+
+    @property
+    def over(self):
+        return self.steps == self.length
+
+    def spoilt(self, observation, where):
+        if self.is_wrong and self.number is not None and self.fault == where:
+            observation[1] = self.number
+        return observation
+
+    def render(self):
+        self.meet("render")
+        return np.zeros((8, 8, 3), np.uint8)
+
+    def close(self):
+        self.meet("close")
+
+
 class Images(gym.Env):
     """Observes images, and cannot be drawn."""
 

@@ -56,7 +56,7 @@ COMMANDS = [
         ("video", ("constant",), {**FILMED, "env_id": "Pendulum-v1", "action": (-0.5,)}),
     ),
     ("video mine", ("video", ("mine",), FILMED)),
-    ("video mine --output out --seed 0", ("video", ("mine",), {**FILMED, "output": Path("out"), "seed": 0})),
+    ("video mine --output out --seed 0", ("video", ("mine",), {**FILMED, "output": "out", "seed": 0})),
     ("report mine", ("report", ("mine",), {"storage": None})),
 ]
 

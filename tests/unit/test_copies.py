@@ -119,11 +119,14 @@ def test_the_training_return_is_of_the_new_weights_alone(tmp_path, better):
     assert again.run_to(7).training_return == 8.0
 
 
-def test_a_damaged_copy_is_refused(tmp_path, better):
+def test_a_damaged_copy_is_set_aside_and_the_trial_goes_on_from_its_own_checkpoint(tmp_path, better):
     taken_over(tmp_path, better)
     (copied_folder(TrialStore(tmp_path, "t0000"), 5) / "engine.json").write_text("{}")
-    with pytest.raises(CheckpointError, match=r"engine\.json"):
-        Trial(tmp_path, engine=Recording(), changes=(change(5),))
+    trial = Trial(tmp_path, engine=Recording(), changes=(change(5),))
+    assert trial.engine.checkpoint == trial.store.checkpoint_folder(5)
+    assert trial.loop.iteration == 5
+    assert (trial.store.folder / "damaged" / "copied-000005" / "engine.json").is_file()
+    assert "the copied checkpoint 000005 is damaged" in trial.run_to(6).notes[0]
 
 
 def test_a_damaged_checkpoint_is_not_copied(tmp_path, better):

@@ -71,7 +71,6 @@ def test_an_env_that_hangs_is_cut_off_with_its_place(how, where):
     [
         ("exit", "ended with exit code 7 in"),
         ("segfault", r"was ended by SIGSEGV \(segmentation fault\) in"),
-        ("leave", "raised SystemExit in"),
     ],
 )
 @pytest.mark.parametrize("where", ["constructor", "step"])
@@ -81,6 +80,15 @@ def test_an_env_that_ends_its_process_ends_another_one(how, words, where):
         guarded.check_env(HOSTILE, {"how": how, "where": where})
     # The next job has a child again.
     assert guarded.check_env(HOSTILE, {}).action_space.n == 2
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [("constructor", "cannot be made .*: SystemExit: 5"), ("step", "cannot be stepped.*: SystemExit: 5")],
+)
+def test_an_env_that_raises_what_ends_a_process_has_failed(where, words):
+    with pytest.raises(EnvError, match=words):
+        guarded.check_env(HOSTILE, {"how": "leave", "where": where})
 
 
 def test_a_segmentation_fault_is_told_with_its_place():

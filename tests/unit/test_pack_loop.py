@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 import math
+import shutil
 
 import pytest
 from fake_engine import FakeClock, FakeEngine
@@ -11,6 +12,8 @@ from fake_pack import Pack
 from trial_runs import Trial
 
 from policies.errors import CheckpointError, EnvError
+from tune_jobs.ownership import Owner
+from tune_jobs.store import TrialStore
 
 
 def statuses(pack):
@@ -229,14 +232,66 @@ def test_a_member_that_cannot_be_built_is_retried_and_given_up(tmp_path):
     assert pack.last("t0001").status == "completed"
 
 
-def test_a_damaged_checkpoint_fails_its_member_and_nobody_starts_afresh(tmp_path):
+def test_a_member_whose_latest_checkpoint_is_damaged_goes_on_from_the_one_before(tmp_path):
     Pack(tmp_path, stop={"num_iterations": 3}).add("t0000", "t0001").run()
-    (pack_folder,) = [path for path in (tmp_path / "trials/t0000/checkpoints").iterdir() if path.name == "000003"]
-    (pack_folder / "engine.json").write_text("{}")
+    (tmp_path / "trials/t0000/checkpoints/000003/engine.json").write_text("{}")
     pack = Pack(tmp_path, stop={"num_iterations": 5}).add("t0000", "t0001").run()
-    assert "engine.json" in pack.of("t0000")[-1].error
+    assert pack.engine.builds == [("t0000", 2), ("t0001", 3)]
+    assert [report.error for report in pack.reports] == [None] * len(pack.reports)
+    assert [pack.last(name).status for name in ("t0000", "t0001")] == ["completed", "completed"]
+    assert "checkpoint 000003 is damaged" in pack.last("t0000").notes[0]
+    assert pack.last("t0001").notes == ()
+    assert "goes on from checkpoint 000002" in pack.store("t0000").log_path.read_text()
+
+
+def test_a_member_that_another_process_took_is_let_go_and_has_not_failed(tmp_path):
+    pack = Pack(tmp_path, stop={"num_iterations": 6}, max_retries=3).add("t0000", "t0001")
+    pack.advance()
+    before = pack.store("t0000").read_iterations()
+    other = Pack(tmp_path, stop={"num_iterations": 6}).add("t0000")
+    other.advance()
+    pack.run()
+    (news,) = [report for report in pack.of("t0000") if report.lost]
+    assert (news.progress, news.error) == (None, None)
+    assert not [report for report in pack.reports if report.error is not None]
     assert pack.last("t0001").status == "completed"
-    assert pack.engine.builds == [("t0001", 3)]
+    assert list(pack.engine.members) == []
+    other.run()
+    assert other.last("t0000").status == "completed"
+    iterations = [record.iteration for record in other.store("t0000").read_iterations()]
+    assert iterations == [1, 2, 3, 4, 5, 6]
+    assert before[0].iteration == 1
+
+
+def test_whose_files_went_away_because_another_process_took_it_has_not_failed(tmp_path):
+    """What another owner removes under its hands is no failure of the trial."""
+
+    def script(trial_id):
+        engine = FakeEngine()
+        save, folder = engine.save, tmp_path
+
+        def taken_meanwhile(target):
+            TrialStore(folder, trial_id).take()
+            shutil.rmtree(target)
+            save(target)
+
+        if trial_id == "t0000":
+            engine.save = taken_meanwhile
+        return engine
+
+    pack = Pack(tmp_path, script, stop={"num_iterations": 2}).add("t0000", "t0001").run()
+    assert [report.lost for report in pack.of("t0000")] == [True]
+    assert pack.last("t0001").status == "completed"
+    assert not list((tmp_path / "trials/t0000/checkpoints").iterdir())
+
+
+def test_a_pack_that_is_anothers_by_now_takes_nobody_up(tmp_path):
+    old = Owner.take(tmp_path / "packs" / ".p00.owner")
+    Owner.take(tmp_path / "packs" / ".p00.owner")
+    pack = Pack(tmp_path, under=old, stop={"num_iterations": 2}).add("t0000").run()
+    assert [report.lost for report in pack.reports] == [True]
+    assert pack.engine.builds == []
+    assert not pack.store("t0000").results_path.exists()
 
 
 def test_an_evaluation_that_fails_is_its_members_failure(tmp_path):

@@ -4,6 +4,7 @@ import pytest
 from fake_engine import FakeClock
 
 from analysis.records import CheckpointRecord, TrialRecord
+from tune_jobs.ownership import Owner, OwnershipLostError
 from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.store import SweepStore
 from tune_jobs.trial import Progress
@@ -116,3 +117,42 @@ def test_how_trials_end(kept):
     ]
     keeper.started("t0001")
     assert (keeper.record("t0001").error, keeper.record("t0001").num_failures) == (None, 1)
+
+
+def test_who_lost_the_run_writes_no_record(tmp_path):
+    """A driver that was stopped for so long that another one took the sweep up."""
+    store = SweepStore(tmp_path / "mine")
+    store.create()
+    record = TrialRecord(trial_id="t0000", index=0, point_index=0, seed=1, point={})
+    store.trial("t0000").write_record(record)
+    run = Owner.take(store.folder / ".owner")
+    keeper = RecordKeeper(store, ["t0000"], lambda record: None, run=run)
+    keeper.started("t0000")
+    keeper.flush()
+    assert on_disk(store, "t0000").status == "running"
+    Owner.take(store.folder / ".owner")
+    keeper.progressed("t0000", progress(status="failed", error="it is not for it to say"), node="here", pid=1)
+    for write in (keeper.flush, keeper.close, lambda: keeper.change("t0000", point={"lr": 1.0})):
+        with pytest.raises(OwnershipLostError):
+            write()
+    assert on_disk(store, "t0000").status == "running"
+    assert on_disk(store, "t0000").point == {}
+    assert not (store.trial("t0000").folder / "tensorboard").exists()
+
+
+def test_a_trial_that_another_process_has_is_paused_and_has_not_failed(kept):
+    store, keeper, _, _ = kept
+    keeper.started("t0003")
+    keeper.lost("t0003")
+    keeper.flush()
+    record = on_disk(store, "t0003")
+    assert (record.status, record.num_failures, record.error) == ("paused", 0, None)
+    assert keeper.running == set()
+
+
+def test_what_was_damaged_stays_in_the_record(kept):
+    store, keeper, _, _ = kept
+    keeper.progressed("t0003", progress(1, notes=("a", "b")), node="here", pid=1)
+    keeper.progressed("t0003", progress(2, notes=("b", "c"), status="completed"), node="here", pid=1)
+    keeper.flush()
+    assert on_disk(store, "t0003").notes == ("a", "b", "c")

@@ -177,13 +177,27 @@ def test_a_last_line_without_its_end_is_not_read(trial, torn):
     assert [record.iteration for record in trial.read_iterations()] == [1]
 
 
-def test_a_damaged_line_within_is_an_error_with_its_number(trial):
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"iteration": "x"}',
+        b'{"iteration": 2, "num_env_st{"iteration": 2, "num_env_steps": 5}',
+        b"\xff\x00\xfe junk \x80",
+        b"[1, 2]",
+        b"null",
+        b"",
+        make_iteration(1).model_dump_json().encode(),
+    ],
+)
+def test_a_damaged_line_within_is_left_out_with_a_warning_that_says_where(trial, caplog, line):
     trial.keep_iterations([make_iteration(1)])
-    with trial.results_path.open("a") as file:
-        file.write('{"iteration": "x"}\n')
+    with trial.results_path.open("ab") as file:
+        file.write(line + b"\n")
     trial.append_iterations([make_iteration(3)])
-    with pytest.raises(CheckpointError, match="line 2"):
-        trial.read_iterations()
+    assert [record.iteration for record in trial.read_iterations()] == [1, 3]
+    (warning,) = caplog.messages
+    assert str(trial.results_path) in warning
+    assert "line 2" in warning
 
 
 # -- checkpoints

@@ -9,6 +9,8 @@ from fake_engine import FakeClock, FakeEngine
 from trial_runs import Trial
 
 from policies.errors import CheckpointError
+from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.recovery import latest_damaged
 from tune_jobs.store import SweepStore, TrialStore
 
 # -- going on
@@ -111,14 +113,170 @@ def test_half_written_checkpoints_are_removed_and_never_used(tmp_path):
     assert not half.exists()
 
 
-def test_a_damaged_latest_checkpoint_is_an_error_and_no_fresh_start(tmp_path):
-    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1}).run_to(2)
+def flip_a_bit(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+DAMAGES = {
+    "one bit": flip_a_bit,
+    "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "empty": lambda path: path.write_bytes(b""),
+    "gone": lambda path: path.unlink(),
+}
+
+
+# A manifest has no hash of its own: a bit of a score in it is a matter of who reads scores.
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        (name, damage)
+        for name in ("engine.json", "policy.safetensors", "manifest.json")
+        for damage in DAMAGES
+        if (name, damage) != ("manifest.json", "one bit")
+    ],
+)
+def test_a_damaged_latest_checkpoint_is_set_aside_and_the_one_before_is_taken(tmp_path, name, damage):
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(6)
     store = TrialStore(tmp_path, "t0000")
-    (store.checkpoints_folder / "000002" / "engine.json").write_text("{}")
-    with pytest.raises(CheckpointError, match=r"engine\.json"):
-        Trial(tmp_path)
-    # Nothing was lost by looking.
-    assert [record.iteration for record in store.read_iterations()] == [1, 2]
+    bad = store.checkpoint_folder(6)
+    DAMAGES[damage](bad / name)
+    files = {path.name: path.read_bytes() for path in bad.iterdir() if path.is_file()}
+
+    again = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}, stop={"num_iterations": 8})
+    assert again.engine.builds == ["000005"]
+    assert again.loop.iteration == 5
+    assert [record.iteration for record in again.results] == [1, 2, 3, 4, 5]
+    # Kept, under a name that is no checkpoint's, and said.
+    aside = store.folder / "damaged" / "000006"
+    assert {path.name: path.read_bytes() for path in aside.iterdir() if path.is_file()} == files
+    log = store.log_path.read_text()
+    assert "checkpoint 000006 is damaged and kept as damaged/000006; the trial goes on from checkpoint 000005" in log
+    progress = again.run()
+    assert (progress.status, progress.iteration) == ("completed", 8)
+    assert progress.notes[0] in log
+    assert [record.iteration for record in again.results] == list(range(1, 9))
+    assert again.kept[-1] == 8
+
+
+def test_a_trial_all_of_whose_checkpoints_are_damaged_begins_again_and_says_so(tmp_path):
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
+    store = TrialStore(tmp_path, "t0000")
+    for iteration in store.checkpoint_iterations():
+        (store.checkpoint_folder(iteration) / "engine.json").write_text("{}")
+    again = Trial(tmp_path)
+    assert again.engine.builds == [None]
+    assert (again.results, again.loop.iteration) == ([], 0)
+    notes = again.run_to(1).notes
+    assert len(notes) >= 2
+    assert all("the trial goes on from its start" in note for note in notes)
+
+
+def test_a_checkpoint_set_aside_twice_is_kept_twice(tmp_path):
+    for _ in range(2):
+        trial = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3})
+        trial.run_to(4)
+        (trial.store.checkpoint_folder(4) / "engine.json").write_text("{}")
+    Trial(tmp_path)
+    assert sorted(path.name for path in (trial.store.folder / "damaged").iterdir()) == ["000004", "000004-2"]
+    assert latest_damaged(trial.store) == 4
+
+
+def test_a_whole_checkpoint_that_does_not_restore_is_an_error_and_no_older_one_is_taken(tmp_path):
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
+
+    class OfOtherValues(FakeEngine):
+        def build(self, task, checkpoint):
+            raise CheckpointError(f"{checkpoint.name} is of other hyperparameters.")
+
+    with pytest.raises(CheckpointError, match="000004 is of other hyperparameters"):
+        Trial(tmp_path, engine=OfOtherValues())
+    store = TrialStore(tmp_path, "t0000")
+    assert not (store.folder / "damaged").exists()
+    assert [record.iteration for record in store.read_iterations()] == [1, 2, 3, 4]
+
+
+# -- results that can't be read
+
+
+@pytest.mark.parametrize("junk", [b'{"iterat{"iteration": 3}', b"\x00\xff\x80", b'{"score": 1}', b"7"])
+@pytest.mark.parametrize("place", [1, 3, 4, 6])
+def test_a_line_that_cannot_be_read_is_set_aside_and_the_trial_goes_on(tmp_path, place, junk):
+    """Before the checkpoint, at it, after it, at the end: the rest of the curve stays."""
+    first = Trial(tmp_path, scores=lambda i: -float(i), checkpoints={"every_iterations": 4, "keep": 1})
+    first.run_to(6)
+    lines = first.store.results_path.read_bytes().splitlines()
+    lines[place - 1] = junk
+    first.store.results_path.write_bytes(b"\n".join(lines) + b"\n")
+
+    again = Trial(
+        tmp_path, scores=lambda i: -float(i), checkpoints={"every_iterations": 4, "keep": 1}, stop={"num_iterations": 9}
+    )
+    assert again.engine.builds == ["000004"]
+    assert (again.loop.iteration, again.engine.iteration) == (4, 4)
+    assert (again.store.folder / "results.damaged").read_bytes() == junk + b"\n"
+    progress = again.run()
+    assert (progress.status, progress.iteration, progress.num_env_steps) == ("completed", 9, 900)
+    # What the checkpoint had learned from is not done again, so of a line before it only the hole is left.
+    expected = [number for number in range(1, 10) if number != place or place > 4]
+    assert [record.iteration for record in again.results] == expected
+    assert [record.num_env_steps for record in again.results] == [100 * number for number in expected]
+    assert f"results.jsonl: line {place}" in progress.notes[0]
+    assert progress.notes[0] in again.store.log_path.read_text()
+
+
+def test_results_that_are_gone_leave_a_hole_and_no_other_count(tmp_path):
+    first = Trial(tmp_path, checkpoints={"every_iterations": 4, "keep": 1})
+    first.run_to(4)
+    first.store.results_path.unlink()
+    again = Trial(tmp_path, stop={"num_iterations": 6})
+    assert (again.loop.iteration, again.engine.iteration) == (4, 4)
+    again.run()
+    assert [(record.iteration, record.num_env_steps) for record in again.results] == [(5, 500), (6, 600)]
+
+
+# -- who trains it
+
+
+def test_who_lost_the_trial_writes_nothing_any_more(tmp_path):
+    task = {"checkpoints": {"every_iterations": 2, "keep": 9}, "stop": {"num_iterations": 9}}
+    old = Trial(tmp_path, **task)
+    old.run_to(3)
+    new = Trial(tmp_path, **task)
+
+    def everything():
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    before = everything()
+    with pytest.raises(OwnershipLostError, match="taken up by another process"):
+        old.loop.advance(math.inf)
+    with pytest.raises(OwnershipLostError):
+        old.loop.pause()
+    with pytest.raises(OwnershipLostError):
+        old.store.take(Owner(tmp_path / ".owner", "of a run that is over"))
+    assert everything() == before
+    assert new.run().status == "completed"
+    assert [record.iteration for record in new.results] == list(range(1, 10))
+
+
+def test_a_trial_that_is_taken_while_a_checkpoint_is_written_keeps_none_of_it(tmp_path):
+    old = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 9})
+    old.run_to(3)
+    save, others = old.engine.save, []
+
+    def taken_meanwhile(folder):
+        others.append(Trial(tmp_path, stop={"num_iterations": 6}))
+        folder.mkdir(exist_ok=True)
+        save(folder)
+
+    old.engine.save = taken_meanwhile
+    with pytest.raises(OwnershipLostError):
+        old.loop.advance(math.inf)
+    (new,) = others
+    assert new.engine.builds == ["000003"]
+    assert sorted(path.name for path in new.store.checkpoints_folder.iterdir()) == ["000001", "000002", "000003"]
+    assert new.run().status == "completed"
 
 
 def test_a_trial_that_had_reached_its_end_is_done_at_once(tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.baselines import baseline_policy
+from policies.checked_envs import CheckedEnvs
 from policies.envs import make_vector_env
 from policies.errors import CheckpointError
 from policies.evaluate import Resettable
@@ -45,7 +46,8 @@ class BaselineEngine:
             # Other episodes than those it has played already.
             seed = int(np.random.SeedSequence([task.seed, self._iteration]).generate_state(1)[0])
         # The failure penalty is for learning alone: returns are those of the env itself.
-        self._env = make_vector_env(task.env_id, task.env_args, hyperparams.num_envs)
+        env = make_vector_env(task.env_id, task.env_args, hyperparams.num_envs)
+        self._env = CheckedEnvs(env, task.env_id)
         self._policy: Policy = policy_from_portable(self.policy())
         if isinstance(self._policy, Resettable):
             self._policy.reset(seed)

@@ -1,0 +1,135 @@
+"""Numbers of an environment that are none, found where it gives them.
+
+A NaN or an infinite number in a reward or an observation ruins the weights of whoever learns from it, many steps later
+and far away. Bounds of a space that are infinite allow any number, but not these.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.env_faults import close_env, env_failed
+from policies.errors import EnvFailedError
+
+_LARGEST = float(np.finfo(np.float32).max)
+"""Learners compute in 32 bits: what is larger is infinite to them."""
+_HINT = "Mend the env: training on it would ruin the weights."
+
+
+def is_sound(values: NDArray[Any]) -> bool:
+    """Whether all numbers are finite, in 32 bits too."""
+    # NaN is not <= anything.
+    return values.dtype == np.uint8 or bool((np.abs(values) <= _LARGEST).all())
+
+
+def check_reward(reward: float, env_id: str, num_steps: int) -> None:
+    """Refuse a reward that is not finite.
+
+    Args:
+        reward: The env's own.
+        env_id: For the message.
+        num_steps: Env steps of its episode, that of the reward included.
+
+    Raises:
+        EnvFailedError: It is NaN or infinite.
+    """
+    if not abs(reward) <= _LARGEST:
+        raise EnvFailedError(
+            f"The reward of env step {num_steps} of an episode of {env_id} was {_name(reward)}.", _HINT
+        )
+
+
+def check_observation(observation: Any, env_id: str, num_steps: int) -> None:
+    """Refuse an observation that is not finite, whatever the bounds of its space.
+
+    Args:
+        observation: Of any shape.
+        env_id: For the message.
+        num_steps: Env steps of its episode so far; 0: it is the reset's.
+
+    Raises:
+        EnvFailedError: A number of it is NaN or infinite.
+    """
+    values = np.asarray(observation)
+    if is_sound(values):
+        return
+    place = int(np.flatnonzero(~(np.abs(values) <= _LARGEST))[0])
+    which = f"after env step {num_steps}" if num_steps else "from reset(), at the beginning"
+    raise EnvFailedError(
+        f"The observation {which} of an episode of {env_id} was {_name(float(values.flat[place]))} (number {place} of "
+        f"its {values.size}, counted from 0).",
+        _HINT,
+    )
+
+
+def _name(value: float) -> str:
+    if math.isnan(value):
+        return "NaN"
+    if math.isinf(value):
+        return "infinite" if value > 0 else "minus infinity"
+    return f"{value:g}, which is infinite in 32 bits"
+
+
+class CheckedEnvs(gym.vector.VectorWrapper):
+    """A vector environment whose errors are `EnvError`s, and whose rewards and observations are finite.
+
+    For those that reset in the step after an episode's end, as `make_vector_env` makes them.
+
+    Args:
+        env: Without a failure penalty: its own rewards are looked at.
+        env_id: For messages.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
+        super().__init__(env)
+        self._env_id = env_id
+        self._lengths = np.zeros(env.num_envs, dtype=np.int64)
+        self._ended = np.zeros(env.num_envs, dtype=np.bool_)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset all sub-environments.
+
+        Raises:
+            EnvFailedError: One raised an error, or its observation is not finite.
+        """
+        try:
+            observations, info = self.env.reset(seed=seed, options=options)
+        except BaseException as error:
+            raise env_failed(f"{self._env_id} raised an error in reset()", error) from error
+        self._lengths[:], self._ended[:] = 0, False
+        self._check(observations)
+        return observations, info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all sub-environments.
+
+        Raises:
+            EnvFailedError: One raised an error, or its reward or observation is not finite.
+        """
+        try:
+            observations, rewards, terminated, truncated, info = self.env.step(actions)
+        except BaseException as error:
+            raise env_failed(f"{self._env_id} raised an error in step()", error) from error
+        self._lengths += 1
+        self._lengths[self._ended] = 0
+        if not is_sound(rewards):
+            for reward, length in zip(rewards.tolist(), self._lengths.tolist(), strict=True):
+                check_reward(reward, self._env_id, length)
+        self._check(observations)
+        self._ended = np.logical_or(terminated, truncated)
+        return observations, rewards, terminated, truncated, info
+
+    def _check(self, observations: NDArray[Any]) -> None:
+        if not is_sound(observations):
+            for observation, length in zip(observations, self._lengths.tolist(), strict=True):
+                check_observation(observation, self._env_id, length)
+
+    def close(self, **kwargs: Any) -> None:
+        """Close all; that one cannot be closed harms nobody."""
+        del kwargs
+        close_env(self.env)

@@ -1,0 +1,79 @@
+"""Exceptions out of an environment's code, which may be anything.
+
+`SystemExit`, `KeyboardInterrupt` and the like would end the process of a trial, and all that train in it. Raised by an
+env they are its error and no more; raised for a signal to the process they have to pass.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+from policies.errors import EnvFailedError
+
+_notes_signals = False
+_signalled = False
+
+
+def note_signals() -> None:
+    """Let this process tell the exceptions of its signals from those that its environments raise.
+
+    For processes of trials, whose handlers of SIGTERM and SIGINT raise SystemExit and KeyboardInterrupt. Called in
+    another thread than the main one it does nothing.
+    """
+    global _notes_signals  # noqa: PLW0603 (signals are the process's)
+    if _notes_signals or threading.current_thread() is not threading.main_thread():
+        return
+    _notes_signals = True
+    for number in (signal.SIGINT, signal.SIGTERM):
+        handler = signal.getsignal(number)
+        if callable(handler):
+            signal.signal(number, _noting(handler))
+
+
+def _noting(handler: Callable[[int, FrameType | None], Any]) -> Callable[[int, FrameType | None], Any]:
+    def note(number: int, frame: FrameType | None) -> Any:
+        global _signalled  # noqa: PLW0603 (signals are the process's)
+        _signalled = True
+        return handler(number, frame)
+
+    return note
+
+
+def is_of_env(error: BaseException) -> bool:
+    """Whether an exception that came out of an env's code was raised by it, and not by a signal to this process."""
+    if isinstance(error, Exception):
+        return True
+    if _notes_signals:
+        return not _signalled
+    # Elsewhere only Ctrl-C and what acts as it does, in the process of whoever launched.
+    return not isinstance(error, KeyboardInterrupt)
+
+
+def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or choose another one.") -> EnvFailedError:
+    """The error for an exception that came out of an env's code.
+
+    Args:
+        what: What failed, such as "CartPole-v1 raised an error in step()".
+        error: What the env raised.
+        hint: What to do.
+
+    Raises:
+        BaseException: The error itself, if it came from a signal to this process.
+    """
+    if not is_of_env(error):
+        raise error
+    detail = str(error).strip().rstrip(".")
+    return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint)
+
+
+def close_env(env: Any) -> None:
+    """Close an environment that nobody needs any more; that it cannot be closed harms nobody."""
+    try:
+        env.close()
+    except BaseException as error:
+        if not is_of_env(error):
+            raise

@@ -1,0 +1,72 @@
+"""What pyproject.toml requires is what the code imports, no less and no more."""
+
+import ast
+import re
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+
+import pytest
+
+OWN = {"policies", "analysis", "tune_jobs"}
+# Why something is required that nothing here imports; by distribution.
+NOT_IMPORTED = {
+    "build": "the tests build the wheel by `python -m build`",
+    "mypy": "a command",
+    "ruff": "a command",
+    "pandas-stubs": "types, for mypy",
+    "types-pyyaml": "types, for mypy",
+}
+
+
+@pytest.fixture(scope="module")
+def project(pytestconfig):
+    return tomllib.loads((pytestconfig.rootpath / "pyproject.toml").read_text())["project"]
+
+
+def normal(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def distributions(requirements):
+    return {normal(re.match(r"[\w.-]+", text).group()) for text in requirements}
+
+
+def imported(folder, names):
+    """Distributions of other people's that the Python files of some folders import at their top level or anywhere."""
+    tops = set()
+    for path in [path for name in names for path in (folder / name).rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                tops |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                tops.add(node.module.partition(".")[0])
+            elif isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip":
+                tops.add(ast.literal_eval(node.args[0]).partition(".")[0])
+    local = {path.stem for path in (folder / "tests").rglob("*.py")} | {"tests"} | OWN
+    others = sorted(tops - sys.stdlib_module_names - local)
+    known = packages_distributions()
+    return {normal(known[top][0]) if top in known else normal(top) for top in others}
+
+
+def test_the_code_imports_what_it_requires_and_requires_what_it_imports(project, pytestconfig):
+    required = distributions(project["dependencies"])
+    optional = project["optional-dependencies"]
+    used = imported(pytestconfig.rootpath, OWN)
+    assert used - distributions([*optional["tpe"], *optional["box2d"]]) == required
+
+
+def test_the_extras_are_what_the_tests_import(project, pytestconfig):
+    optional = project["optional-dependencies"]
+    extras = distributions([text for name in ("test", "bench", "box2d", "tpe") for text in optional[name]])
+    used = imported(pytestconfig.rootpath, ["tests"])
+    assert used - extras - distributions(project["dependencies"]) == set()
+    assert extras - used == set(NOT_IMPORTED)
+
+
+def test_the_constraints_pin_everything_that_is_required(project, pytestconfig):
+    lines = (pytestconfig.rootpath / "constraints.txt").read_text().splitlines()
+    pinned = {normal(line.partition("==")[0]) for line in lines if "==" in line}
+    optional = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *(text for extra in optional.values() for text in extra)]
+    assert distributions(wanted) - pinned == set()

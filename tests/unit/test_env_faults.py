@@ -1,0 +1,235 @@
+"""Environments that raise what ends processes, or give numbers that are none: one trial fails, and says why."""
+
+import dataclasses
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_engine import make_task
+from odd_envs import RAISED
+from policy_factory import make_policy
+from test_packed_env_failures import go_on
+from test_packed_envs import assert_equal_bits, make, own_modules, seen_by
+
+from policies import env_faults
+from policies.checked_envs import CheckedEnvs
+from policies.envs import make_env, make_vector_env
+from policies.errors import EnvError
+from policies.evaluate import Evaluator, evaluate_policy
+from policies.packed.evaluation import evaluate_many
+from policies.policy import RandomPolicy
+from tune_jobs.engines.baseline import BaselineEngine
+
+__all__ = ["make", "own_modules"]
+
+FAULTY = "odd_envs:Faulty"
+NUMBERS = {"nan": "NaN", "inf": "infinite", "-inf": "minus infinity", "1e39": r"1e\+39|infinite"}
+
+
+@pytest.fixture(autouse=True)
+def in_a_trial(monkeypatch):
+    """As in a trial's process, where signals are noted; none came."""
+    monkeypatch.setattr(env_faults, "_notes_signals", True)
+    monkeypatch.setattr(env_faults, "_signalled", False)
+
+
+# -- packs
+
+
+STEPS = (
+    [({"raises": name}, rf"{FAULTY} raised an error in step\(\): {name}") for name in RAISED]
+    + [
+        ({"where": "reward", "number": number}, f"reward of env step 3 of an episode of {FAULTY} was ({words})")
+        for number, words in NUMBERS.items()
+    ]
+    + [
+        (
+            {"where": "observation", "number": number},
+            rf"observation after env step 3 of an episode of {FAULTY} was ({words}) \(number 1 of its 2",
+        )
+        for number, words in NUMBERS.items()
+    ]
+)
+
+
+# In processes it is the same code: one of each sort.
+@pytest.mark.parametrize(
+    ("kind", "fault", "words"),
+    [("scalar", *case) for case in STEPS] + [("processes", *STEPS[number]) for number in (0, 1, 4, 9)],
+)
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+def test_a_faulty_env_fails_its_member_alone(make, kind, fault, words):
+    envs = make(FAULTY, kind, env_args={**fault, "action": 1}, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
+    alone = make(FAULTY, "scalar", members={"a": 1, "c": 3})
+    for index in range(12):
+        # The third step of the second episode.
+        step, expected = go_on(envs, "b", 1 if index == 9 else 0), go_on(alone)
+        for member_id in ("a", "c"):
+            assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
+        assert list(envs.errors) == (["b"] if index >= 9 else [])
+        if index >= 9:
+            assert all((values == 0).all() for values in seen_by(envs, step, "b").values())
+    with pytest.raises(EnvError, match=words):
+        raise envs.errors["b"]
+
+
+@pytest.mark.parametrize("kind", ["scalar", "processes"])
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"raises": "SystemExit"}, r"raised an error in reset\(\): SystemExit: 3"),
+        ({"raises": "KeyboardInterrupt"}, r"raised an error in reset\(\): KeyboardInterrupt"),
+        ({"number": "nan"}, r"observation from reset\(\), at the beginning of an episode of .* was NaN"),
+    ],
+)
+def test_a_reset_that_goes_wrong_makes_no_member(make, kind, fault, words):
+    args = {"where": "reset", "seed": 13, **fault}
+    envs = make(FAULTY, kind, num_envs=2, env_args=args, members={"a": 2}, num_processes=2)
+    with pytest.raises(EnvError, match=words):
+        envs.add("b", 12)  # its second sub-environment, in another process than the first
+    assert envs.member_ids == ("a",)
+    assert envs.errors == {}
+    go_on(envs)
+    envs.add("b", 14)
+    go_on(envs)
+    assert envs.errors == {}
+
+
+@pytest.mark.parametrize("kind", ["scalar", "processes"])
+def test_an_env_that_cannot_be_closed_harms_nobody(make, kind):
+    args = {"where": "close", "raises": "SystemExit"}
+    envs = make(FAULTY, kind, env_args=args, members={"a": 1, "b": 2}, num_processes=2)
+    go_on(envs)
+    envs.remove("a")
+    go_on(envs)
+    assert envs.member_ids == ("b",)
+    assert envs.errors == {}
+
+
+@pytest.mark.parametrize("name", RAISED)
+def test_a_constructor_may_raise_anything(name):
+    for make_one in (make_env, lambda *args: make_vector_env(*args, 2)):
+        with pytest.raises(EnvError, match=f"cannot be made.*{name}"):
+            make_one(FAULTY, {"where": "init", "raises": name})
+
+
+# -- vector environments
+
+
+@pytest.mark.parametrize("name", RAISED)
+@pytest.mark.parametrize("where", ["reset", "step"])
+def test_a_vector_env_fails_as_scalar_ones_do(name, where):
+    envs = CheckedEnvs(make_vector_env(FAULTY, {"where": where, "raises": name}, 2), FAULTY)
+    with pytest.raises(EnvError, match=rf"{FAULTY} raised an error in {where}\(\): {name}") as caught:
+        step_vector(envs, 3)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("where", ["reward", "observation"])
+def test_a_vector_env_says_what_is_not_finite(number, where):
+    args = {"where": where, "number": number, "action": 1}
+    envs = CheckedEnvs(make_vector_env(FAULTY, args, 2), FAULTY)
+    # Seven steps, one that resets, and two of the next episode.
+    step_vector(envs, 10)
+    at = "of env step 3" if where == "reward" else "after env step 3"
+    with pytest.raises(EnvError, match=rf"{where} {at} of an episode of {FAULTY} was ({NUMBERS[number]})"):
+        envs.step(np.array([0, 1]))
+
+
+def step_vector(envs, num_steps):
+    envs.reset(seed=5)
+    for _ in range(num_steps):
+        envs.step(np.zeros(2, dtype=np.int64))
+
+
+# -- greedy episodes
+
+
+FAULTS = [{"raises": name} for name in RAISED] + [
+    {"where": where, "number": number} for where in ("reward", "observation") for number in ("nan", "inf", "-inf")
+]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: "-".join(fault.values()))
+def test_greedy_episodes_say_what_the_env_did(fault):
+    words = fault.get("raises") or NUMBERS[fault["number"]]
+    for policy in (make_policy(FAULTY), RandomPolicy.for_env(FAULTY)):
+        with pytest.raises(EnvError, match=rf"(?s){FAULTY}.*{words}"):
+            evaluate_policy(policy, env_id=FAULTY, env_args=fault, seeds=[5, 6])
+    with Evaluator(FAULTY, fault, [5, 6]) as evaluator:
+        results = evaluate_many(evaluator, [make_policy(FAULTY, seed=seed) for seed in (1, 2)])
+    assert all(isinstance(result, EnvError) for result in results)
+
+
+def test_an_evaluator_whose_envs_cannot_be_closed_is_closed():
+    evaluator = Evaluator(FAULTY, {"where": "close", "raises": "SystemExit"}, [5])
+    assert evaluator.run(make_policy(FAULTY)).lengths == (7,)
+    evaluator.close()
+
+
+# -- baselines
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: "-".join(fault.values()))
+def test_a_baseline_s_trial_says_what_the_env_did(tmp_path, fault):
+    task = dataclasses.replace(make_task(tmp_path), algorithm="random", env_id=FAULTY, env_args=fault)
+    engine = BaselineEngine()
+    engine.build(task, None)
+    with pytest.raises(EnvError, match=fault.get("raises") or NUMBERS[fault["number"]]):
+        engine.train_iteration()
+    engine.close()
+
+
+# -- signals
+
+CHILD = """
+import os, signal, sys
+import gymnasium as gym, numpy as np
+from policies.env_faults import note_signals
+from policies.env_modules import allow_modules
+from policies.errors import EnvError
+from policies.packed.sub_envs import SubEnvs
+
+signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(5))
+note_signals()
+allow_modules(["signalling"])
+envs = SubEnvs("signalling:Env", {"signal": sys.argv[1]})
+envs.add("a", [1])
+print("raised", *envs.step(np.zeros(1, int)).errors, flush=True)
+"""
+ENV = """
+import os, signal, sys
+import gymnasium as gym, numpy as np
+class Env(gym.Env):
+    observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
+    def __init__(self, signal): self.signal = signal
+    def reset(self, *, seed=None, options=None): return np.zeros(1, np.float32), {}
+    def step(self, action):
+        if self.signal == "none": sys.exit(5)
+        os.kill(os.getpid(), getattr(signal, self.signal))
+        for _ in range(1000): os.getpid()
+        raise ZeroDivisionError
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 5), ("SIGINT", -2), ("none", 0)])
+def test_a_signal_to_the_process_is_no_fault_of_the_env(tmp_path, name, code):
+    (tmp_path / "signalling.py").write_text(ENV)
+    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    child = subprocess.run(
+        [sys.executable, "-c", CHILD, name], env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True,
+        timeout=120, check=False,
+    )  # fmt: skip
+    assert child.returncode == code, child.stderr
+    assert child.stdout == ("raised a\n" if name == "none" else "")
+
+
+def test_ctrl_c_in_the_process_of_whoever_launched_is_ctrl_c(monkeypatch):
+    monkeypatch.setattr(env_faults, "_notes_signals", False)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_policy(make_policy(FAULTY), env_id=FAULTY, env_args={"raises": "KeyboardInterrupt"}, seeds=[5])

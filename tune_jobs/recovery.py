@@ -1,0 +1,117 @@
+"""What of a trial's folder can be gone on with; what is damaged is set aside, never deleted, and never silently.
+
+Results that can't be read go to `results.damaged`, checkpoints and copies to `damaged/`; only the owner does it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from analysis.records import CheckpointRecord
+from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.places import within
+from tune_jobs.results_file import ResultsFile, read_results
+from tune_jobs.store import TrialStore, verify_checkpoint
+
+DAMAGED_FOLDER = "damaged"
+DAMAGED_RESULTS = "results.damaged"
+
+
+def write_log(path: Path, text: str) -> None:
+    """Append to a trial's log what concerns this trial, whatever the process prints elsewhere."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n")
+
+
+def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
+    """Read a trial's results, and set aside what of them cannot be read.
+
+    The lines stay in results.jsonl until the trial writes what it goes on with.
+
+    Returns:
+        What can be read, and what to tell of the rest.
+    """
+    found = read_results(trial.results_path)
+    unreadable = [bad.content for bad in found.bad] + ([found.tail] if found.tail else [])
+    if unreadable:
+        with trial.owned(), within(trial.folder, DAMAGED_RESULTS).open("ab") as file:
+            file.write(b"".join(content + b"\n" for content in unreadable))
+    # Half a line at the end is what every kill may leave: it is done again.
+    return found, [f"results.jsonl: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
+
+
+def take_up_checkpoints(trial: TrialStore) -> tuple[list[CheckpointRecord], list[str]]:
+    """The checkpoints a trial goes on with, the last of them verified; damaged ones are set aside.
+
+    Of the older ones only the manifests are read: the files are checked before they are used.
+
+    Returns:
+        The checkpoints, oldest first, and what to tell of those that were set aside.
+    """
+    known: list[CheckpointRecord] = []
+    damaged: list[tuple[Path, Exception]] = []
+    for iteration in trial.checkpoint_iterations():
+        try:
+            known.append(trial.checkpoint(iteration))
+        except (CheckpointError, NotFoundError) as error:
+            damaged.append((trial.checkpoint_folder(iteration), error))
+    while known:
+        folder = trial.checkpoint_folder(known[-1].iteration)
+        try:
+            verify_checkpoint(folder)
+            break
+        except (CheckpointError, NotFoundError) as error:
+            damaged.append((folder, error))
+            known.pop()
+    start = f"checkpoint {known[-1].iteration:06d}" if known else "its start: no older one is whole"
+    notes = [
+        f"checkpoint {folder.name} is damaged and kept as {set_aside(trial, folder)}; "
+        f"the trial goes on from {start}. {_message(error)}"
+        for folder, error in damaged
+    ]
+    return known, notes
+
+
+def take_up_copy(trial: TrialStore, folder: Path) -> tuple[Path | None, list[str]]:
+    """Another trial's checkpoint that this one goes on from, verified; None, and set aside, if it is damaged."""
+    try:
+        verify_checkpoint(folder)
+    except (CheckpointError, NotFoundError) as error:
+        target = set_aside(trial, folder, prefix="copied-")
+        note = (
+            f"the copied checkpoint {folder.name} is damaged and kept as {target}; the trial goes on from its own "
+            f"latest checkpoint, with the values it was given. {_message(error)}"
+        )
+        return None, [note]
+    return folder, []
+
+
+def set_aside(trial: TrialStore, folder: Path, prefix: str = "") -> str:
+    """Move a folder to where nobody takes it for a checkpoint.
+
+    Returns:
+        Where it lies now, from the trial's folder.
+    """
+    target = within(trial.folder, DAMAGED_FOLDER, f"{prefix}{folder.name}")
+    number = 1
+    while target.exists():
+        number += 1
+        target = target.with_name(f"{prefix}{folder.name}-{number}")
+    with trial.owned():
+        target.parent.mkdir(exist_ok=True)
+        if folder.is_dir():
+            folder.replace(target)
+    return f"{DAMAGED_FOLDER}/{target.name}"
+
+
+def latest_damaged(trial: TrialStore) -> int:
+    """Of the checkpoints of a trial that were set aside, the latest one's iteration; 0: there is none."""
+    names = [folder.name.partition("-")[0] for folder in (trial.folder / DAMAGED_FOLDER).glob("[0-9]*")]
+    return max((int(name) for name in names if name.isdecimal()), default=0)
+
+
+def _message(error: Exception) -> str:
+    return error.message if isinstance(error, CheckpointError | NotFoundError) else str(error)
