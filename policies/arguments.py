@@ -145,8 +145,9 @@ def _number(value: Any) -> Any:
 
 
 _FITS: dict[Any, Callable[[Any], Any]] = {str: _text, Path: _path, bool: _flag, int: _whole, float: _number}
+_PATH_WORDS = f"a name or path (not empty, each part at most {_LONGEST_NAME} bytes)"
 _NAMES = {
-    str: "a text", Path: "a path", bool: "True or False", int: "a whole number", float: "a number",
+    str: "a text", Path: _PATH_WORDS, bool: "True or False", int: "a whole number", float: "a number",
     type(None): "None", Mapping: "a mapping", type: "a class",
 }  # fmt: skip
 
@@ -154,7 +155,9 @@ _NAMES = {
 def _words(kind: Any) -> str:
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
-        return " or ".join(map(_words, parts))
+        # A text beside a path is one, and is looked at as one.
+        named = [_words(part) for part in parts if part is not str or Path not in parts]
+        return " or ".join(named)
     if origin is Literal:
         return " or ".join(map(repr, parts))
     if origin is Annotated:

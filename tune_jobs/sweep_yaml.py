@@ -238,7 +238,7 @@ class _Builder:
             raise self._error(
                 node,
                 f"{text} may mean a time, {total:.10g} to some, or a text",
-                f"Write the number of seconds (or whatever is asked for), or {as_text}.",
+                f"Write {total:.10g} if that is meant, or {as_text}.",
             )
 
     def _check_tag(self, node: yaml.Node, kind: str) -> None:

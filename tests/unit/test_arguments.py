@@ -120,7 +120,8 @@ def test_what_is_given_wrong_often_is_told_in_words():
     assert str(caught.value) == "The argument num_episodes is 0.\nGive a whole number from 1 to 262,144."
     with pytest.raises(SpecError) as caught:
         tune_jobs.launch(3)
-    assert caught.value.hint == "Give a text or a path or a mapping or a SweepSpec."
+    path = "a name or path (not empty, each part at most 255 bytes)"
+    assert caught.value.hint == f"Give {path} or a mapping or a SweepSpec."
     with pytest.raises(SpecError, match="overrides is 'a=1'"):
         tune_jobs.load_spec(MINIMAL, "a=1")
 
