@@ -51,7 +51,7 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
         # Without what is returned: that may be named for type checkers alone.
         given = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
         holder = types.SimpleNamespace(__annotations__=given)
-        return get_type_hints(holder, globalns=function.__globals__, include_extras=True)
+        return get_type_hints(holder, globalns=inspect.unwrap(function).__globals__, include_extras=True)
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:

@@ -25,6 +25,7 @@ from tune_jobs.own_code import modules_of
 from tune_jobs.ownership import OWNER_FILE, Owner
 from tune_jobs.plan import SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import stored_spec
 from tune_jobs.store import SweepStore
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ def run_sweep(
         record.model_copy(update={"state": "running", "started_at": record.started_at or started, "ended_at": None})
     )
     todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
-    spec = SweepSpec.model_validate(record.spec)
+    spec = stored_spec(record)
     monitor = SweepMonitor(
         store.name,
         store.read_trials(),

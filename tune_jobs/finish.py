@@ -21,7 +21,7 @@ from policies.policy import Policy, RandomPolicy, load_policy, policy_from_porta
 from policies.portable import PolicyNetwork, read_policy, save_policy
 from tune_jobs.candidates import choose, leave_out, read_trials
 from tune_jobs.seeds import confirmation_seeds
-from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import stored_spec
 from tune_jobs.storage import storage_folder
 from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
 
@@ -66,7 +66,7 @@ def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
         EnvError: The environment raised an error, hung, or ended its process.
     """
     sweep = _trusted(store).read_record()
-    spec = SweepSpec.model_validate(sweep.spec)
+    spec = stored_spec(sweep)
     selection, portable = choose(store, read_trials(store))
     seeds = confirmation_seeds(spec.seed, num_episodes)
     policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
@@ -156,7 +156,7 @@ def find_policy(
         policy = load_policy(path)
     else:
         store, trial_id = _sweep_and_trial(text, storage)
-        timeout_s = SweepSpec.model_validate(store.read_record().spec).iteration_timeout_s
+        timeout_s = stored_spec(store.read_record()).iteration_timeout_s
         if trial_id is None:
             if not (store.best_folder / "evaluation.json").is_file():
                 choose_best(store)

@@ -33,6 +33,7 @@ from tune_jobs.record_keeper import Listener, RecordKeeper
 from tune_jobs.schedulers import build_scheduler, waits_for_others
 from tune_jobs.searcher import PointChooser, PointSearcher
 from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import stored_spec
 from tune_jobs.store import SweepStore
 from tune_jobs.trainable import TrialTrainable
 from tune_jobs.trial import Progress
@@ -94,7 +95,7 @@ class _Run:
         self._store = store
         # What each process is told: which sweep, for which run, and who is gone when it is to end.
         self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
-        self._spec = SweepSpec.model_validate(store.read_record().spec)
+        self._spec = stored_spec(store.read_record())
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
         self._scheduler = self._build_scheduler()
         chooser = PointChooser(self._spec, self.keeper.all_records, self.keeper.change)

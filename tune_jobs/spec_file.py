@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from analysis.records import SweepRecord
 from policies.arguments import checked
-from policies.errors import SpecError, shortened
+from policies.errors import CheckpointError, SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tune_jobs.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.search_space import Domain
@@ -127,6 +128,23 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
     if len(lines) == 1:
         raise SpecError(f"{label}: {lines[0]}", _HINT)
     raise SpecError(f"{label}: {len(lines)} problems:\n" + "\n".join(f"  {line}" for line in lines), _HINT)
+
+
+def stored_spec(record: SweepRecord) -> SweepSpec:
+    """The spec that a sweep was launched with.
+
+    Raises:
+        CheckpointError: The sweep's record holds none that this version accepts.
+    """
+    try:
+        return SweepSpec.model_validate(record.spec)
+    except ValidationError as error:
+        problems = _problems(error, record.spec)
+    told = "; ".join(f"spec.{path}: {text}" for path, text in dict.fromkeys(problems))
+    raise CheckpointError(
+        f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told}",
+        "Restore it from a backup, or use the version of tune-jobs that stands in it.",
+    )
 
 
 def json_schema() -> dict[str, Any]:

@@ -31,7 +31,7 @@ from tune_jobs.own_code import Source, load_source
 from tune_jobs.plan import make_plan
 from tune_jobs.results import dataframe, report, trials
 from tune_jobs.search_checks import check_extendable
-from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import stored_spec
 from tune_jobs.storage import choose_store, create_store, stem_of, storage_folder
 from tune_jobs.store import SweepStore, list_sweep_stores
 
@@ -57,8 +57,8 @@ class SweepStatus:
     """Whether a process runs it now."""
 
 
-@guarding(start=True)
 @checked
+@guarding(start=True)
 def launch(
     source: Source,
     *,
@@ -188,7 +188,7 @@ def _go_on(
         stack.enter_context(store.lock())
         record = store.read_record()
         allow_modules(record.allowed_modules)
-        spec = SweepSpec.model_validate(record.spec)
+        spec = stored_spec(record)
         if num_samples:
             check_extendable(spec)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
@@ -267,8 +267,8 @@ def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: 
     return choose_best(find_sweep(sweep, storage), num_episodes)
 
 
-@guarding(start=True)
 @checked
+@guarding(start=True)
 def evaluate(
     source: str | Path,
     *,
@@ -299,8 +299,8 @@ def evaluate(
     return finish.evaluate(finish.find_policy(source, storage, env_id, action), num_episodes, first_seed)
 
 
-@guarding()
 @checked
+@guarding()
 def video(
     source: str | Path,
     *,

@@ -31,7 +31,7 @@ from tune_jobs.engines.protocol import TrainingEngine, TrialTask
 from tune_jobs.ownership import OWNER_FILE, Owner
 from tune_jobs.recovery import latest_damaged
 from tune_jobs.schedulers import METRIC, WORST_SCORE, grace_env_steps
-from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_file import stored_spec
 from tune_jobs.store import SweepStore
 from tune_jobs.trial import Progress, TrialLoop
 
@@ -81,7 +81,7 @@ class TaskReader:
     def __init__(self, sweep_folder: Path) -> None:
         self.store = SweepStore(sweep_folder)
         self.sweep = self.store.read_record()
-        self.spec = SweepSpec.model_validate(self.sweep.spec)
+        self.spec = stored_spec(self.sweep)
 
     def read(self, trial_id: str) -> TrialTask:
         """What to run as a trial.

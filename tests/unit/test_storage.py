@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from spec_errors import MINIMAL
 
-from policies.errors import SpecError
+from policies.errors import CheckpointError, SpecError
 from tune_jobs import sweeps
 from tune_jobs.driving import write_new
 from tune_jobs.machine import Machine
@@ -51,6 +51,28 @@ def test_storage_is_what_is_given_else_the_environments_else_here(tmp_path, monk
     monkeypatch.setenv("TUNE_JOBS_STORAGE", "theirs")
     assert storage_folder(None) == tmp_path / "theirs"
     assert storage_folder("mine") == tmp_path / "mine"
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"stop": 3}, "spec.stop: 3 is not allowed: give a mapping of its fields"),
+        ({"env": None}, "spec.env: is missing"),
+        ({"later": 1}, "spec.later: there is no field 'later' here"),
+        ({"hyperparams": {"lr": "x"}}, "spec.hyperparams.lr: 'x'"),
+    ],
+)
+def test_a_spec_that_was_changed_in_the_sweeps_record_is_told_in_its_words(tmp_path, change, part):
+    spec = load_spec(MINIMAL)
+    store = create_store("mine", "x", tmp_path)
+    write_new(store, spec, make_plan(spec, Machine(1)), None)
+    record = store.read_record()
+    store.write_record(record.model_copy(update={"spec": {**record.spec, **change}}))
+    for call in (sweeps.resume, sweeps.best, sweeps.report):
+        with pytest.raises(CheckpointError) as caught:
+            call("mine", storage=tmp_path)
+        assert "sweep.json of sweep mine" in caught.value.message
+        assert part in caught.value.message
 
 
 @pytest.mark.parametrize(
