@@ -71,7 +71,7 @@ class Page:
 
     @property
     def steps(self) -> int:
-        """Steps since the last reset, of whichever environment that was; one that has only begun included."""
+        """Of the environment that was stepped last: its steps since its last reset, the one that runs included."""
         return self._cells[_STEPS]
 
     @contextlib.contextmanager
@@ -90,8 +90,14 @@ class Page:
             cells[_CALL] = around
             cells[_COUNT] += 1
 
-    def telling(self, method: Callable[..., Any], call: Call) -> Callable[..., Any]:
-        """The method, which tells of each time that it is called."""
+    def telling(self, method: Callable[..., Any], call: Call, steps: list[int]) -> Callable[..., Any]:
+        """The method, which tells of each time that it is called.
+
+        Args:
+            method: Of an environment or a policy.
+            call: Which it is.
+            steps: Of the same environment's methods: one number, its steps since its last reset.
+        """
         cells = self._cells
 
         # Not by `inside`, which takes ten times as long: fast environments make hundreds of thousands of calls.
@@ -100,9 +106,10 @@ class Page:
             cells[_CALL] = call
             cells[_COUNT] += 1
             if call == _STEP:
-                cells[_STEPS] += 1
+                steps[0] += 1
+                cells[_STEPS] = steps[0]
             elif call == _RESET:
-                cells[_STEPS] = 0
+                steps[0] = 0
             try:
                 return method(*args, **kwargs)
             except BaseException:
@@ -146,6 +153,7 @@ def watch_policy(policy: _Watched) -> _Watched:
 
 def _watch(thing: _Watched, methods: dict[str, Call]) -> _Watched:
     if _page is not None:
+        steps = [0]
         for name, call in methods.items():
-            setattr(thing, name, _page.telling(getattr(thing, name), call))
+            setattr(thing, name, _page.telling(getattr(thing, name), call, steps))
     return thing

@@ -1,0 +1,155 @@
+"""What comes after the trials, where the environment fails in it: said in the result, the report and the exit code."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_baselines import make_task, run_trial
+
+from policies import env_modules
+from policies.env_modules import allow_modules
+from policies.errors import EnvFailedError
+from tune_jobs import finish, sweeps
+from tune_jobs.driving import SweepResult, _finished, write_new
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec_file import load_spec
+from tune_jobs.store import SweepStore
+
+HOSTILE = "hostile_envs:Hostile"
+
+
+@pytest.fixture(autouse=True)
+def _own_modules(monkeypatch):
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["hostile_envs"])
+
+
+@pytest.fixture
+def sweep_of(tmp_path):
+    """A sweep of one trial that went well, in an environment that is hostile from now on."""
+
+    def make(**args):
+        flag = tmp_path / "hostile"
+        args |= {"only_after": str(flag)}
+        spec = load_spec(
+            {
+                "env": {"id": HOSTILE, "args": args},
+                "algorithm": "constant",
+                "hyperparams": {"env_steps_per_iteration": 100},
+                "stop": {"num_env_steps": 200},
+                "evaluation": {"num_episodes": 2},
+                "iteration_timeout_s": 2,
+            }
+        )
+        store = SweepStore(tmp_path / "mine")
+        store.create()
+        plan = make_plan(spec, Machine(1))
+        write_new(store, spec, plan, None)
+        task = make_task(
+            store.folder, "constant", env_id=HOSTILE, hyperparams=plan.trials[0].hyperparams, stop=spec.stop,
+            checkpoints=spec.checkpoints,
+        )  # fmt: skip
+        run_trial(dataclasses.replace(task, env_args=args))
+        trial = store.trial("t0000")
+        trial.write_record(trial.read_record().model_copy(update={"status": "completed", "num_iterations": 2}))
+        flag.touch()
+        return store
+
+    return make
+
+
+def finished(store):
+    return _finished(store, SweepResult(store.folder, store.read_record(), store.read_trials()))
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ({"how": "hang", "at": 7}, "hangs in step(), step 7 after reset()"),
+        ({"how": "exit", "where": "reset", "at": 2}, "ended with exit code 7 in reset()"),
+        ({"how": "segfault"}, "was ended by SIGSEGV (segmentation fault) in step(), step 1 after reset()"),
+        ({"how": "fail", "at": 3}, "after 2 steps: ValueError: the motor broke"),
+    ],
+)
+def test_a_confirmation_that_fails_is_in_the_report_and_the_exit_code(sweep_of, args, words):
+    store = sweep_of(**args)
+    result = finished(store)
+    assert result.exit_code == 3
+    assert result.best is None
+    assert words in result.why_no_best
+    page = result.artifacts["report"].read_text(encoding="utf-8")
+    assert "No winner" in page
+    assert words in page
+    assert {path.name for path in store.best_folder.glob("*")} <= {"evaluation.json"}
+
+
+def test_a_report_that_chooses_says_why_it_could_not(sweep_of):
+    store = sweep_of(how="exit", at=4)
+    assert "ended with exit code 7 in step(), step 4" in finish.make_report(store).read_text(encoding="utf-8")
+
+
+def test_an_older_winner_is_not_shown_as_the_confirmed_one(sweep_of):
+    store = sweep_of(how="fail", where="close")  # harmless
+    assert finished(store).exit_code == 0
+    spec = store.read_record().spec
+    spec["env"]["args"] |= {"how": "exit", "where": "step"}
+    store.write_record(store.read_record().model_copy(update={"spec": spec}))
+    result = finished(store)
+    assert result.exit_code == 3
+    assert "No winner" in result.artifacts["report"].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("how", "words"), [("hang", "hangs in render()"), ("exit", "exit code 7 in render()")])
+def test_a_film_that_fails_is_a_note_and_an_exit_code(sweep_of, how, words):
+    store = sweep_of(how=how, where="render", at=5)
+    result = finished(store)
+    assert result.exit_code == 3
+    assert result.best is not None
+    (note,) = result.notes
+    assert note.startswith("No video: ")
+    assert words in note
+    assert {path.name for path in store.best_folder.iterdir()} == {
+        "evaluation.json", "policy.json", "policy.safetensors",
+    }  # fmt: skip
+
+
+def test_an_env_that_cannot_be_drawn_is_no_failure(sweep_of):
+    store = sweep_of(how="fail", where="render")
+    result = finished(store)
+    assert (result.exit_code, result.best is None) == (0, False)
+    assert "cannot be drawn: ValueError: the motor broke" in result.notes[0]
+
+
+@pytest.mark.parametrize("call", [sweeps.best, sweeps.evaluate, sweeps.video])
+def test_what_is_done_by_hand_is_guarded_too(sweep_of, call):
+    store = sweep_of(how="exit", at=4)
+    with pytest.raises(EnvFailedError, match=r"exit code 7 in step\(\), step 4"):
+        call(store.folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["launch", "sweep.yaml", "--dry-run", "--json"], "hangs in step(), step 1 after reset()"),
+        (["launch", "sweep.yaml", "--json", "--storage", "here"], "hangs in step(), step 1 after reset()"),
+    ],
+)
+def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path, arguments, words):
+    (tmp_path / "sweep.yaml").write_text(
+        f"env: {{id: '{HOSTILE}', args: {{how: hang}}}}\nalgorithm: ppo\niteration_timeout_s: 1\n"
+    )
+    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, "-m", "tune_jobs.cli", *arguments],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},
+        capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert words in json.loads(done.stdout)["error"]
+    assert not (tmp_path / "here" / "sweep").exists()
