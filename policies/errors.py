@@ -72,3 +72,9 @@ def shortened(value: Any) -> str:
     except Exception:  # noqa: BLE001 - an object of a user's own may raise anything
         return "a value"
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+MALFORMED = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
+"""What data of another kind than was expected raises; who reads a file turns these into a `CheckpointError`."""

@@ -20,7 +20,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import MALFORMED, CheckpointError, NotFoundError
 from policies.files import write_atomic
 from policies.policy_network import (
     BASELINE_KINDS,
@@ -127,7 +127,7 @@ def read_policy(path: Path) -> PortablePolicy:
     try:
         description = json.loads(json_path.read_text(encoding="utf-8"))
         weights = weights_path.read_bytes()
-    except ValueError as error:  # JSON and UTF-8 errors are both ValueErrors
+    except (ValueError, RecursionError) as error:  # JSON and UTF-8 errors are both ValueErrors
         raise _broken(json_path, f"is not JSON: {error}") from error
     except OSError as error:
         raise NotFoundError(
@@ -202,7 +202,7 @@ def _assemble(description: dict[str, Any], weights: bytes, place: Path) -> Porta
         )
     except KeyError as error:
         raise _broken(place, f"lacks {error}") from error
-    except (SafetensorError, TypeError, ValueError) as error:
+    except (SafetensorError, *MALFORMED) as error:
         raise _broken(place, f"cannot be read: {error}") from error
 
 

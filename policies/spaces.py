@@ -10,7 +10,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.errors import CheckpointError
+from policies.errors import MALFORMED, CheckpointError
+
+_MAX_SIZE = 10_000_000
+"""Numbers in an observation; 25 times those of four frames of an Atari screen."""
 
 
 def observation_dtype(space: gym.Space[Any]) -> type[np.uint8 | np.float32]:
@@ -55,15 +58,18 @@ def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | g
         if description["type"] == "box":
             dtype = np.dtype(description["dtype"])
             shape = tuple(int(size) for size in description["shape"])
+            # Before there is an array of that size.
+            if min(shape, default=0) < 0 or math.prod(shape) > _MAX_SIZE:
+                raise ValueError(f"its shape is {shape}")
             low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))
             return gym.spaces.Box(low, high, shape, dtype.type)
-    except (KeyError, TypeError, ValueError, AssertionError) as error:
+    except MALFORMED as error:
         raise CheckpointError(
-            f"A space is described as {dict(description)!r}, which makes none: {error}.",
+            f"A space is described as {str(description)[:200]}, which makes none: {error}.",
             "Write the policy file again from its checkpoint.",
         ) from error
     raise CheckpointError(
-        f"A space is described as of type {description['type']!r}; known are 'box' and 'discrete'.",
+        f"A space is described as of type {str(description['type'])[:80]!r}; known are 'box' and 'discrete'.",
         "Write the policy file again from its checkpoint, or update tune-jobs.",
     )
 

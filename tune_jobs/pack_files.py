@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from policies.errors import CheckpointError
+from policies.errors import MALFORMED, CheckpointError, NotFoundError
 from policies.files import write_atomic
 from tune_jobs.ownership import OWNER_FILE
-from tune_jobs.places import within
+from tune_jobs.places import check_trial_id, within
 
 _TAIL_BYTES = 20_000
 TIMEOUT_MARK = "Timeout ("
@@ -71,8 +71,10 @@ class PackFiles:
         """
         try:
             data = json.loads(self.assignment_path.read_bytes())
-            return Assignment(tuple(data["trial_ids"]), dict(data["num_failures"]))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            trial_ids = tuple(check_trial_id(trial_id) for trial_id in data["trial_ids"])
+            failures = {check_trial_id(trial_id): int(number) for trial_id, number in data["num_failures"].items()}
+            return Assignment(trial_ids, failures)
+        except (OSError, NotFoundError, *MALFORMED) as error:
             raise CheckpointError(
                 f"{self.assignment_path} does not tell whom pack {self.pack_id} is to train: {error!r}.",
                 "Check that all nodes see the sweep folder, and resume the sweep.",

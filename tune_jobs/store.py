@@ -28,14 +28,8 @@ from tune_jobs.results_file import read_results
 _LOG = logging.getLogger(__name__)
 
 __all__ = [
-    "MANIFEST",
-    "SweepStore",
-    "TrialStore",
-    "list_sweep_stores",
-    "name_taken",
-    "read_manifest",
-    "verify_checkpoint",
-]
+    "MANIFEST", "SweepStore", "TrialStore", "list_sweep_stores", "name_taken", "read_manifest", "verify_checkpoint",
+]  # fmt: skip
 
 
 class TrialStore(OwnedFolder):

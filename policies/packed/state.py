@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from policies.errors import CheckpointError
+from policies.errors import MALFORMED, CheckpointError
 from policies.files import write_plain
 from policies.hyperparams import Algorithm, PPOHyperparams, make_hyperparams
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
@@ -93,7 +93,7 @@ def load_member(folder: Path, member_id: str) -> Member:
             failure_penalty=None if description["failure_penalty"] is None else _number(description["failure_penalty"]),
             **cast("Any", {name: _number(description["counters"][name]) for name in _COUNTERS}),
         )
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+    except (OSError, SafetensorError, *MALFORMED) as error:
         raise CheckpointError(f"{folder} does not hold a member's state: {error!r}.", _HINT) from error
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from policies.baselines import baseline_policy
 from policies.checked_envs import CheckedEnvs
 from policies.envs import make_vector_env
-from policies.errors import CheckpointError
+from policies.errors import MALFORMED, CheckpointError
 from policies.evaluate import Resettable
 from policies.hyperparams import Algorithm, RandomHyperparams, make_hyperparams
 from policies.policy import Policy, policy_from_portable
@@ -110,7 +110,7 @@ def _read_state(path: Path) -> tuple[int, int]:
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
         return int(state["iteration"]), int(state["num_env_steps"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, *MALFORMED) as error:
         raise CheckpointError(
             f"{path} cannot be read: {error!r}.",
             "Use another checkpoint of the trial; this one cannot be gone on from.",
