@@ -29,6 +29,7 @@ from tune_jobs.live import quiet
 from tune_jobs.machine import Machine
 from tune_jobs.places import within
 from tune_jobs.ray_environment import prepare_environment
+from tune_jobs.ray_reaper import reaping
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
@@ -65,15 +66,16 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
     if ray.is_initialized():
         yield Connection(address, _is_client(), cluster_machine("the connected Ray cluster"))
         return
-    if address is None:
-        _start(machine)
-    else:
-        _join(address)
-    try:
-        source = "this machine" if address is None else f"the cluster at {address}"
-        yield Connection(address, _is_client(), cluster_machine(source))
-    finally:
-        ray.shutdown()
+    with reaping() if address is None else contextlib.nullcontext():
+        if address is None:
+            _start(machine)
+        else:
+            _join(address)
+        try:
+            source = "this machine" if address is None else f"the cluster at {address}"
+            yield Connection(address, _is_client(), cluster_machine(source))
+        finally:
+            ray.shutdown()
 
 
 def _start(machine: Machine | None) -> None:
