@@ -1,6 +1,7 @@
 # make sweep   install into .venv, run the tutorial's sweep, show where its results lie
 # make test    install the test tools too, then lint, types and every test that can run here
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
+# make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table
 # make bench   the benchmarks, beside their peers, in one table
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test lint types learn bench clean
+.PHONY: install sweep test lint types learn kills bench clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -51,6 +52,9 @@ types: $(VENV)/installed-test
 
 learn: $(VENV)/installed-test
 	$(BIN)/python -m tests.learning
+
+kills: $(VENV)/installed-test
+	$(BIN)/python -m tests.kills
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m tests.benchmarks
