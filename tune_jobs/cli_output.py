@@ -129,6 +129,14 @@ def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None
     for trial in trials:
         if trial.status == "failed":
             console.print(f"{trial.trial_id} failed: {_first_line(trial.error)}", style="red")
+    _print_trial_notes(console, trials)
+
+
+def _print_trial_notes(console: Console, trials: Sequence[TrialRecord]) -> None:
+    """Print what of trials was damaged; they went on from something else than their latest checkpoint or results."""
+    for trial in trials:
+        for note in trial.notes:
+            console.print(f"{trial.trial_id}: {note}", style="yellow")
 
 
 def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
@@ -203,7 +211,9 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
             *([trial.engine] if engines_differ else []),
             *([", ".join(change.source_trial_id for change in trial.changes) or "-"] if copies else []),
         )
-    make_console().print(table)
+    console = make_console()
+    console.print(table)
+    _print_trial_notes(console, trials)
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:

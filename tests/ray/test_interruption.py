@@ -40,6 +40,14 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], li
         time.sleep(0.05)
 
 
+def wait_until_gone(pid: int, limit_s: float = 60) -> None:
+    """Until a trial's process has ended; one that nobody waits for is a zombie."""
+    deadline = time.monotonic() + limit_s
+    while (stat := Path(f"/proc/{pid}/stat")).exists() and stat.read_text().rpartition(")")[2].split()[0] not in "ZX":
+        assert time.monotonic() < deadline, f"process {pid} still runs"
+        time.sleep(0.05)
+
+
 @pytest.fixture
 def interrupted(tmp_path: Path, request: pytest.FixtureRequest):
     """A sweep that got a signal when its first trial was done and its second had checkpoints; and how it ended."""
@@ -108,6 +116,8 @@ def test_a_signal_saves_and_stops(interrupted) -> None:
 def test_a_kill_loses_no_more_than_the_last_iterations(interrupted) -> None:
     folder, code, _ = interrupted
     assert code == -signal.SIGKILL
+    pid = read(folder)[1]["pid"]
+    wait_until_gone(pid)
     status = subprocess.run([PROGRAM, "status", str(folder), "--json"], capture_output=True, text=True, check=True)
     assert json.loads(status.stdout)["sweep"]["state"] == "interrupted"
     with (folder / "trials/t0001/results.jsonl").open("a") as file:

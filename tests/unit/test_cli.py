@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from fake_sweeps import SWEEP, Status, evaluation
+from fake_sweeps import SWEEP, TRIALS, Status, evaluation
 
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli import cli
@@ -221,3 +221,12 @@ def test_wrong_arguments_are_exit_code_2(run, sweeps, arguments):
     assert result.exit_code == 2
     assert result.stderr
     assert sweeps.calls == []
+
+
+@pytest.mark.parametrize("command", [("trials", "mine"), ("resume", "mine")])
+def test_what_was_damaged_is_told_where_trials_are(run, sweeps, command):
+    note = "checkpoint 000004 is damaged and kept as damaged/000004; the trial goes on from its start"
+    trials = [TRIALS[0], TRIALS[1].model_copy(update={"notes": (note,)})]
+    sweeps.answers["trials"] = trials
+    sweeps.answers["resume"] = dataclasses.replace(sweeps.answers["resume"], trials=trials)
+    assert f"t0001: {note}" in run(*command).output

@@ -1,0 +1,69 @@
+"""What Ray Tune is told of a trial that another process has, or whose paused checkpoint is damaged."""
+
+import json
+import types
+
+import cloudpickle
+import pytest
+from ray.exceptions import RayTaskError
+from scripted_packs import make_sweep
+
+from policies.errors import CheckpointError
+from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.record_keeper import RecordKeeper
+from tune_jobs.runner import RunJob, _TrialEvents, run_trials
+from tune_jobs.trainable import TrialTrainable
+
+pytestmark = pytest.mark.ray
+
+
+def tune_trial(folder, trial_id, cause):
+    """As Tune shows its callbacks one whose process raised."""
+    path = folder / f"{trial_id}.pkl"
+    path.write_bytes(cloudpickle.dumps(RayTaskError("step", "a traceback", cause)))
+    return types.SimpleNamespace(config={"trial_id": trial_id}, pickled_error_file=str(path))
+
+
+@pytest.mark.parametrize("event", ["on_trial_recover", "on_trial_error"])
+def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path, event):
+    store = make_sweep(tmp_path / "mine", 2)
+    keeper = RecordKeeper(store, ["t0000", "t0001"], lambda record: None)
+    events = _TrialEvents(store, keeper)
+    for trial_id, cause in (("t0000", OwnershipLostError("taken")), ("t0001", ValueError("broke"))):
+        keeper.started(trial_id)
+        getattr(events, event)(0, [], tune_trial(tmp_path, trial_id, cause))
+    assert (keeper.record("t0000").status, keeper.record("t0000").num_failures) == ("paused", 0)
+    assert keeper.record("t0000").error is None
+    assert keeper.record("t0001").num_failures == 1
+
+
+def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path):
+    store = make_sweep(tmp_path / "mine", 1)
+    run = Owner.take(store.folder / OWNER_FILE)
+    Owner.take(store.folder / OWNER_FILE)
+    store.tune_folder.mkdir()
+
+    def everything():
+        return {path: path.read_bytes() if path.is_file() else None for path in store.folder.rglob("*")}
+
+    before = everything()
+    with pytest.raises(OwnershipLostError):
+        run_trials(RunJob(store.folder, ("t0000",), 1.0, 0.0, 1, run=run.token), lambda record: None)
+    assert everything() == before
+
+
+@pytest.mark.parametrize(("damaged", "fits"), [((), False), (("000004",), False), (("000006",), True)])
+def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(tmp_path, damaged, fits):
+    store = make_sweep(tmp_path / "mine", 1)
+    pointer = tmp_path / "pointer.json"
+    pointer.write_text(json.dumps({"trial_id": "t0000", "iteration": 6}))
+    for name in damaged:
+        (store.trial("t0000").folder / "damaged" / name).mkdir(parents=True)
+    trainable = TrialTrainable.__new__(TrialTrainable)
+    trainable._trial = (store.folder, "t0000")
+    if fits:
+        trainable.load_checkpoint(str(tmp_path))
+    else:
+        # Gone for no known reason: it must not begin anew in silence.
+        with pytest.raises(CheckpointError, match="was paused at iteration 6"):
+            trainable.load_checkpoint(str(tmp_path))
