@@ -145,7 +145,7 @@ def test_an_own_env_class_trains_in_rays_processes_and_is_evaluated_without_pena
 def test_an_env_id_of_an_allowed_module_trains_in_env_runners_too_and_goes_on_without_being_allowed_again(tmp_path):
     spec = {
         "env": f"{OWN}:TestEdge",
-        "space": {"lr": {"uniform": [1e-4, 1e-3]}},
+        "space": {"gamma": {"uniform": [0.9, 0.99]}},
         "resources": {"num_env_runners": 1},
     }
     with pytest.raises(EnvError, match="not allowed"):
