@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from rounding import close
 from torch import nn
 
 from policies.hyperparams import DQNHyperparams
@@ -26,6 +27,7 @@ def by_autograd(outputs, actions, targets, weights, hyperparams):
     return outputs.grad, losses.detach(), selected.detach()
 
 
+@pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("has_weights", [False, True])
 @pytest.mark.parametrize("td_loss", ["huber", "mse"])
 @pytest.mark.parametrize("dueling", [False, True])
@@ -42,10 +44,10 @@ def test_the_gradient_by_hand_is_that_of_the_loss(num_actions, dueling, td_loss,
     # Of both branches of Huber's loss, on both sides.
     assert all((mask.float().mean() > 0.1) for mask in (found.td_errors > 1, found.td_errors < -1))
     assert (found.td_errors.abs() < 1).float().mean() > 0.1
-    torch.testing.assert_close(found.gradient, gradient, rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(found.q_selected, selected)
-    torch.testing.assert_close(found.td_errors, selected - targets)
-    torch.testing.assert_close(dqn.mean_loss(found.td_errors, weights, hyperparams), losses)
+    close(found.gradient, gradient)
+    close(found.q_selected, selected)
+    close(found.td_errors, selected - targets)
+    close(dqn.mean_loss(found.td_errors, weights, hyperparams), losses)
 
 
 def test_the_best_next_action_is_the_target_networks_or_the_online_ones():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from packed_members import random_member
+from rounding import assert_rounded, close
 from torch import nn
 
 from policies.network_layers import ObservationStatistics
@@ -20,7 +21,7 @@ M, B = 4, 200
 
 
 def column(*values):
-    return torch.tensor(values)[:, None]
+    return torch.tensor(values, dtype=torch.float64)[:, None]
 
 
 def make_case(num_actions, *, with_kl, seed=0):
@@ -28,7 +29,7 @@ def make_case(num_actions, *, with_kl, seed=0):
     rng = torch.Generator().manual_seed(seed)
     outputs = 2 * torch.randn(M, B, num_actions, generator=rng)
     old_outputs = outputs + torch.randn(M, B, num_actions, generator=rng)
-    actions = nn.functional.one_hot(torch.randint(num_actions, (M, B), generator=rng), num_actions).float()
+    actions = nn.functional.one_hot(torch.randint(num_actions, (M, B), generator=rng), num_actions).to(outputs.dtype)
     batch = ppo.Minibatch(
         actions=actions,
         logp=(torch.log_softmax(old_outputs, dim=-1) * actions).sum(dim=-1),
@@ -48,6 +49,7 @@ COEFFICIENTS = ppo.Coefficients(
 )
 
 
+@pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("with_kl", [False, True])
 @pytest.mark.parametrize("num_actions", [2, 3, 6])
 def test_gradients_by_hand_are_those_of_the_loss(num_actions, with_kl):
@@ -65,10 +67,11 @@ def test_gradients_by_hand_are_those_of_the_loss(num_actions, with_kl):
     parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
     parts.total_loss.sum().backward()
     for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
+        close(mine, other)
     assert (parts.kl > 0).all() == with_kl
 
 
+@pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("entropy_coeff", [0.0, 0.01])
 def test_gradients_without_a_value_clip(entropy_coeff):
     outputs, values, batch = make_case(2, with_kl=False)
@@ -84,7 +87,7 @@ def test_gradients_without_a_value_clip(entropy_coeff):
     values.requires_grad_()
     ppo.loss(outputs, values, batch, coefficients, is_gaussian=False).total_loss.sum().backward()
     for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
+        close(mine, other)
 
 
 @pytest.mark.parametrize("is_gaussian", [False, True])
@@ -100,13 +103,14 @@ def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name, is_ga
     assert gradient[[0, 2, 3]].isfinite().all()
 
 
+@pytest.mark.usefixtures("in_double")
 def test_ratios_begin_at_one():
     outputs, values, batch = make_case(3, with_kl=True)
     batch.logp = ppo.log_probabilities(outputs, batch.actions, is_gaussian=False)
     batch.old_outputs = outputs
     parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
-    torch.testing.assert_close(parts.policy_loss, -batch.advantages.mean(dim=1))
-    torch.testing.assert_close(parts.kl, torch.zeros(M), rtol=0, atol=1e-6)
+    close(parts.policy_loss, -batch.advantages.mean(dim=1))
+    close(parts.kl, torch.zeros(M))
 
 
 def test_schedules():
@@ -126,25 +130,31 @@ def test_no_advantage_flows_back_over_an_end():
     next_values = np.array([[20, 0], [25, 0], [40, 0], [99, 7]], dtype=np.float32)
     terminated, ended = np.zeros((4, 2), dtype=bool), np.zeros((4, 2), dtype=bool)
     terminated[3, 0] = ended[1, 0] = ended[3, 0] = True
-    gamma, gae_lambda = np.array([0.5, 1.0], dtype=np.float32), np.array([0.8, 0.5], dtype=np.float32)
+    # Powers of two, and whole numbers: no result is rounded.
+    gamma, gae_lambda = np.array([0.5, 1.0], dtype=np.float32), np.array([0.25, 0.5], dtype=np.float32)
     advantages, targets = advantages_and_targets(
         rewards, values, next_values, terminated=terminated, ended=ended, gamma=gamma, gae_lambda=gae_lambda
     )
     last = 4 - 40
     second = 2 + 0.5 * 25 - 20  # bootstrapped from what the cut episode would have gone on with
-    first = [1 + 0.5 * 20 - 10 + 0.4 * second, second, 3 + 0.5 * 40 - 30 + 0.4 * last, last]
+    first = [1 + 0.5 * 20 - 10 + 0.125 * second, second, 3 + 0.5 * 40 - 30 + 0.125 * last, last]
     other = 1 + 7.0
-    np.testing.assert_allclose(advantages[:, 0], first, rtol=1e-6)
-    np.testing.assert_allclose(advantages[:, 1], [1.75 + other / 8, 1.5 + other / 4, 1 + other / 2, other])
-    np.testing.assert_allclose(targets, advantages + values)
+    np.testing.assert_array_equal(advantages[:, 0], first)
+    np.testing.assert_array_equal(advantages[:, 1], [1.75 + other / 8, 1.5 + other / 4, 1 + other / 2, other])
+    np.testing.assert_array_equal(targets, advantages + values)
 
 
 def test_advantages_are_standardised_member_by_member():
     rng = np.random.default_rng(0)
     rows = (rng.normal(size=(3, 50)) * [[1.0], [100.0], [1e-6]] + [[5.0], [0.0], [1.0]]).astype(np.float32)
     out = standardise(rows)
-    np.testing.assert_allclose(out.mean(axis=1), 0, atol=1e-3)
-    np.testing.assert_allclose(out.std(axis=1)[:2], 1, rtol=1e-5)
+    # The mean of 50 is a sum of 50 roundings at most; what is divided by is 1, 100, and 1e-4: the least that is.
+    exact = rows.astype(np.float64)
+    mean, std = exact.mean(axis=1, keepdims=True), np.maximum(exact.std(axis=1, keepdims=True), 1e-4)
+    sizes = (np.abs(exact) + np.abs(exact).mean(axis=1, keepdims=True)) / std
+    # Of a deviation's square twice as many, and it moves the result by its share.
+    sizes = sizes * (1 + 2 * np.abs(exact - mean) / std)
+    assert_rounded(out, (exact - mean) / std, sizes=sizes, num_roundings=60)
     # Those that hardly differ are not blown up.
     assert out[2].std() < 0.1
 
@@ -193,6 +203,7 @@ def test_episodes_go_on_over_fragments_and_changes_of_the_pack():
         assert sum(map(len, expected)) > 0 or num_steps == 1
         for ours, theirs in zip(found, expected, strict=True):
             assert [length for _, length in ours] == [length for _, length in theirs]
+            # In float64, of fewer than 60 rewards below 10 in size: 60 roundings of 600 are below 1e-11.
             np.testing.assert_allclose([r for r, _ in ours], [r for r, _ in theirs], rtol=0, atol=1e-9)
 
 
