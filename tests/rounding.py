@@ -13,6 +13,7 @@ finds any error of a formula.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -49,3 +50,55 @@ def assert_rounded(found: Any, exact: Any, *, sizes: Any, num_roundings: int, wh
         f"{found[wrong][:3]} instead of {exact[wrong][:3]}, by {np.abs(found - exact)[wrong][:3]}, "
         f"and at most {limit[wrong][:3]} is rounding."
     )
+
+
+def dense(layers: Any, x: Any) -> tuple[Any, int]:
+    """(sizes, roundings) of the outputs of dense layers, for `assert_rounded`.
+
+    The sizes are the outputs of the same network with absolute weights and inputs and without activations, since
+    |f(x)| <= |x| for each of these. A layer adds as many products as it has inputs, and a bias; an activation is a few
+    operations. Slopes of up to 1.13 (SiLU, GELU) make larger what was rounded in the layers before.
+
+    Args:
+        layers: With `weight`, (outputs, inputs), and `bias`; the first one first.
+        x: (num, inputs).
+    """
+    sizes, num_roundings = np.abs(np.asarray(x, dtype=np.float64)), 0.0
+    for layer in layers:
+        weight, bias = (np.abs(np.asarray(values, dtype=np.float64)) for values in (layer.weight, layer.bias))
+        sizes = sizes @ weight.T + bias
+        num_roundings = 1.13 * num_roundings + weight.shape[1] + 9
+    return sizes, math.ceil(num_roundings)
+
+
+def assert_network(found: Any, expected: Any, *, num_terms: int) -> None:
+    """That outputs of two programs for the same network in float32 are the same but for rounding.
+
+    Both are off. Where terms are of either sign and at random, as a network's are, n of them sum up to about the root
+    of n of their sizes, and as many roundings add up to about their root as well: n * u of the largest output, for each
+    program, bounds what is far beyond the root. An error of a formula moves outputs by more than a thousandth.
+
+    Args:
+        found: Outputs.
+        expected: Outputs.
+        num_terms: Products in all layers on the way to an output, and 10 for each activation.
+    """
+    largest = float(np.abs(np.asarray(expected, dtype=np.float64)).max())
+    assert 2 * bound(1.0, num_terms) < 1e-3
+    assert_rounded(found, expected, sizes=largest, num_roundings=2 * num_terms)
+
+
+def assert_greedy(actions: Any, expected: Any, outputs: Any, *, num_terms: int) -> None:
+    """That actions are those of another program for the same network, but where two outputs are equal but for rounding.
+
+    Args:
+        actions: Found, from 0.
+        expected: The other program's.
+        outputs: Of either, (num, actions).
+        num_terms: As `assert_network`.
+    """
+    actions, expected, outputs = (np.asarray(values) for values in (actions, expected, outputs))
+    rows = np.flatnonzero(actions != expected)
+    assert len(rows) < len(actions) / 100
+    limit = 4 * bound(np.abs(outputs).max(), num_terms)
+    assert (np.abs(outputs[rows, actions[rows]] - outputs[rows, expected[rows]]) <= limit).all()

@@ -24,6 +24,8 @@ SMALL = {
     "replay_capacity": 500,
     "epsilon_decay": 200,
 }
+# As in `packed_rllib`: of nine updates, each on 16 rows, whose differences add up.
+ROUNDING = 9 * (16 + 30) * 6e-8
 PHASES = ((3, 16, 1), (4, 16, 2), (2, 8, 1))
 """(updates, env steps since the phase before, episodes that ended in them)."""
 

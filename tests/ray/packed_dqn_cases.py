@@ -6,7 +6,8 @@ the network; the others are in `packed_dqn_traces`.
 
 import numpy as np
 import pytest
-from packed_dqn import add, compare, differences, make_stack, q_values_of
+from packed_dqn import ROUNDING, add, compare, differences, make_stack, q_values_of
+from rounding import assert_network
 
 from policies.hyperparams import ACTIVATIONS, DQNHyperparams
 
@@ -33,7 +34,7 @@ def updates(shared=None, **values):
     shared = shared or {}
     ((plain, _), (changed, theirs)), _ = compare([shared, {**shared, **values}], seeds=[3, 3], only=[1])
     for what, value in differences(changed, theirs).items():
-        assert value < 1e-5, what
+        assert value < ROUNDING, what
     return plain, changed
 
 
@@ -53,7 +54,7 @@ def check_shared(values, shared=None):
     """The same of what all members of a stack have in common."""
     ((plain, _),) = compare([shared or {}], seeds=[3], only=[])[0]
     ((changed, expected),) = compare([{**(shared or {}), **values}], seeds=[3])[0]
-    assert max(differences(changed, expected).values()) < 1e-5
+    assert max(differences(changed, expected).values()) < ROUNDING
     assert abs(plain.losses[0] - changed.losses[0]) > 1e-4
 
 
@@ -74,7 +75,7 @@ def check_grad_clip():
 def check_optimizer():
     for name, moments in (("adam", {"exp_avg", "exp_avg_sq"}), ("rmsprop", {"square_avg"})):
         for ours, theirs in compare([{"optimizer": name}])[0]:
-            assert max(differences(ours, theirs).values()) < 1e-5
+            assert max(differences(ours, theirs).values()) < ROUNDING
             assert set(ours.moments) == moments
 
 
@@ -170,7 +171,7 @@ def check_first_q_values(**values):
     found = stack._groups[0].act(observations)[0]
     expected = q_values_of(module, observations[0])
     # But for what all actions have in common.
-    np.testing.assert_allclose(found[:, 1] - found[:, 0], expected[:, 1] - expected[:, 0], atol=1e-6)
+    assert_network(found[:, 1] - found[:, 0], expected[:, 1] - expected[:, 0], num_terms=200)
     algorithm.stop()
     stack.envs.close()
     return member

@@ -5,7 +5,7 @@ Most compare a pack of two members, one with the hyperparameter changed, with RL
 
 import numpy as np
 import pytest
-from packed_rllib import ROWS, compare, differences, make_stack, sample
+from packed_rllib import ROUNDING, ROWS, compare, differences, make_stack, sample
 
 from policies.hyperparams import ACTIVATIONS, PPOHyperparams
 
@@ -31,7 +31,7 @@ def updates(shared=None, **values):
     pairs, _, sampled = compare("CartPole-v1", [shared, {**shared, **values}], seeds=[3, 3], num_epochs=2)
     for ours, theirs in pairs:
         for what, value in differences(ours, theirs).items():
-            assert value < 1e-5, what
+            assert value < ROUNDING, what
     (plain, _), (changed, _) = pairs
     return plain, changed, sampled
 
@@ -51,7 +51,7 @@ def check_hidden_sizes():
         pairs, stack, _ = compare("CartPole-v1", [{"hidden_sizes": (8,) * len(sizes)}, {"hidden_sizes": sizes}])
         assert len(stack._groups) == (1 if len(sizes) == 1 else 2)
         for ours, theirs in pairs:
-            assert max(differences(ours, theirs).values()) < 1e-5
+            assert max(differences(ours, theirs).values()) < ROUNDING
         layers = [
             weight.shape[0] for name, weight in pairs[1][0].weights.items() if "actor" in name and "weight" in name
         ]
@@ -63,7 +63,7 @@ def check_activation():
     pairs, stack, _ = compare("CartPole-v1", [{"activation": name} for name in ACTIVATIONS], seeds=[3] * 6)
     assert len(stack._groups) == 6
     for ours, theirs in pairs:
-        assert max(differences(ours, theirs).values()) < 1e-5
+        assert max(differences(ours, theirs).values()) < ROUNDING
     assert len({ours.losses["vf_loss"] for ours, _ in pairs}) == 6
 
 

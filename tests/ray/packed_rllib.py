@@ -5,6 +5,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 import torch
 
 from policies.envs import make_env
@@ -12,6 +13,10 @@ from policies.hyperparams import PPOHyperparams
 
 MODULE = "default_policy"
 ROWS = 64
+# A share of the largest value. A gradient is a sum over the rows of what came through three layers of 8 at most: 64 and
+# 3 * 10 roundings in the pack and as many in RLlib, each of half an eps (6e-8); the updates after the first start apart
+# by that, which is as much again. A hyperparameter that acts otherwise moves gradients by more than a thousandth.
+ROUNDING = 4 * (ROWS + 30) * 6e-8
 SMALL = {"hidden_sizes": (8,), "train_batch_size": ROWS, "minibatch_size": ROWS, "num_epochs": 1, "num_envs": 4}
 
 
@@ -267,6 +272,12 @@ def compare(env_id, members, *, seeds=None, num_epochs=1, before=None):
         assert np.abs(ours[name].weights["pi.weight"] - old[name].weights["pi.weight"]).max() > 1e-5
     stack.envs.close()
     return pairs, stack, sampled
+
+
+def assert_same_stats(ours, theirs):
+    """But for the last bits: two rows of one product may lie at other places of a vector register."""
+    assert (ours.num_env_steps, ours.episodes) == (theirs.num_env_steps, theirs.episodes)
+    assert ours.learner == pytest.approx(theirs.learner, rel=1e-4, abs=1e-5)
 
 
 def episodes_of(fragment, row, env_id, final):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from packed_dqn import PHASES, compare, differences
+from packed_dqn import PHASES, ROUNDING, compare, differences
 
 from policies.hyperparams import ACTIVATIONS
 
@@ -60,13 +60,12 @@ def test_all_activations_and_both_of_each_kind_have_a_pack():
 
 @pytest.mark.parametrize("name", PACKS)
 def test_training_phases_are_rllibs_for_every_member(name):
-    """Measured with torch 2 on x86: 4e-7 at most, and 1e-7 for weights."""
     shared, members = PACKS[name]
     pairs, stack = compare([{**shared, **values} for values in members])
     assert len(stack._groups) == len({values.get("activation") for values in members})
     for ours, theirs in pairs:
         for what, value in differences(ours, theirs).items():
-            assert value < 1e-5, what
+            assert value < ROUNDING, what
         assert ours.num_target_updates == theirs.num_target_updates
         assert len(ours.losses) == sum(num_updates for num_updates, *_ in PHASES)
         # Both sides of Huber's loss.

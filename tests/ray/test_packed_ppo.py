@@ -1,6 +1,6 @@
 """One update of a pack is RLlib's Learner's for every member; advantages and first weights are RLlib's too.
 
-Measured on x86: losses, gradients and moments differ by 5e-7 of their size at most, weights by 1e-7.
+What may differ is `packed_rllib.ROUNDING`.
 """
 
 import math
@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from packed_rllib import MODULE, compare, differences, episodes_of, learner_of, make_stack, sample
+from packed_rllib import MODULE, ROUNDING, compare, differences, episodes_of, learner_of, make_stack, sample
 
 from policies.hyperparams import ACTIVATIONS
 from policies.packed import ppo_stack
@@ -66,7 +66,7 @@ def test_an_update_is_rllibs_for_every_member(name, num_updates):
     assert len(stack._groups) == 1
     for ours, theirs in pairs:
         for what, value in differences(ours, theirs).items():
-            assert value < 1e-5, what
+            assert value < ROUNDING, what
 
 
 # -- advantages
@@ -163,7 +163,10 @@ def test_first_weights_are_those_of_rllibs_learner_with_the_seed(env_id, values)
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 def test_a_member_whose_weights_are_no_numbers_touches_no_other(env_id):
-    """The others' weights are to the last bit those of a run in which nothing went wrong."""
+    """The others' weights are to the last bit those of a run in which nothing went wrong.
+
+    Not across machines: both runs are the same program on this one, with the same shapes, and round alike.
+    """
     weights = {}
     for goes_wrong in (False, True):
         stack = make_stack(env_id, [{"grad_clip": 1.0}, {"hidden_sizes": (5,)}, {"entropy_coeff": 0.1}])

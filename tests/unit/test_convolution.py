@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rounding import assert_rounded
 
 from policies.convolution import convolve, output_shape
 from policies.errors import SpecError
@@ -15,8 +16,9 @@ def test_a_convolution_by_its_definition():
     assert result.shape == (2, *output_shape((7, 6, 3), [(4, 3, 2)])) == (2, 3, 2, 4)
     for image, row, column, channel in np.ndindex(result.shape):
         patch = images[image, 2 * row : 2 * row + 3, 2 * column : 2 * column + 3].transpose(2, 0, 1)
-        expected = np.sum(patch * kernels[channel]) + bias[channel]
-        assert result[image, row, column, channel] == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        terms = np.append(patch.astype(np.float64) * kernels[channel], bias[channel])
+        limits = {"sizes": np.abs(terms).sum(), "num_roundings": len(terms) + 1}
+        assert_rounded(result[image, row, column, channel], terms.sum(), **limits)
 
 
 def test_sizes_of_a_stack():

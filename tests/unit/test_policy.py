@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from policy_factory import IMAGES, make_image_policy, make_policy, make_portable, register_test_envs
+from rounding import assert_rounded, dense
 
 from policies.errors import TuneJobsError
 from policies.hyperparams import ACTIVATIONS
@@ -39,16 +41,18 @@ def test_the_network_computes_what_torch_computes(activation):
     for layer in policy.portable.network.layers:
         linear = torch.nn.Linear(*layer.weight.shape[::-1])
         linear.weight.data, linear.bias.data = torch.from_numpy(layer.weight), torch.from_numpy(layer.bias)
+        linear.double()
         modules += [linear, getattr(torch.nn, kinds[layer.activation])()]
     scale = np.array([1, 1, 10, 300])[np.arange(1000) % 4, None]  # far into the flat ends too
     observations = (np.random.default_rng(0).normal(size=(1000, 4)) * scale).astype(np.float32)
     with torch.no_grad():
-        expected = torch.nn.Sequential(*modules)(torch.from_numpy(observations)).numpy()
+        expected = torch.nn.Sequential(*modules)(torch.from_numpy(observations).double()).numpy()
     with np.errstate(all="raise", under="ignore"):
         outputs = policy.outputs(observations)
     assert outputs.dtype == np.float32
-    np.testing.assert_allclose(outputs, expected, rtol=1e-4, atol=1e-4)
-    np.testing.assert_array_equal(policy.act(observations), expected.argmax(axis=1))
+    sizes, num_roundings = dense(policy.portable.network.layers, observations)
+    assert_rounded(outputs, expected, sizes=sizes, num_roundings=num_roundings)
+    np.testing.assert_array_equal(policy.act(observations), outputs.argmax(axis=1))
 
 
 @pytest.mark.parametrize("normalize", [False, True])
@@ -62,22 +66,30 @@ def test_convolutions_compute_what_torch_computes(activation, normalize):
     images = np.random.default_rng(0).integers(0, 256, (1000, *IMAGES.shape), dtype=np.uint8)
     # Around 0, so that each action is the best one somewhere.
     network.layers[-1].bias[:] -= NetworkPolicy(portable).outputs(images).mean(axis=0)
-    x = torch.from_numpy(images).float() / 255
+    x = torch.from_numpy(images).double() / 255
     if normalize:
         mean, std = (torch.from_numpy(getattr(network.normalization, name)) for name in ("mean", "std"))
+        # Terms of up to (1 + 1) / std are subtracted.
+        sizes = 2 / std.expand(x.shape).double()
         x = ((x - mean) / std).clamp(-4, 4)
         assert (x.abs() == 4).any()
-    x = x.permute(0, 3, 1, 2)
+    else:
+        sizes = x
+    x, sizes, num_roundings = x.permute(0, 3, 1, 2), sizes.permute(0, 3, 1, 2), 4
     for layer in network.conv:
-        weight, bias = torch.from_numpy(layer.weight), torch.from_numpy(layer.bias)
+        weight, bias = torch.from_numpy(layer.weight).double(), torch.from_numpy(layer.bias).double()
         x = function(torch.nn.functional.conv2d(x, weight, bias, stride=layer.stride))
-    x = x.flatten(1)
+        sizes = torch.nn.functional.conv2d(sizes, weight.abs(), bias.abs(), stride=layer.stride)
+        num_roundings = math.ceil(1.13 * num_roundings) + weight[0].numel() + 9
+    x, (sizes, others) = x.flatten(1), dense(network.layers, sizes.flatten(1))
     for layer in network.layers:
-        x = torch.nn.functional.linear(x, torch.from_numpy(layer.weight), torch.from_numpy(layer.bias))
+        weight, bias = torch.from_numpy(layer.weight).double(), torch.from_numpy(layer.bias).double()
+        x = torch.nn.functional.linear(x, weight, bias)
         x = x if layer.activation == "linear" else function(x)
     policy = NetworkPolicy(portable)
-    np.testing.assert_allclose(policy.outputs(images), x.numpy(), rtol=1e-5, atol=1e-5)
-    np.testing.assert_array_equal(policy.act(images), x.numpy().argmax(axis=1))
+    outputs = policy.outputs(images)
+    assert_rounded(outputs, x, sizes=sizes, num_roundings=num_roundings + others)
+    np.testing.assert_array_equal(policy.act(images), outputs.argmax(axis=1))
     assert set(policy.act(images)) == {0, 1, 2}
 
 
@@ -149,7 +161,8 @@ def _gaussian(env_id, transform):
 def test_bounded_actions_are_stretched_over_the_bounds_and_clipped():
     mean, actions = _gaussian("Pendulum-v1", "unsquash")
     assert (np.abs(mean) > 1).any()
-    np.testing.assert_allclose(actions, np.clip(2 * mean, -2, 2), rtol=1e-5, atol=1e-6)
+    # Stretched in float32: the mean plus 1, times 4, less 2; of sizes that add up to 8 before it is clipped.
+    assert_rounded(actions, np.clip(2 * mean.astype(np.float64), -2, 2), sizes=8, num_roundings=4)
     low, high = np.full(1, -2, np.float32), np.full(1, 2, np.float32)
     np.testing.assert_array_equal(actions, np.clip(low + (mean + 1.0) * (high - low) / 2.0, low, high))
 

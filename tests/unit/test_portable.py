@@ -18,6 +18,7 @@ from policy_factory import (
     make_portable,
     register_test_envs,
 )
+from rounding import assert_rounded, dense
 
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.policy import load_policy
@@ -80,7 +81,8 @@ def test_files_of_format_1_act_as_they_did():
     policy = load_policy(Path(__file__).parent / "samples" / "policy_format_1")
     observations = np.array([[0.1, -0.2, 0.03, 0.4], [-1.0, 0.5, -0.2, -0.7]])
     expected = [[0.17224079370498657, 0.17183804512023926], [-0.18863928318023682, 0.07189814746379852]]
-    np.testing.assert_allclose(policy.outputs(observations), expected, rtol=1e-5)
+    sizes, num_roundings = dense(policy.portable.network.layers, observations)
+    assert_rounded(policy.outputs(observations), expected, sizes=sizes, num_roundings=num_roundings)
     np.testing.assert_array_equal(policy.act(observations), [0, 1])
     assert policy.observation_space == gym.make("CartPole-v1").observation_space
 
