@@ -6,19 +6,15 @@ The process that drives the sweep writes `<pack>.json`, the pack reads it before
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from policies.errors import MALFORMED, CheckpointError, NotFoundError
 from policies.files import write_atomic
+from tune_jobs.logs import begin_log, log_tail
 from tune_jobs.ownership import OWNER_FILE
 from tune_jobs.places import check_trial_id, within
-
-_TAIL_BYTES = 20_000
-TIMEOUT_MARK = "Timeout ("
-"""How the traceback of a process begins that was ended because it hung."""
 
 
 @dataclass(frozen=True)
@@ -81,22 +77,13 @@ class PackFiles:
             ) from error
 
     def begin_log(self) -> None:
-        """Print what tells the output of this process, which goes to the log, from that of earlier ones."""
-        print(f"{self._log_mark}{os.getpid()}", flush=True)
-
-    @property
-    def _log_mark(self) -> str:
-        return f"-- pack {self.pack_id}, process "
+        """See `logs.begin_log`."""
+        begin_log(self._what)
 
     def log_tail(self, num_lines: int = 15) -> str:
-        """The last lines of the pack's last process, after one that says if it was ended because it hung."""
-        try:
-            with self.log_path.open("rb") as file:
-                file.seek(max(0, self.log_path.stat().st_size - _TAIL_BYTES))
-                lines = file.read().decode("utf-8", errors="replace").splitlines()
-        except OSError:
-            return ""
-        begun = max((index for index, line in enumerate(lines) if line.startswith(self._log_mark)), default=0)
-        above, tail = lines[begun:-num_lines], lines[begun:][-num_lines:]
-        # The traceback of every thread comes after it.
-        return "\n".join([line for line in above if line.startswith(TIMEOUT_MARK)][-1:] + tail)
+        """See `logs.log_tail`: of the pack's last process."""
+        return log_tail(self.log_path, self._what, num_lines)
+
+    @property
+    def _what(self) -> str:
+        return f"pack {self.pack_id}"

@@ -21,9 +21,9 @@ from ray.tune.schedulers import TrialScheduler
 from analysis.records import CheckpointRecord
 from policies.errors import TuneJobsError
 from policies.parents import this_process
+from tune_jobs.logs import died_by
 from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.pack_driver import PackDriver, PackScheduler
-from tune_jobs.pack_files import TIMEOUT_MARK
 from tune_jobs.pack_trainable import PackTrainable
 from tune_jobs.packs import PackPlan
 from tune_jobs.places import remove_folder, within
@@ -114,6 +114,7 @@ class _Run:
         driver = PackDriver(
             self._store, self._spec, plan, trial_ids, scheduler=self._scheduler, keeper=self.keeper, choose=choose
         )
+        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
         tune.Tuner(
             tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
@@ -127,13 +128,14 @@ class _Run:
                 scheduler=PackScheduler(driver), trial_name_creator=_pack_id, trial_dirname_creator=_pack_id
             ),
             # The driver decides which of a dead pack's trials are tried again, and the run ends when none is left.
-            run_config=self._run_config("packs", _PackEvents(driver, self.keeper), -1, lambda: driver.is_finished),
+            run_config=self._run_config("packs", events, -1, lambda: driver.is_finished),
         ).fit()
 
     def single_trials(self, trial_ids: Sequence[str]) -> None:
         """Run trials one by one, as many at once as fit."""
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
+        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s)
         searcher = None
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
@@ -152,7 +154,7 @@ class _Run:
                 trial_name_creator=_trial_id,
                 trial_dirname_creator=_trial_id,
             ),
-            run_config=self._run_config("run", _TrialEvents(self._store, self.keeper), spec.max_retries),
+            run_config=self._run_config("run", events, spec.max_retries),
         ).fit()
 
     def _run_config(
@@ -213,9 +215,10 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
 class _TrialEvents(tune.Callback):  # type: ignore[misc]
     """Tells the keeper of records what Tune does with the trials."""
 
-    def __init__(self, store: SweepStore, keeper: RecordKeeper) -> None:
+    def __init__(self, store: SweepStore, keeper: RecordKeeper, timeout_s: float) -> None:
         self._store = store
         self._keeper = keeper
+        self._timeout_s = timeout_s
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A process took the trial."""
@@ -260,7 +263,7 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
             # Another process has it: nothing went wrong with the trial.
             self._keeper.lost(trial_id)
             return
-        message = describe_failure(error, self._store.trial(trial_id).log_tail())
+        message = describe_failure(error, self._store.trial(trial_id).log_tail(), timeout_s=self._timeout_s)
         self._keeper.failed(trial_id, message, retried=retried)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -271,9 +274,10 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
 class _PackEvents(tune.Callback):  # type: ignore[misc]
     """Tells the driver of the packs what becomes of their processes."""
 
-    def __init__(self, driver: PackDriver, keeper: RecordKeeper) -> None:
+    def __init__(self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float) -> None:
         self._driver = driver
         self._keeper = keeper
+        self._timeout_s = timeout_s
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """The pack's process runs."""
@@ -300,8 +304,8 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """The pack's process died; Tune starts another one."""
-        pack_id = _pack_id(trial)
-        self._driver.died(pack_id, describe_failure(_error_of(trial), self._driver.log_tail(pack_id), what="pack"))
+        pack_id, tail = _pack_id(trial), self._driver.log_tail(_pack_id(trial))
+        self._driver.died(pack_id, describe_failure(_error_of(trial), tail, timeout_s=self._timeout_s, what="pack"))
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """It died too often."""
@@ -321,18 +325,21 @@ def _error_of(trial: Trial) -> BaseException | None:
     return error
 
 
-def describe_failure(error: BaseException | None, log_tail: str, what: str = "trial") -> str:
-    """What made a trial or a pack fail, in a line, and the end of its log."""
+def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float, what: str = "trial") -> str:
+    """What made a trial or a pack fail, in a line, and the end of its log.
+
+    Args:
+        error: What Ray Tune tells.
+        tail: Of the log, as `logs.log_tail` gives it.
+        timeout_s: The sweep's `iteration_timeout_s`.
+        what: Whose process it was.
+    """
     if isinstance(error, RayTaskError):
         cause = error.cause if isinstance(error.cause, BaseException) else error
         message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {cause}"
     elif isinstance(error, RayActorError):
-        message = f"The process of the {what} died"
-        if TIMEOUT_MARK in log_tail:
-            message += ": an iteration took longer than iteration_timeout_s"
-        elif error.preempted:
-            message += ": its node was taken away"
-        message += "."
+        why = died_by(tail, timeout_s) or ("its node was taken away" if error.preempted else "")
+        message = f"The process of the {what} died{f': {why}' if why else ''}."
     else:
         message = str(error) if error is not None else "Unknown error."
-    return f"{message}\n{log_tail}".strip()
+    return f"{message}\n{tail}".strip()

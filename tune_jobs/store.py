@@ -19,6 +19,7 @@ from analysis.records import BestRecord, CheckpointRecord, IterationRecord, Swee
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.files import write_atomic
 from tune_jobs.locks import held, is_held
+from tune_jobs.logs import log_tail
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
 from tune_jobs.ownership import OwnedFolder
 from tune_jobs.places import check_trial_id, checkpoint_iteration, is_trial_id, refuse_link, remove_folder, within
@@ -189,14 +190,8 @@ class TrialStore(OwnedFolder):
                     remove_folder(folder)
 
     def log_tail(self, num_lines: int = 15) -> str:
-        """The last lines of the trial's log; empty if there is none."""
-        try:
-            with self.log_path.open("rb") as file:
-                file.seek(max(0, self.log_path.stat().st_size - 20_000))
-                lines = file.read().decode("utf-8", errors="replace").splitlines()
-        except OSError:
-            return ""
-        return "\n".join(lines[-num_lines:])
+        """See `logs.log_tail`: of the trial's last process."""
+        return log_tail(self.log_path, f"trial {self.trial_id}", num_lines)
 
 
 class SweepStore:

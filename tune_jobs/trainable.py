@@ -28,6 +28,7 @@ from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
 from policies.parents import end_with_parent, is_gone
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
+from tune_jobs.logs import begin_log
 from tune_jobs.ownership import OWNER_FILE, Owner
 from tune_jobs.recovery import latest_damaged
 from tune_jobs.schedulers import METRIC, WORST_SCORE, grace_env_steps
@@ -225,6 +226,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
     def _open(self, folder: Path, trial_id: str) -> TrialLoop:
         reader = TaskReader(folder)
         self._file = self._log.open(reader.store.trial(trial_id).log_path)
+        begin_log(f"trial {trial_id}")
         task = reader.read(trial_id)
         allow_modules(reader.sweep.allowed_modules)
         key = json.dumps([task.env_id, task.env_args, task.evaluation_seeds], sort_keys=True)

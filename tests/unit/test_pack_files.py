@@ -42,11 +42,3 @@ def test_the_end_of_a_log_is_of_the_last_process(tmp_path, capsys):
     begun, last = files.log_tail().splitlines()
     assert begun.startswith("-- pack p00, process ")
     assert last == "killed"
-
-
-def test_the_end_of_a_log_says_if_the_process_hung_though_that_is_far_above(tmp_path, capsys):
-    files = PackFiles(tmp_path, "p00")
-    threads = [f"  File thread-{index}" for index in range(30)]
-    log(files, capsys, ["started"], ["Timeout (0:00:10)!", *threads])
-    assert files.log_tail().splitlines() == ["Timeout (0:00:10)!", *threads[-15:]]
-    assert files.log_tail(40).splitlines()[1:] == ["Timeout (0:00:10)!", *threads]
