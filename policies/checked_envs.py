@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from policies.env_faults import close_env, env_failed
 from policies.errors import EnvFailedError
+from policies.tallies import only_tally
 
 _LARGEST = float(np.finfo(np.float32).max)
 """Learners compute in 32 bits: what is larger is infinite to them."""
@@ -121,7 +122,10 @@ class CheckedEnvs(gym.vector.VectorWrapper):
             for reward, length in zip(rewards.tolist(), self._lengths.tolist(), strict=True):
                 check_reward(reward, self._env_id, length)
         self._check(observations)
-        self._ended = np.logical_or(terminated, truncated)
+        ended = np.logical_or(terminated, truncated)
+        if (tally := only_tally()) is not None:
+            tally.add(int(np.count_nonzero(~self._ended)), int(np.count_nonzero(ended)))
+        self._ended = ended
         return observations, rewards, terminated, truncated, info
 
     def _check(self, observations: NDArray[Any]) -> None:

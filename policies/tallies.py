@@ -1,8 +1,7 @@
-"""How far the trials of this process are, in memory that they share with a file: it outlives the process, however that ends.
+"""How far the trials of this process are, in memory shared with files: it outlives the process, however that ends.
 
-A *tally* counts the env steps and the episodes of one trial. Whoever steps its environments adds to it at every step,
-which costs a tenth of a microsecond; so it also knows of the iteration in which an env hangs, raises an error or ends the
-process, of which nothing else is written.
+A *tally* counts the env steps and episodes of one trial. Whoever steps its environments adds to it at every step, so it
+also knows of the iteration in which an env hangs, raises an error or ends the process, of which nothing is written.
 """
 
 from __future__ import annotations
@@ -35,19 +34,19 @@ class Tally:
 
     Args:
         path: Its file. One that is there is replaced: a process that has it and is not gone yet writes into nothing.
+            Where it cannot be written, or its file system shares no memory with files, the tally is this process's own.
         begun: Where the trial goes on from.
-
-    Raises:
-        OSError: The folder cannot be written, or its file system shares no memory with files.
     """
 
     def __init__(self, path: Path, begun: Reached) -> None:
         self._path = path
-        path.unlink(missing_ok=True)
-        with path.open("x+b") as file:
-            file.write(bytes(_SIZE))
-            file.flush()
-            self._cells = memoryview(mmap.mmap(file.fileno(), _SIZE)).cast("d")
+        self._cells = memoryview(bytearray(_SIZE)).cast("d")
+        with contextlib.suppress(OSError, ValueError):
+            path.unlink(missing_ok=True)
+            with path.open("x+b") as file:
+                file.write(bytes(_SIZE))
+                file.flush()
+                self._cells = memoryview(mmap.mmap(file.fileno(), _SIZE)).cast("d")
         self._began = time.perf_counter() - begun.time_s
         self.set(begun)
 
@@ -90,14 +89,10 @@ def _reached(iterations: float, steps: float, episodes: float, time_s: float) ->
 _tallies: dict[str, Tally] = {}
 
 
-def begin_tally(trial_id: str, path: Path, begun: Reached) -> Tally | None:
-    """Let those who step a trial's environments in this process count; None: it cannot be counted here."""
-    _tallies.pop(trial_id, None)
-    try:
-        _tallies[trial_id] = Tally(path, begun)
-    except (OSError, ValueError):
-        return None
-    return _tallies[trial_id]
+def begin_tally(trial_id: str, path: Path, begun: Reached) -> Tally:
+    """Let those who step a trial's environments in this process count; see `Tally`."""
+    tally = _tallies[trial_id] = Tally(path, begun)
+    return tally
 
 
 def end_tally(trial_id: str) -> None:

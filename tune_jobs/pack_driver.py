@@ -208,7 +208,7 @@ class PackDriver:
             self._stopped(pack, trial_id)
             return
         self._num_failures[trial_id] += 1
-        self._keeper.failed(trial_id, report.error or "", retried=report.retried)
+        self._keeper.failed(trial_id, report.error or "", retried=report.retried, reached=report.reached)
         if not report.retried or self._store.stop_requested():
             self._leave(pack, trial_id)
         else:

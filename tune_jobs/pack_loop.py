@@ -21,6 +21,7 @@ from policies.errors import TuneJobsError
 from policies.evaluate import Episodes, Evaluator
 from policies.policy import NonFiniteWeightsError, Policy
 from policies.portable import PortablePolicy
+from policies.tallies import Reached, end_tally, tally_of
 from tune_jobs.engines.protocol import IterationStats, PackEngine, TrialTask
 from tune_jobs.ownership import Owner, OwnershipLostError
 from tune_jobs.recovery import write_log
@@ -41,6 +42,8 @@ class MemberReport:
     progress: Progress | None = None
     error: str | None = None
     """What made it fail, and the end of its log."""
+    reached: Reached | None = None
+    """How far one that failed was; None: it is not known here."""
     retried: bool = False
     """Whether it goes on from its latest checkpoint: at once, or if it was to leave, when the sweep is resumed."""
     lost: bool = False
@@ -127,6 +130,7 @@ class _Member:
             if self.loop is not None:
                 self.loop.flush()
         finally:
+            end_tally(self.task.trial_id)
             if self.engine is not None:
                 self.engine.close()
             self.loop = self.engine = self.unreported = None
@@ -325,7 +329,10 @@ class PackLoop:
         _log(member.task, "".join(traceback.format_exception(error)).rstrip())
         member.num_failures += 1
         retried = leaves or member.num_failures <= self._max_retries
-        self._reports.append(MemberReport(member.task.trial_id, error=_describe(member.task, error), retried=retried))
+        trial_id, tally = member.task.trial_id, tally_of(member.task.trial_id)
+        reached = None if tally is None else tally.reached
+        message = _describe(member.task, error)
+        self._reports.append(MemberReport(trial_id, error=message, reached=reached, retried=retried))
         if leaves or not retried:
             self._let_go(member)
         else:

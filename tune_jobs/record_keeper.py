@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from analysis.records import TrialRecord
+from policies.tallies import Reached, read_tally
 from tune_jobs.ownership import Owner
 from tune_jobs.store import SweepStore
 from tune_jobs.tensorboard import ScalarWriter
@@ -117,6 +118,7 @@ class RecordKeeper:
     def ended(self, trial_id: str) -> None:
         """A trial runs no more: by itself, as it has told, or it was paused or stopped."""
         self.running.discard(trial_id)
+        self._forget_tally(trial_id)
         record = self._records[trial_id]
         if record.status not in ("running", "paused"):
             return
@@ -126,14 +128,29 @@ class RecordKeeper:
             reason = f"scheduler, at {record.num_env_steps} env steps"
             self._update(trial_id, status="stopped", stop_reason=reason, ended_at=time.time())
 
-    def failed(self, trial_id: str, error: str, *, retried: bool) -> None:
-        """A trial failed, for good or to be tried again."""
+    def failed(self, trial_id: str, error: str, *, retried: bool, reached: Reached | None = None) -> None:
+        """A trial failed, for good or to be tried again.
+
+        Args:
+            trial_id: The trial.
+            error: Why.
+            retried: Whether it is tried again.
+            reached: How far it was; None: what its process has left behind says so.
+        """
         self.running.discard(trial_id)
-        failures = self._records[trial_id].num_failures + 1
+        if reached is None:
+            reached = read_tally(self._store.trial(trial_id).tally_path)
+        changes: dict[str, Any] = {} if reached is None else dataclasses.asdict(reached)
+        changes |= {"num_failures": self._records[trial_id].num_failures + 1, "error": error}
         if retried:
-            self._update(trial_id, status="pending", num_failures=failures, error=error)
+            self._update(trial_id, status="pending", **changes)
         else:
-            self._update(trial_id, status="failed", num_failures=failures, error=error, ended_at=time.time())
+            self._update(trial_id, status="failed", ended_at=time.time(), **changes)
+            self._forget_tally(trial_id)
+
+    def _forget_tally(self, trial_id: str) -> None:
+        """What is in a process's tally is in the record now, or its trial is over."""
+        self._store.trial(trial_id).tally_path.unlink(missing_ok=True)
 
     def flush(self) -> None:
         """Write what is due: first what was written longest ago."""

@@ -63,6 +63,11 @@ class TrialStore(OwnedFolder):
         return within(self.folder, "log.txt")
 
     @property
+    def tally_path(self) -> Path:
+        """Of the file that says how far a trial is whose process runs, or did not end by itself."""
+        return within(self.folder, ".tally")
+
+    @property
     def checkpoints_folder(self) -> Path:
         """Where its checkpoints lie."""
         return within(self.folder, "checkpoints")

@@ -27,6 +27,7 @@ from policies.env_modules import allow_modules
 from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
 from policies.parents import end_with_parent, is_gone
+from policies.tallies import end_tally
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
 from tune_jobs.logs import begin_log
 from tune_jobs.ownership import OWNER_FILE, Owner
@@ -186,6 +187,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         note_signals()
         self._log = TrialLog()
         self._engine: TrainingEngine | None = None
+        self._loop: TrialLoop | None = None
         self._evaluators: dict[str, Evaluator] = {}
         self._node = this_node()
         self._run = owner_of_run(config)
@@ -198,8 +200,10 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         return True
 
     def _take(self, config: Mapping[str, Any]) -> None:
+        if self._loop is not None:
+            end_tally(self._loop.task.trial_id)
         self._trial = (Path(config["sweep_folder"]), str(config["trial_id"]))
-        self._loop: TrialLoop | None = None
+        self._loop = None
         self._grace = 1
 
     def step(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from policies.evaluate import Episodes, Evaluator
 from policies.files import write_plain
 from policies.policy import NonFiniteWeightsError, Policy, policy_from_portable
 from policies.portable import save_policy
+from policies.tallies import Reached, begin_tally, end_tally
 from tune_jobs.copies import pending_copy, remove_copies
 from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
 from tune_jobs.ownership import Owner, OwnershipLostError
@@ -147,6 +148,8 @@ class TrialLoop:
         self._take_up_results(start, change.iteration if change is not None else 0)
         for note in self._notes:
             write_log(self._store.log_path, f"{self.task.trial_id}: {note}")
+        with self._store.owned():
+            self._tally = begin_tally(self.task.trial_id, self._store.tally_path, _reached(self._last))
         done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
         self._engine.build(done, folder)
         self._started = self._clock() - self._last.time_s
@@ -229,6 +232,8 @@ class TrialLoop:
         """Take what an iteration gave; returns whether `conclude` needs an evaluation of the policy as it is now."""
         self._taken = self._record(stats)
         self._is_copy = False
+        # Its iteration is whole when it is concluded.
+        self._tally.set(replace(_reached(self._taken), num_iterations=self._last.iteration))
         self._reason = self._stop_reason(self._taken, None)
         return self._taken.iteration % self.task.evaluation.every_iterations == 0 or self._reason is not None
 
@@ -255,6 +260,7 @@ class TrialLoop:
             reason = reason or self._stop_reason(record, score)
         self._last = record.model_copy(update={"time_s": self._clock() - self._started})
         self._unwritten.append(self._last)
+        self._tally.set(_reached(self._last))
         score = record.evaluation_return
         if (
             self._improves(score)
@@ -349,6 +355,10 @@ class TrialLoop:
     def _progress(
         self, status: str, *, evaluated: bool, reason: str | None = None, error: str | None = None
     ) -> Progress:
+        if status != "running":
+            end_tally(self.task.trial_id)
+            with self._store.owned():
+                self._store.tally_path.unlink(missing_ok=True)
         return Progress(
             iteration=self._last.iteration,
             num_env_steps=self._last.num_env_steps,
@@ -367,6 +377,10 @@ class TrialLoop:
             started_at=self._started_at,
             ended_at=None if status == "running" else time.time(),
         )
+
+
+def _reached(record: IterationRecord) -> Reached:
+    return Reached(record.iteration, record.num_env_steps, record.num_episodes, record.time_s)
 
 
 def _reaches(value: float | None, target: float | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +20,7 @@ from policies.packed.penalty import Penalty
 from policies.packed.process_envs import ProcessHost
 from policies.packed.sub_envs import HereHost, Host, HostDiedError, SubStep
 from policies.spaces import observation_dtype
+from policies.tallies import Tally, tally_of
 
 _NUM_SEEDS = 2**32  # Gymnasium takes larger ones, but many an env does not
 
@@ -75,6 +77,7 @@ class ScalarEnvs:
         self._num_processes = num_processes
         self._parts: list[_Part] = []
         self._suspects: set[str] = set()
+        self._tallies: dict[str, Tally] = {}
         self.observations: NDArray[Any] = self._zeros(0)
 
     @property
@@ -104,6 +107,8 @@ class ScalarEnvs:
                 self._suspects.add(member_id)
             raise problem
         self._members.add(member_id)
+        if (tally := tally_of(member_id)) is not None:
+            self._tallies[member_id] = tally
         self.observations = np.concatenate([self.observations, firsts])
         self._find_rows()
 
@@ -112,6 +117,7 @@ class ScalarEnvs:
         self._drop(member_id)
         self.observations = self.observations[self._members.remove(member_id)]
         self.errors.pop(member_id, None)
+        self._tallies.pop(member_id, None)
         self._find_rows()
 
     def arrange(self, member_ids: Sequence[str]) -> None:
@@ -152,6 +158,10 @@ class ScalarEnvs:
             for array in (finals, observations, rewards, terminated, truncated):
                 array[self._members.of(member_id)] = 0
         self.observations = observations
+        ends = Counter(self._members.ids[row // self.num_envs] for row in firsts)
+        for member_id, tally in self._tallies.items():
+            if member_id not in self.errors:
+                tally.add(self.num_envs, ends[member_id])
         seen = rewards if self._penalty is None else self._penalty.apply(rewards, terminated)
         return Step(observations, finals, seen, rewards, terminated, truncated)
 

@@ -171,6 +171,8 @@ def test_the_members_of_a_pack_that_is_killed_go_on_from_their_checkpoints(tmp_p
     errors = {record.trial_id: record.error for record in seen if record.error}
     assert set(errors) == {"t0000", "t0001", "t0002"}
     assert errors["t0000"].startswith("The process of the pack died.")
+    # As many as it had made, though the last report may be older.
+    assert {record.num_env_steps for record in seen if record.error} == {4 * STEPS}
     # The end of the pack's log.
     assert "about to die" in errors["t0000"]
     for record in records:
@@ -186,9 +188,14 @@ def test_a_pack_that_hangs_is_ended_and_started_again(tmp_path):
     records = run_packs(store, {"t0001": {"hang_at": 5}}, num_packs=1, slots=3, listener=seen.append)
     assert [(record.status, record.num_failures) for record in records] == [("completed", 1)] * 3
     errors = {record.trial_id: record.error for record in seen if record.error}
-    assert all("died: an iteration took longer than iteration_timeout_s." in error for error in errors.values())
-    # Where it hung.
-    assert "in train_iteration" in errors["t0002"]
+    first, *lines = errors["t0002"].splitlines()
+    assert set(errors.values()) == {errors["t0002"]}
+    assert "died: an iteration took longer than iteration_timeout_s (3 s). It hung at " in first
+    assert first.endswith(" in train_iteration.")
+    # The frames of the thread that hung, and no other's.
+    assert lines[0].startswith("Timeout (")
+    assert "in train_iteration" in lines[2]
+    assert sum("Thread 0x" in line for line in lines) == 1
     for record in records:
         assert_whole(store, record)
 

@@ -5,9 +5,11 @@ Sweeps whose process is killed are in test_interruption.py.
 
 import itertools
 import os
+import re
 import threading
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.policy import load_policy
 from policies.portable import read_policy
 from tune_jobs import sweeps
+from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.seeds import trial_seeds
 from tune_jobs.store import SweepStore, verify_checkpoint
 
@@ -223,7 +226,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     hangs. Each is tried twice."""
     seeds = trial_seeds(0, 5)
     troubles = {
-        str(seeds[1]): {"how": "raise"},
+        str(seeds[1]): {"how": "raise", "at": 6},
         # After its first checkpoints: the retry goes on from there.
         str(seeds[2]): {"how": "raise", "at": 100, "marker": str(tmp_path / "raised")},
         str(seeds[3]): {"how": "exit", "marker": str(tmp_path / "died")},
@@ -234,7 +237,15 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
         iteration_timeout_s=12, engine="rllib",
     )  # fmt: skip
-    result = launch(tmp_path, spec, finish=True)
+    told = {}
+
+    def note(keeper, trial_id, error, **kwargs):
+        failed_as_it_is(keeper, trial_id, error, **kwargs)
+        told[trial_id] = keeper.record(trial_id)
+
+    failed_as_it_is = RecordKeeper.failed
+    with mock.patch.object(RecordKeeper, "failed", note):
+        result = launch(tmp_path, spec, finish=True)
     assert [trial.status for trial in result.trials] == ["completed", "failed", "completed", "completed", "completed"]
     assert [trial.num_failures for trial in result.trials] == [0, 2, 1, 1, 1]
     assert (result.exit_code, result.sweep.state) == (3, "completed")
@@ -246,6 +257,14 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     assert "tune_jobs_test_envs.py" in failed.error
     assert failed.ended_at is not None
     assert failed.checkpoints == ()
+    # In the first iteration: the five steps before it, of four sub-environments each.
+    assert (failed.num_iterations, failed.num_env_steps) == (0, 5 * FAST["num_envs"])
+    assert failed.time_s > 0
+    hung = told["t0004"]
+    assert hung.num_env_steps > 60 * FAST["num_envs"]
+    first = hung.error.splitlines()[0]
+    assert "died: an iteration took longer than iteration_timeout_s (12 s). It hung at " in first
+    assert re.search(r"/tune_jobs_test_envs\.py:\d+ in _go_wrong\.$", first)
     store = SweepStore(result.folder)
     for trial in result.trials:
         if trial.status == "completed":

@@ -1,0 +1,147 @@
+"""How far a trial is outlives its process, and is in the record of one that failed."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_engine import FakeEngine
+from fake_pack import Pack
+from test_packed_env_failures import go_on
+from test_packed_envs import make, own_modules
+from test_record_keeper import kept, progress
+from trial_runs import Trial
+
+from policies import env_faults
+from policies.checked_envs import CheckedEnvs
+from policies.envs import make_vector_env
+from policies.errors import EnvError
+from policies.tallies import Reached, begin_tally, end_tally, only_tally, read_tally, tally_of
+
+__all__ = ["kept", "make", "own_modules"]
+
+BEGUN = Reached(num_iterations=2, num_env_steps=200, num_episodes=3, time_s=7.0)
+FAULTY = "odd_envs:Faulty"
+
+
+@pytest.fixture(autouse=True)
+def no_tallies():
+    yield
+    for name in ("a", "b", "t0000", "t0001"):
+        end_tally(name)
+
+
+def test_a_tally_outlives_a_process_that_is_killed(tmp_path):
+    code = (
+        "import os, signal, sys\nfrom pathlib import Path\nfrom policies.tallies import Reached, begin_tally\n"
+        "tally = begin_tally('a', Path(sys.argv[1]), Reached(2, 200, 3, 7.0))\n"
+        "for _ in range(5): tally.add(8, 1)\nos.kill(os.getpid(), signal.SIGKILL)"
+    )
+    path = tmp_path / ".tally"
+    child = subprocess.run(
+        [sys.executable, "-c", code, str(path)], env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        timeout=120, check=False,
+    )  # fmt: skip
+    assert child.returncode == -9
+    reached = read_tally(path)
+    assert (reached.num_iterations, reached.num_env_steps, reached.num_episodes) == (2, 240, 8)
+    assert reached.time_s >= 7.0
+
+
+def test_a_process_that_has_lost_its_trial_counts_into_nothing(tmp_path):
+    old = begin_tally("a", tmp_path / ".tally", BEGUN)
+    begin_tally("a", tmp_path / ".tally", BEGUN)
+    old.add(100, 1)
+    assert read_tally(tmp_path / ".tally") == BEGUN
+
+
+def test_what_is_no_tally_says_nothing(tmp_path):
+    assert read_tally(tmp_path / ".tally") is None
+    for content in (b"", b"x" * 31, np.array([np.nan, 1, 1, 1]).tobytes()):
+        (tmp_path / ".tally").write_bytes(content)
+        assert read_tally(tmp_path / ".tally") is None
+    tally = begin_tally("a", tmp_path / "missing" / ".tally", BEGUN)
+    tally.add(8, 1)
+    assert tally.reached.num_env_steps == 208
+
+
+@pytest.mark.parametrize("kind", ["scalar", "processes"])
+def test_env_steps_of_a_pack_are_counted_up_to_the_failure(make, tmp_path, kind):
+    for name in ("a", "b"):
+        begin_tally(name, tmp_path / name, BEGUN)
+    envs = make(FAULTY, kind, env_args={"raises": "OwnStop", "action": 1}, members={"a": 1, "b": 2}, num_processes=2)
+    for index in range(12):
+        go_on(envs, "b", 1 if index == 9 else 0)
+    # Three sub-environments each; an episode takes seven steps.
+    assert (tally_of("a").reached.num_env_steps, tally_of("a").reached.num_episodes) == (236, 6)
+    assert (tally_of("b").reached.num_env_steps, tally_of("b").reached.num_episodes) == (227, 6)
+    assert read_tally(tmp_path / "b") == tally_of("b").reached
+    envs.remove("b")
+    go_on(envs)
+    assert tally_of("b").reached.num_env_steps == 227
+
+
+def test_env_steps_of_a_vector_env_are_counted_without_those_that_reset(monkeypatch, tmp_path):
+    monkeypatch.setattr(env_faults, "_notes_signals", True)
+    begin_tally("a", tmp_path / "a", BEGUN)
+    envs = CheckedEnvs(make_vector_env(FAULTY, {"raises": "OwnStop", "action": 1}, 2), FAULTY)
+    envs.reset(seed=5)
+    for _ in range(10):
+        envs.step(np.zeros(2, dtype=np.int64))
+    with pytest.raises(EnvError):
+        envs.step(np.ones(2, dtype=np.int64))
+    # Ten steps, one of which only reset.
+    assert (only_tally().reached.num_env_steps, only_tally().reached.num_episodes) == (218, 5)
+    begin_tally("b", tmp_path / "b", BEGUN)
+    assert only_tally() is None
+
+
+def test_a_trial_s_tally_follows_it_and_is_gone_at_its_end(tmp_path):
+    trial = Trial(tmp_path, engine=FakeEngine(raise_at=4), evaluation={"every_iterations": 2})
+    path = trial.store.tally_path
+    assert read_tally(path) == Reached(0, 0, 0, 0.0)
+    trial.run_to(2)
+    tally_of("t0000").add(30, 2)
+    with pytest.raises(ZeroDivisionError):
+        trial.run()
+    # The fourth iteration is not whole; of it is known what was counted while it lasted.
+    found = read_tally(path)
+    assert (found.num_iterations, found.num_env_steps, found.num_episodes) == (3, 300, 3)
+    again = Trial(tmp_path, stop={"num_iterations": 5})
+    again.run()
+    assert not path.exists()
+    assert tally_of("t0000") is None
+
+
+def test_a_member_that_fails_tells_how_far_it_was(tmp_path):
+    def engine(trial_id):
+        return FakeEngine(raise_at=4 if trial_id == "t0001" else None)
+
+    pack = Pack(tmp_path, engine, max_retries=1, stop={"num_iterations": 6}, checkpoints={"every_iterations": 2})
+    pack.add("t0000", "t0001").run()
+    reached = [report.reached for report in pack.of("t0001") if report.error is not None]
+    assert [(one.num_iterations, one.num_env_steps) for one in reached] == [(3, 300), (3, 300)]
+    assert not pack.store("t0000").tally_path.exists()
+    assert tally_of("t0001") is None
+
+
+def test_the_record_of_a_failed_trial_says_how_far_it_was(kept):
+    store, keeper, _, _ = kept
+    begin_tally("a", store.trial("t0003").tally_path, Reached(5, 512, 9, 2.5))
+    keeper.started("t0003")
+    keeper.failed("t0003", "it hung", retried=True)
+    record = keeper.record("t0003")
+    assert (record.status, record.num_iterations, record.num_env_steps) == ("pending", 5, 512)
+    assert (record.num_episodes, record.time_s) == (9, 2.5)
+    keeper.started("t0003")
+    keeper.failed("t0003", "it raised", retried=False, reached=Reached(6, 700, 11, 3.5))
+    record = keeper.record("t0003")
+    assert (record.status, record.num_iterations, record.num_env_steps, record.time_s) == ("failed", 6, 700, 3.5)
+    assert not store.trial("t0003").tally_path.exists()
+    # Nothing is known: what it has told itself stays.
+    keeper.started("t0004")
+    keeper.progressed("t0004", progress(4), node="here", pid=12)
+    keeper.failed("t0004", "its node is gone", retried=False)
+    assert (keeper.record("t0004").num_iterations, keeper.record("t0004").num_env_steps) == (4, 400)
