@@ -7,7 +7,7 @@ sweep with more samples gives the same trials first. What can't run is refused h
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -149,7 +149,7 @@ def make_plan(
     if retry_failed:
         ended -= {record.trial_id for record in records if record.status == "failed"}
     to_run = [trial for trial in trials if trial.trial_id not in ended]
-    members = _members(to_run, points, [max(member_bytes(env, each) for each in sets) for sets in sizes])
+    members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
         all_are_packed = all(trial.engine == "packed" for trial in trials)
@@ -162,9 +162,9 @@ def make_plan(
         max_concurrent=concurrent,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
-        max_env_steps=spec.seeds_per_point * sum(max(max_env_steps(spec, each) for each in sets) for sets in sizes),
+        max_env_steps=spec.seeds_per_point * sum(_largest(sizes, lambda each: max_env_steps(spec, each))),
         max_disk_bytes=_SWEEP_BYTES
-        + spec.seeds_per_point * sum(max(max_disk_bytes(spec, env, each) for each in sets) for sets in sizes),
+        + spec.seeds_per_point * sum(_largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
         env=env,
         machine=machine,
         notes=(*_notes(spec, env, concurrent if packs is None else None), *engine_notes),
@@ -238,6 +238,15 @@ def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]
         return [[values, *largest_hyperparams(spec, known)] for values in known]
     unknown = spec.num_samples - len(known) if spec.search.type == "tpe" else 0
     return [[values] for values in known] + ([largest_hyperparams(spec, known)] * unknown if unknown else [])
+
+
+def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], int]) -> list[int]:
+    """The largest measure of each point's; a list that stands for many points is gone through once."""
+    known: dict[int, int] = {}
+    for values in sizes:
+        if id(values) not in known:
+            known[id(values)] = max(map(measure, values))
+    return [known[id(values)] for values in sizes]
 
 
 def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int) -> Hyperparams:

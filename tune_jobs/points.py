@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
+from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, as_sizes
 from tune_jobs.search_space import Domain, Listed, Range, draw_point, draw_points
 from tune_jobs.spec import SweepSpec
 
+_MAX_COMBINATIONS = 10_000
 _DECIDE_SIZE = (
     "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers",
     "replay_capacity",
@@ -32,10 +35,20 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
     Args:
         spec: The sweep.
         known: Of the points that are known; at least one.
+
+    Raises:
+        SpecError: There are too many combinations to look at.
     """
     ends = {name: _ends(domain) for name, domain in spec.space.items() if name in _DECIDE_SIZE}
     if "hidden_sizes" in ends:
         ends["hidden_sizes"] = [as_sizes(value) for value in ends["hidden_sizes"]]
+    combinations = math.prod(map(len, ends.values()))
+    if combinations > _MAX_COMBINATIONS:
+        raise SpecError(
+            f"The listed values of {', '.join(ends)} have {combinations:,} combinations; at most {_MAX_COMBINATIONS:,} "
+            "can be looked at to find the largest trial.",
+            "List fewer values, or give ranges.",
+        )
     return [
         known[0].model_copy(update=dict(zip(ends, values, strict=True))) for values in itertools.product(*ends.values())
     ]

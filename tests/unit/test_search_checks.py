@@ -4,7 +4,7 @@ import pytest
 from spec_errors import MINIMAL, errors
 
 from analysis.records import ChangeRecord
-from policies.errors import CannotRunError
+from policies.errors import CannotRunError, SpecError
 from tune_jobs.driving import check_same_trials, pending_record, write_new
 from tune_jobs.machine import Machine
 from tune_jobs.plan import make_plan
@@ -176,3 +176,25 @@ def test_values_that_a_population_changed_are_no_other_sweep_but_others_are(tmp_
     trial.write_record(known.model_copy(update={**changed, "changes": ()}))
     with pytest.raises(CannotRunError, match="t0001"):
         check_same_trials(store, plan)
+
+
+def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused():
+    space = {
+        "hidden_sizes": {"choice": [[number, number] for number in range(1, 2_602)]},
+        "num_envs": {"randint": [1, 8]},
+        "train_batch_size": {"randint": [512, 1024]},
+    }
+    with pytest.raises(SpecError, match="hidden_sizes, num_envs, train_batch_size have 10,404 combinations"):
+        make_plan(load_spec({**MINIMAL, **TPE, "space": space}), MACHINE)
+
+
+def test_a_list_of_sizes_is_measured_once_however_many_points_it_stands_for(monkeypatch):
+    from tune_jobs import plan
+
+    measured = []
+    real = plan.max_env_steps
+    monkeypatch.setattr(plan, "max_env_steps", lambda spec, values: measured.append(values) or real(spec, values))
+    spec = load_spec({**MINIMAL, **TPE, "space": {"num_envs": {"randint": [1, 8]}}, "num_samples": 1_000})
+    make_plan(spec, MACHINE)
+    # The random points at the start, and the two ends for all others.
+    assert len(measured) == 10 + 2
