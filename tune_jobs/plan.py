@@ -21,6 +21,7 @@ from policies.guard import guarding
 from policies.guarded import check_env
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
 from tune_jobs.env_rules import check_env_args, check_env_rules
+from tune_jobs.idle_notes import idle_notes
 from tune_jobs.machine import Machine
 from tune_jobs.own_code import check_rl_module
 from tune_jobs.pack_sizes import Member, plan_packs
@@ -125,7 +126,8 @@ def make_plan(
     Raises:
         EnvError: The environment isn't registered, can't be made, or doesn't go with the algorithm.
         SpecError: A point's values contradict each other or the environment, there are too many trials, something is
-            in a module that is not allowed, or trials that are to be packed can't be.
+            in a module that is not allowed, trials that are to be packed can't be, or a new sweep searches what can't
+            act.
         CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
     if spec.search.type == "tpe":
@@ -144,6 +146,14 @@ def make_plan(
     known = [values for _, values in points if values is not None]
     check_env_rules(spec, env, known)
     trials, engine_notes = _trials(spec, env, points, records)
+    first_trials = trials[:: spec.seeds_per_point]
+    idle = idle_notes(
+        spec,
+        env,
+        [values for _, values in points],
+        [trial.engine == "packed" for trial in first_trials],
+        may_refuse=not records,
+    )
     sizes = _sizes(spec, known)
     ended = {record.trial_id for record in records if record.status in FINISHED}
     if retry_failed:
@@ -167,7 +177,7 @@ def make_plan(
         + spec.seeds_per_point * sum(_largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
         env=env,
         machine=machine,
-        notes=(*_notes(spec, env, concurrent if packs is None else None), *engine_notes),
+        notes=(*_notes(spec, env, concurrent if packs is None else None), *idle, *engine_notes),
         packs=packs,
     )
 

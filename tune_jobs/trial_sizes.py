@@ -32,6 +32,11 @@ def max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     return min(spec.stop.num_env_steps - 1 + iteration, spec.stop.num_iterations * iteration)
 
 
+def max_iterations(spec: SweepSpec, values: Hyperparams) -> int:
+    """Most iterations of one trial."""
+    return min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
+
+
 def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     """Most env steps of one iteration: all sub-environments step together, so the last step overshoots."""
     wanted, num_runners = _wanted_env_steps(values), max(1, spec.resources.num_env_runners)
@@ -49,7 +54,7 @@ def _wanted_env_steps(values: Hyperparams) -> int:
 
 def max_disk_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
     """Most bytes that one trial's folder holds, as an estimate."""
-    iterations = min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
+    iterations = max_iterations(spec, values)
     checkpoint = _CHECKPOINT_BASE_BYTES + _num_weights(env, values) * _BYTES_PER_NUMBER * _COPIES_OF_WEIGHTS
     kept = min(spec.checkpoints.keep + 2, math.ceil(iterations / spec.checkpoints.every_iterations) + 2)
     # One more while a new one is being written and the old one not yet deleted.

@@ -1,0 +1,188 @@
+"""Hyperparameters that can't act: a search over one is refused, what acts in some points alone is told."""
+
+import pytest
+from spec_errors import MINIMAL
+
+from analysis.records import TrialRecord
+from policies.errors import SpecError
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec_file import load_spec
+
+PPO = {"algorithm": "ppo"}
+DQN = {"algorithm": "dqn", "stop": {"num_env_steps": 5000}}
+TWO_LRS = {"lr": {"grid": [1e-3, 1e-2]}}
+
+
+def notes(*records, **fields):
+    """What the plan of a small sweep says, but for its engines."""
+    made = make_plan(load_spec({**MINIMAL, "space": TWO_LRS, **fields}), Machine(2), records)
+    return [note for note in made.notes if "packed" not in note]
+
+
+def grid(**values):
+    return {name: {"grid": list(listed)} for name, listed in values.items()}
+
+
+# -- searched, and idle in all points: refused
+
+NEVER = {
+    "kl_target": (PPO, {"kl_target": {"loguniform": [1e-3, 1e-1]}}, "use_kl_loss is false"),
+    "kl_coeff": ({**PPO, "hyperparams": {"use_kl_loss": False}}, grid(kl_coeff=[0.1, 1.0]), "use_kl_loss is false"),
+    "prioritized_alpha": (DQN, {"prioritized_alpha": {"uniform": [0, 1]}}, "replay is not prioritized"),
+    "rmsprop_rho": (DQN, {"rmsprop_rho": {"uniform": [0.9, 0.99]}}, "optimizer is adam"),
+    "learning_starts": (DQN, {"learning_starts": {"randint": [7000, 9000]}}, "ends before.*6,002 env steps"),
+    "replay_capacity": (DQN, grid(replay_capacity=[7000, 50_000]), "keeps them all"),
+    "lr": ({**DQN, "hyperparams": {"learning_starts": 6003}}, TWO_LRS, "no update is made"),
+    "epsilon_decay": (
+        {**DQN, "hyperparams": {"epsilon_initial": 0.1, "epsilon_final": 0.1}}, grid(epsilon_decay=[10, 100]),
+        "epsilon_initial is epsilon_final",
+    ),
+    "train_freq": ({**DQN, "hyperparams": {"num_envs": 8}}, grid(train_freq=[1, 4, 8]), "not more than num_envs"),
+    "n_step": (
+        {**DQN, "env": {"id": "CartPole-v1", "args": {"max_episode_steps": 5}}}, grid(n_step=[5, 9]), "no episode has",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NEVER)
+def test_a_search_that_changes_nothing_is_refused(name):
+    fields, space, why = NEVER[name]
+    fields = {"num_samples": 1 if "grid" in space[name] else 6, **fields}
+    with pytest.raises(SpecError, match=rf"space\.{name} is searched, but can't act.*{why}") as refused:
+        notes(**fields, space=space)
+    assert "Take it out of space" in refused.value.hint
+    # Whatever else is searched, no trial differs by this one.
+    with pytest.raises(SpecError, match=rf"space\.{name} is searched"):
+        notes(**fields, space={**space, **grid(activation=["relu", "tanh"])})
+
+
+def test_several_are_told_at_once():
+    space = grid(kl_target=[0.01, 0.1], kl_coeff=[0.1, 0.2], lr=[1e-3, 1e-4])
+    with pytest.raises(SpecError, match=r"space\.kl_target, space\.kl_coeff are searched") as refused:
+        notes(**PPO, space=space)
+    assert "space.lr" not in refused.value.message
+
+
+@pytest.mark.parametrize("more", [{}, {"search": "tpe", "num_samples": 30}, {"scheduler": "pbt", "num_samples": 3}])
+def test_whatever_chooses_the_points(more):
+    space = {"rmsprop_rho": {"uniform": [0.9, 0.99]}, "lr": {"loguniform": [1e-4, 1e-2]}}
+    with pytest.raises(SpecError, match=r"space\.rmsprop_rho is searched.*optimizer is adam"):
+        notes(**DQN, **{"num_samples": 3, **more}, space=space)
+
+
+def test_values_at_both_ends_of_a_range_may_be_alike_for_two_reasons_and_those_between_not():
+    space = {"learning_starts": {"randint": [0, 20_000]}}
+    assert not any("space" in note for note in notes(**DQN, space=space, num_samples=2))
+
+
+def test_a_sweep_that_is_there_goes_on_and_is_told():
+    spec = load_spec({**MINIMAL, **PPO, "space": grid(kl_target=[0.01, 0.1])})
+    record = TrialRecord(trial_id="t0000", index=0, point_index=0, seed=1, point={"kl_target": 0.01})
+    assert "space.kl_target can't act: use_kl_loss is false." in make_plan(spec, Machine(2), [record]).notes
+
+
+# -- searched, and idle in some points
+
+
+def test_what_acts_in_some_points_alone_is_told_with_these():
+    space = grid(use_kl_loss=[False, True], kl_target=[0.01, 0.1])
+    assert notes(**PPO, space=space) == ["space.kl_target can't act in 2 of 4 points (0, 1): use_kl_loss is false."]
+    many = grid(use_kl_loss=[False, True], kl_target=[0.01 * number for number in range(1, 11)])
+    assert notes(**PPO, space=many) == ["space.kl_target can't act in 10 of 20 points: use_kl_loss is false."]
+
+
+def test_each_reason_has_its_points():
+    space = grid(use_kl_loss=[False, True], kl_coeff=[0.0, 0.2], kl_target=[0.01, 0.1])
+    zero = "kl_coeff is 0, and stays 0 as it is changed by factors"
+    assert notes(**PPO, space=space) == [
+        f"space.use_kl_loss can't act in 4 of 8 points (0, 1, 4, 5): {zero}.",
+        "space.kl_coeff can't act in 4 of 8 points (0, 1, 2, 3): use_kl_loss is false.",
+        "space.kl_target can't act in 4 of 8 points (0, 1, 2, 3): use_kl_loss is false.",
+        f"space.kl_target can't act in 2 of 8 points (4, 5): {zero}.",
+    ]
+
+
+def test_the_search_of_one_optimizer_with_the_values_of_both_is_no_error():
+    space = grid(optimizer=["adam", "rmsprop"], rmsprop_rho=[0.9, 0.99], adam_beta1=[0.8, 0.9])
+    found = notes(**DQN, space=space)
+    assert found == [
+        "space.rmsprop_rho can't act in 4 of 8 points (0, 1, 2, 3): optimizer is adam.",
+        "space.adam_beta1 can't act in 4 of 8 points (4, 5, 6, 7): optimizer is rmsprop.",
+    ]
+
+
+def test_values_that_act_alike_are_told_and_one_alone_is_not():
+    space = grid(replay_capacity=[2000, 8000, 20_000])
+    (found,) = notes(**DQN, space=space)
+    assert found.startswith(
+        "space.replay_capacity: its values act alike in 2 of 3 points (1, 2): a trial makes no more"
+    )
+    assert notes(**DQN, space=grid(replay_capacity=[2000, 8000])) == []
+
+
+def test_a_few_draws_of_a_range_that_act_alike_are_not_worth_a_note():
+    rare = {"replay_capacity": {"randint": [100, 6100]}}
+    assert notes(**DQN, space=rare, num_samples=50) == []
+    often = {"replay_capacity": {"randint": [100, 20_000]}}
+    (found,) = notes(**DQN, space=often, num_samples=50)
+    assert "its values act alike in" in found
+
+
+def test_mutations_may_change_what_others_depend_on():
+    pbt = {"scheduler": "pbt", "num_samples": 1}
+    (found,) = notes(**PPO, **pbt, space=grid(use_kl_loss=[False, True], kl_target=[0.01, 0.1]))
+    assert found.endswith("use_kl_loss is false. A mutation of use_kl_loss may change that.")
+
+
+def test_points_that_are_not_known_yet_may_act():
+    space = {**grid(optimizer=["adam", "rmsprop"]), "rmsprop_rho": {"uniform": [0.9, 0.99]}}
+    (found,) = notes(**DQN, space=space, search="tpe", num_samples=30)
+    assert "of 10 points that are known" in found
+
+
+# -- fixed
+
+
+def test_fixed_values_that_cannot_act_are_told():
+    fixed = {"rmsprop_rho": 0.9, "adam_beta1": 0.8, "prioritized_beta": 0.5, "hidden_sizes": [8]}
+    assert notes(**DQN, hyperparams=fixed) == [
+        "hyperparams.rmsprop_rho can't act: optimizer is adam.",
+        "hyperparams.prioritized_beta can't act: replay is not prioritized.",
+    ]
+    both = grid(optimizer=["adam", "rmsprop"])
+    assert notes(**DQN, hyperparams={"rmsprop_rho": 0.9}, space=both) == []
+
+
+def test_a_searched_value_of_one_is_a_fixed_one():
+    assert notes(**DQN, space={**grid(rmsprop_rho=[0.9]), **TWO_LRS}) == [
+        "space.rmsprop_rho can't act: optimizer is adam."
+    ]
+
+
+def test_what_is_switched_off_or_large_enough_needs_no_note():
+    fixed = {"replay_capacity": 100_000, "target_update_freq": None, "target_network": False, "double_q": False}
+    assert notes(**DQN, hyperparams=fixed) == []
+    assert notes(**PPO, hyperparams={"use_kl_loss": False, "kl_coeff": 0.0})[0].startswith("hyperparams.kl_coeff")
+
+
+def test_trials_that_never_learn_are_told():
+    fixed = {"learning_starts": 6003, "gamma": 0.9}
+    (found,) = notes(**DQN, hyperparams=fixed, space={}, num_samples=1)
+    assert found == (
+        "In the only point no update is made, as learning_starts 6,003 is more than the env steps of a trial (at most "
+        "6,002)."
+    )
+    (found,) = notes(**DQN, hyperparams={"updates_per_env_step": 1e-4}, space={}, num_samples=1)
+    assert "updates_per_env_step 0.0001 gives less than one" in found
+    (found,) = notes(**DQN, hyperparams={"train_batch_size": 7000}, space={}, num_samples=1)
+    assert "train_batch_size 7,000 is more" in found
+    (found,) = notes(**DQN, space=grid(learning_starts=[1000, 9000], activation=["relu", "tanh"]))
+    assert found.startswith("In 2 of 4 points (2, 3) no update is made")
+    assert notes(**DQN, hyperparams={"learning_starts": 6002}) == []
+
+
+def test_the_exploration_of_a_users_own_module_is_its_own_affair(monkeypatch):
+    monkeypatch.setattr("tune_jobs.plan.check_rl_module", lambda spec: None)
+    flat = {"epsilon_initial": 0.1, "epsilon_final": 0.1}
+    assert notes(**DQN, rl_module="own:Module", hyperparams=flat, space=grid(epsilon_decay=[10, 100])) == []
