@@ -45,6 +45,8 @@ __all__ = [
 
 FORMAT_VERSION = 2
 READABLE_VERSIONS = (1, 2)
+_MAX_CHARS = 400
+"""Of what a message quotes."""
 
 ActionTransform = Literal["none", "unsquash", "by_component", "clip"]
 
@@ -139,7 +141,7 @@ def read_policy(path: Path) -> PortablePolicy:
     if version not in READABLE_VERSIONS:
         known = " and ".join(str(number) for number in READABLE_VERSIONS)
         raise CheckpointError(
-            f"The policy file {json_path} has format version {version!r}; this tune-jobs reads {known}.",
+            f"The policy file {json_path} has format version {str(version)[:80]!r}; this tune-jobs reads {known}.",
             "Update tune-jobs, or write the policy file again from its checkpoint.",
         )
     digest = hashlib.sha256(weights).hexdigest()
@@ -176,7 +178,7 @@ def _locate(path: Path) -> tuple[Path, Path]:
 
 def _broken(path: Path, what: str) -> CheckpointError:
     return CheckpointError(
-        f"The policy file {path} {what}.",
+        f"The policy file {path} {what[:_MAX_CHARS]}.",
         "It is incomplete or was altered: copy both files again, or write them again from the checkpoint.",
     )
 
@@ -218,7 +220,9 @@ def _check(policy: PortablePolicy, place: str) -> None:
     if policy.action_transform not in get_args(ActionTransform):
         problem = f"action transform {policy.action_transform!r} is none of {', '.join(get_args(ActionTransform))}"
     if problem:
-        raise CheckpointError(f"Wrong {place}: {problem}.", "Write the policy file again from its checkpoint.")
+        raise CheckpointError(
+            f"Wrong {place}: {problem[:_MAX_CHARS]}.", "Write the policy file again from its checkpoint."
+        )
 
 
 def _jsonable(value: Any) -> Any:

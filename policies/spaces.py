@@ -65,7 +65,7 @@ def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | g
             return gym.spaces.Box(low, high, shape, dtype.type)
     except MALFORMED as error:
         raise CheckpointError(
-            f"A space is described as {str(description)[:200]}, which makes none: {error}.",
+            f"A space is described as {str(description)[:200]}, which makes none: {str(error)[:200]}.",
             "Write the policy file again from its checkpoint.",
         ) from error
     raise CheckpointError(

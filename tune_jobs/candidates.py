@@ -17,7 +17,7 @@ from pathlib import Path
 
 from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
 from analysis.selection import Selection, select_best
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from policies.portable import PortablePolicy, read_policy
 from tune_jobs.manifests import verify_checkpoint
 from tune_jobs.store import SweepStore, TrialStore
@@ -84,8 +84,8 @@ def choose(store: SweepStore, trials: Sequence[TrialRecord]) -> tuple[Selection,
             remaining = [_without(record, selection.checkpoint) for record in remaining]
 
 
-def leave_out(error: NotFoundError) -> None:
-    """Warn that something is not chosen from."""
+def leave_out(error: TuneJobsError) -> None:
+    """Warn that something is as if it were not there."""
     _warn(error.message)
 
 

@@ -22,7 +22,7 @@ from policies.portable import PolicyNetwork, read_policy, save_policy
 from tune_jobs.candidates import choose, leave_out, read_trials
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec_file import stored_spec
-from tune_jobs.storage import storage_folder
+from tune_jobs.storage import expanded, storage_folder
 from tune_jobs.store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
 
 # The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
@@ -35,7 +35,7 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepSto
     Raises:
         NotFoundError: There is none.
     """
-    as_folder = SweepStore(Path(sweep).expanduser())
+    as_folder = SweepStore(expanded(sweep))
     if as_folder.exists():
         return as_folder
     root = storage_folder(storage)
@@ -146,7 +146,7 @@ def find_policy(
     if text in BASELINES:
         return _baseline(text, env_id, action)
     _refuse_action(text, action)
-    path = Path(text).expanduser()
+    path = expanded(text)
     store: SweepStore | None = None
     timeout_s = CALL_TIMEOUT_S
     if (path / MANIFEST).is_file():
@@ -258,7 +258,7 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
         NotFoundError: There is no such checkpoint.
         CheckpointError: It is damaged.
     """
-    folder = Path(source).expanduser()
+    folder = expanded(source)
     if not (folder / MANIFEST).is_file():
         store, trial_id = _sweep_and_trial(str(source), storage)
         if trial_id is not None:

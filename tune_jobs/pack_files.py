@@ -72,7 +72,7 @@ class PackFiles:
             return Assignment(trial_ids, failures)
         except (OSError, NotFoundError, *MALFORMED) as error:
             raise CheckpointError(
-                f"{self.assignment_path} does not tell whom pack {self.pack_id} is to train: {error!r}.",
+                f"{self.assignment_path} does not tell whom pack {self.pack_id} is to train: {repr(error)[:400]}.",
                 "Check that all nodes see the sweep folder, and resume the sweep.",
             ) from error
 

@@ -61,6 +61,8 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
     """Read the fields of a record; see `read_record`."""
     try:
         data = json.loads(path.read_bytes())
+        # Half a pair of surrogates is JSON, but no text that could be shown or written again.
+        json.dumps(data, ensure_ascii=False).encode()
     except FileNotFoundError as error:
         raise NotFoundError(f"No {what} at {path}.", "List the sweeps here with `tune-jobs list`.") from error
     except (OSError, ValueError, RecursionError) as error:

@@ -142,7 +142,7 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
         problems = _problems(error, record.spec)
     told = "; ".join(f"spec.{path}: {text}" for path, text in dict.fromkeys(problems))
     raise CheckpointError(
-        f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told}",
+        f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
         "Restore it from a backup, or use the version of tune-jobs that stands in it.",
     )
 

@@ -15,7 +15,15 @@ DEFAULT_STORAGE = "sweeps"
 def storage_folder(storage: str | Path | None) -> Path:
     """The given folder, else $TUNE_JOBS_STORAGE, else ./sweeps; absolute."""
     chosen = storage or os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
-    return Path(chosen).expanduser().absolute()
+    return expanded(chosen).absolute()
+
+
+def expanded(path: str | Path) -> Path:
+    """A path as its user means it, with ~ for a home folder; of a user that there is none of, it is a name like any."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
 
 
 def choose_store(name: str | None, stem: str, storage: Path) -> SweepStore:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from analysis.records import BestRecord, EvaluationRecord, SweepRecord
 from policies.arguments import NumEpisodes, PositiveInt, Seed, checked
 from policies.env_modules import allow_modules
+from policies.errors import TuneJobsError
 from policies.guard import guarding
 from tune_jobs.driving import (
     SweepResult,
@@ -32,7 +33,7 @@ from tune_jobs.plan import make_plan
 from tune_jobs.results import dataframe, report, trials
 from tune_jobs.search_checks import check_extendable
 from tune_jobs.spec_file import stored_spec
-from tune_jobs.storage import choose_store, create_store, stem_of, storage_folder
+from tune_jobs.storage import choose_store, create_store, expanded, stem_of, storage_folder
 from tune_jobs.store import SweepStore, list_sweep_stores
 
 if TYPE_CHECKING:
@@ -241,8 +242,16 @@ def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStat
 
 @checked
 def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
-    """How every sweep in a storage folder stands, by name."""
-    return [_status(store) for store in list_sweep_stores(storage_folder(storage))]
+    """How every sweep in a storage folder stands, by name; one that cannot be read is left out with a warning."""
+    from tune_jobs.candidates import leave_out
+
+    found = []
+    for store in list_sweep_stores(storage_folder(storage)):
+        try:
+            found.append(_status(store))
+        except TuneJobsError as error:
+            leave_out(error)
+    return found
 
 
 def _status(store: SweepStore) -> SweepStatus:
@@ -343,7 +352,7 @@ def _film_path(output: str | Path | None, name: str) -> Path:
     """The file of a film, which is called so where `output` names no file."""
     if output is None:
         return Path(name)
-    path = Path(output).expanduser()
+    path = expanded(output)
     if str(output).endswith("/") or path.is_dir():
         return path / name
     # Of another ending, such as that of `cartpole-v0.5`, nothing is cut.

@@ -72,8 +72,8 @@ def load_member(folder: Path, member_id: str) -> Member:
         tensors = load((folder / _TENSORS).read_bytes())
         if description["format_version"] > _FORMAT_VERSION:
             raise CheckpointError(
-                f"{folder / _JSON} has format version {description['format_version']}; this tune-jobs reads up to "
-                f"{_FORMAT_VERSION}.",
+                f"{folder / _JSON} has format version {str(description['format_version'])[:80]}; this tune-jobs reads "
+                f"up to {_FORMAT_VERSION}.",
                 "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
             )
         hyperparams = make_hyperparams(cast("Algorithm", description["algorithm"]), description["hyperparams"])
@@ -94,7 +94,7 @@ def load_member(folder: Path, member_id: str) -> Member:
             **cast("Any", {name: _number(description["counters"][name]) for name in _COUNTERS}),
         )
     except (OSError, SafetensorError, *MALFORMED) as error:
-        raise CheckpointError(f"{folder} does not hold a member's state: {error!r}.", _HINT) from error
+        raise CheckpointError(f"{folder} does not hold a member's state: {repr(error)[:400]}.", _HINT) from error
 
 
 def _number(value: Any) -> Any:
