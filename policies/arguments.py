@@ -11,12 +11,11 @@ import inspect
 import math
 import numbers
 import os
+import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
-
-import numpy as np
 
 from policies.errors import SpecError, shortened
 
@@ -95,7 +94,7 @@ def _fit_range(value: Any, kind: Any, limits: Range) -> Any:
 
 
 def _fit_items(value: Any, container: Any, kind: Any) -> Any:
-    if isinstance(value, np.ndarray):
+    if _is_numpys("ndarray", value):
         value = value.tolist()
     # A text is a sequence of its letters, which nobody means.
     if isinstance(value, str | bytes | bytearray | Mapping) or not isinstance(value, container):
@@ -126,11 +125,17 @@ def _can_be_path(text: str) -> bool:
 
 
 def _flag(value: Any) -> Any:
-    return bool(value) if isinstance(value, bool | np.bool_) else _WRONG
+    return bool(value) if isinstance(value, bool) or _is_numpys("bool_", value) else _WRONG
 
 
 def _scalar(value: Any) -> Any:
-    return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    return value[()] if _is_numpys("ndarray", value) and value.ndim == 0 else value
+
+
+def _is_numpys(kind: str, value: Any) -> bool:
+    """Whether it is of that class of NumPy, which is not loaded for this: the command line has to answer at once."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(value, getattr(numpy, kind))
 
 
 def _whole(value: Any) -> Any:

@@ -15,7 +15,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -29,8 +29,10 @@ from policies.env_wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError
 from policies.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.first_step import check_first_step
-from policies.hyperparams import Algorithm
 from policies.rendering import draw_without_display
+
+if TYPE_CHECKING:
+    from policies.hyperparams import Algorithm
 
 __all__ = [
     "ALLOWED_MODULES",

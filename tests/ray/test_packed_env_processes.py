@@ -1,0 +1,52 @@
+"""A slow environment with CPUs to spare: it is planned to run in processes of its own, and does."""
+
+import pytest
+
+from policies import env_modules
+from policies.env_modules import allow_modules
+from tune_jobs.driving import write_new
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec_file import load_spec
+from tune_jobs.store import SweepStore
+
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+NUM_ENVS = 4
+
+
+def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(tmp_path, monkeypatch):
+    from tune_jobs.runner import RunJob, run_trials
+
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["tune_jobs_test_own"])
+    pids = tmp_path / "pids"
+    spec = load_spec(
+        {
+            "env": {"id": "tune_jobs_test_own:SlowEdge", "args": {"pids": str(pids)}},
+            "algorithm": "ppo",
+            "hyperparams": {
+                "num_envs": NUM_ENVS, "train_batch_size": 64, "minibatch_size": 64, "num_epochs": 1,
+                "hidden_sizes": [4],
+            },
+            "stop": {"num_iterations": 2},
+            "evaluation": {"num_episodes": 1},
+        }
+    )  # fmt: skip
+    plan = make_plan(spec, Machine(2))
+    packs = plan.packs
+    assert (packs.num_packs, packs.env_kind, packs.num_env_processes, packs.cpus_per_pack) == (1, "processes", 1, 2)
+    store = SweepStore(tmp_path / "mine")
+    store.create()
+    write_new(store, spec, plan, None)
+    pids.unlink()
+    job = RunJob(
+        store.folder, ("t0000",), plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent, packs=packs
+    )  # fmt: skip
+    run_trials(job, lambda record: None)
+    (record,) = store.read_trials()
+    assert (record.status, record.error) == ("completed", None)
+    stepped = [tuple(map(int, line.split())) for line in pids.read_text().splitlines()]
+    in_processes = [pid for pid, parent in stepped if parent == record.pid]
+    assert len(in_processes) == NUM_ENVS
+    assert len(set(in_processes)) == 1
