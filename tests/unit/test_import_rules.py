@@ -21,7 +21,9 @@ def modules_after(code):
     ("code", "absent"),
     [
         # Help, validation and dry runs are instant.
-        ("import tune_jobs.cli", HEAVY),
+        ("import tune_jobs.cli", HEAVY | {"numpy", "pydantic"}),
+        # What the guard's child begins with, beside its parent, which imports the rest.
+        ("import policies.packed.envs", HEAVY | {"pydantic", "PIL"}),
         ("from tune_jobs.spec_file import load_spec; load_spec('cartpole-ppo')", HEAVY),
         ("import tune_jobs.sweeps", HEAVY),
         # A policy file acts, is evaluated and filmed without Ray and without torch.
