@@ -199,7 +199,7 @@ def _run_trials(
 ) -> None:
     from tune_jobs.live import shown
 
-    with shown(monitor, progress, store.driver_log), _stopping_on_signals(store, monitor):
+    with shown(monitor, progress, store.driver_log, plan.notes), _stopping_on_signals(store, monitor):
         from tune_jobs.runner import RunJob, run_trials
 
         job = RunJob(

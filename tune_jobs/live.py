@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -165,15 +165,19 @@ class _Screen:
 
 
 @contextlib.contextmanager
-def shown(monitor: SweepMonitor, progress: str, log: Path) -> Iterator[None]:
+def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] = ()) -> Iterator[None]:
     """Show a sweep on standard error while the block runs; what libraries print there goes to a file instead.
 
     Args:
         monitor: What to show.
         progress: `auto`: a table on a terminal, else lines; `none`: nothing.
         log: File for everything else that this process prints.
+        notes: The plan's, shown first.
     """
     with quiet(log) as stream:
+        if progress != "none":
+            for note in notes:
+                print(f"note: {note}", file=stream, flush=True)
         if progress == "none":
             yield
         elif stream.isatty():

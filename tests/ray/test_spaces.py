@@ -13,12 +13,14 @@ IMAGE = {"env_args": {"dtype": "float64", "shape": [12, 10, 1]}, "conv_filters":
 # Those of RLlib's engine that packs have too are trained by both.
 CASES = {
     "dqn, double": ("dqn", {"env_args": {"dtype": "float64"}, "normalize_observations": True}),
-    "dqn, half, prioritized": ("dqn", {"env_args": {"dtype": "float16"}, "replay": "prioritized"}),
+    "dqn, half, prioritized, n-step": (
+        "dqn", {"env_args": {"dtype": "float16"}, "replay": "prioritized", "n_step": 4, "gamma": 0.9}
+    ),
     "dqn, images of doubles": ("dqn", IMAGE),
     "ppo, half": ("ppo", {"env_args": {"dtype": "float16"}, "normalize_observations": True}),
     "ppo, long double": ("ppo", {"env_args": {"dtype": "longdouble"}}),
     "ppo, images of doubles": ("ppo", IMAGE),
-}
+}  # fmt: skip
 BOUNDS = [[0, None], [None, 0.5], [-2, 3], [None, None]]
 
 

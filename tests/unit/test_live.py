@@ -141,6 +141,14 @@ def test_nothing_else_is_on_the_terminal(tmp_path, progress, lines):
         assert text in logged
 
 
+@pytest.mark.parametrize(("progress", "first"), [("auto", "note: one\nnote: two\nmine: "), ("none", "")])
+def test_the_plans_notes_come_first(tmp_path, capfd, progress, first):
+    with live.shown(make_monitor(make_trial(0)), progress, tmp_path / "driver.log", ["one", "two"]):
+        pass
+    assert capfd.readouterr().err.startswith(first)
+    assert progress == "auto" or not capfd.readouterr().err
+
+
 def test_streams_come_back_after_an_error(tmp_path, capfd):
     def fail():
         with live.shown(make_monitor(make_trial(0)), "none", tmp_path / "driver.log"):
