@@ -141,7 +141,7 @@ def read_policy(path: Path) -> PortablePolicy:
     if version not in READABLE_VERSIONS:
         known = " and ".join(str(number) for number in READABLE_VERSIONS)
         raise CheckpointError(
-            f"The policy file {json_path} has format version {str(version)[:80]!r}; this tune-jobs reads {known}.",
+            f"The policy file {json_path} has format version {repr(version)[:80]}; this tune-jobs reads {known}.",
             "Update tune-jobs, or write the policy file again from its checkpoint.",
         )
     digest = hashlib.sha256(weights).hexdigest()
