@@ -120,7 +120,8 @@ class Owner:
             try:
                 if self._descriptor is None:
                     self.path.parent.mkdir(parents=True, exist_ok=True)
-                    self._descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+                    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+                    self._descriptor = os.open(self.path, flags, 0o666)
                 self._wait(self._descriptor)
             except OSError as error:
                 raise CannotRunError(

@@ -39,7 +39,11 @@ def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
     if unreadable:
         with trial.owned(), within(trial.folder, DAMAGED_RESULTS).open("ab") as file:
             file.write(b"".join(content + b"\n" for content in unreadable))
-    # Half a line at the end is what every kill may leave: it is done again.
+    if found.tail:
+        # What every kill may leave, and no damage: it is done again.
+        write_log(
+            trial.log_path, f"{trial.trial_id}: results.jsonl ended within a line; it is kept in {DAMAGED_RESULTS}"
+        )
     return found, [f"results.jsonl: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
 
 

@@ -114,6 +114,15 @@ def test_a_file_that_cannot_be_read_is_nobodys_and_can_be_taken(path, junk):
     assert not first.is_current()
 
 
+def test_a_link_is_not_followed(tmp_path, path):
+    path.parent.mkdir()
+    elsewhere = tmp_path / "elsewhere"
+    path.symlink_to(elsewhere)
+    with pytest.raises(CannotRunError, match="cannot be written"):
+        Owner.take(path)
+    assert not elsewhere.exists()
+
+
 def test_a_folder_that_is_gone_is_nobodys(path):
     owner = Owner.take(path)
     path.unlink()

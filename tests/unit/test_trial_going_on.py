@@ -99,6 +99,8 @@ def test_a_torn_last_line_is_dropped(tmp_path):
     assert [record.iteration for record in first.results] == [1, 2, 3, 4]
     second = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
     assert second.store.results_path.read_text() == whole
+    assert (second.store.folder / "results.damaged").read_text() == '{"iteration": 5, "num_env\n'
+    assert "results.jsonl ended within a line" in second.store.log_path.read_text()
     second.run_to(6)
     assert [record.iteration for record in second.results] == [1, 2, 3, 4, 5, 6]
 
