@@ -7,7 +7,9 @@ was killed in between, is ignored.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from analysis.records import ChangeRecord, CheckpointRecord
@@ -76,6 +78,18 @@ def pending_copy(trial: TrialStore, change: ChangeRecord | None, latest_iteratio
         return None
     folder = copied_folder(trial, change.iteration)
     return folder if folder.is_dir() else None
+
+
+def remove_uncounted_copies(trial: TrialStore, changes: Sequence[ChangeRecord]) -> None:
+    """Delete copies that do not count, of a driver that was killed before it wrote so; for the driver, at its start."""
+    folder = within(trial.folder, "copied")
+    counted = {copied_folder(trial, change.iteration).name for change in changes}
+    if folder.is_dir():
+        for path in folder.iterdir():
+            if path.name not in counted:
+                remove_folder(path)
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def remove_copies(trial: TrialStore) -> None:

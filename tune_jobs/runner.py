@@ -21,6 +21,7 @@ from ray.tune.schedulers import TrialScheduler
 from analysis.records import CheckpointRecord
 from policies.errors import TuneJobsError
 from policies.parents import this_process
+from tune_jobs.copies import remove_uncounted_copies
 from tune_jobs.logs import died_by
 from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.pack_driver import PackDriver, PackScheduler
@@ -73,6 +74,8 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     owner = Owner.take(owner_path) if job.run is None else Owner(owner_path, job.run)
     with owner.held():
         remove_folder(store.tune_folder)
+        for trial_id in job.trial_ids:
+            remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
     wanted = set(job.trial_ids)
     packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
     others = [name for name in job.trial_ids if name not in set(packed)]

@@ -134,10 +134,6 @@ class TrialLoop:
             folder, notes = take_up_copy(self._store, folder)
             self._notes += notes
         self._is_copy = folder is not None
-        if folder is None:
-            # Of a copy that does not count, because its driver was killed before it wrote so, nothing is left either.
-            with self._store.owned():
-                remove_copies(self._store)
         start = latest
         if folder is not None and change is not None:
             start = CheckpointRecord(
@@ -145,7 +141,7 @@ class TrialLoop:
             )
         elif latest is not None:
             folder = self._store.checkpoint_folder(latest.iteration)
-        self._take_up_results(start, change.iteration if change is not None else 0)
+        self._take_up_results(start)
         for note in self._notes:
             write_log(self._store.log_path, f"{self.task.trial_id}: {note}")
         with self._store.owned():
@@ -155,14 +151,15 @@ class TrialLoop:
         self._started = self._clock() - self._last.time_s
         self._started_at = time.time()
 
-    def _take_up_results(self, start: CheckpointRecord | None, changed_at: int) -> None:
+    def _take_up_results(self, start: CheckpointRecord | None) -> None:
         """Go on with the results up to what the trial starts from; what came after it is done again.
 
-        The training return goes on from `changed_at`: episodes before it were played by other weights.
+        The training return goes on from the trial's last change: episodes before it were played by other weights.
         """
         found, notes = take_up_results(self._store)
         self._notes += notes
         iteration = start.iteration if start is not None else 0
+        changed_at = max((change.iteration for change in self.task.changes if change.iteration <= iteration), default=0)
         kept = [record for record in found.records if record.iteration <= iteration]
         if self._store.results_path.exists():
             self._store.keep_iterations(kept)

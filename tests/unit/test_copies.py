@@ -11,7 +11,7 @@ from analysis.records import ChangeRecord, CheckpointRecord, TrialRecord
 from analysis.selection import rank_points
 from analysis.tables import trials_frame
 from policies.errors import CheckpointError
-from tune_jobs.copies import copied_folder, copy_latest_checkpoint
+from tune_jobs.copies import copied_folder, copy_latest_checkpoint, remove_uncounted_copies
 from tune_jobs.store import TrialStore
 from tune_jobs.trial import TrialLoop
 
@@ -184,3 +184,30 @@ def test_a_score_stands_beside_the_values_it_was_reached_with():
     assert row["changes"] == "at 1,000 env steps from t0001: lr 0.2; at 2,000 env steps from t0002: lr 0.3"
     plain = changed_trial().model_copy(update={"changes": ()})
     assert "changes" not in trials_frame([plain]).columns
+
+
+def test_copies_that_do_not_count_are_removed(tmp_path, better):
+    """A driver was killed while it copied, or before it wrote of what the trial goes on from."""
+    taken_over(tmp_path, better)
+    store = TrialStore(tmp_path, "t0000")
+    for name in (".000007", "000007"):
+        shutil.copytree(copied_folder(store, 5), store.folder / "copied" / name)
+    remove_uncounted_copies(store, (change(5),))
+    assert [path.name for path in (store.folder / "copied").iterdir()] == ["000005"]
+    remove_uncounted_copies(store, ())
+    assert not (store.folder / "copied").exists()
+    remove_uncounted_copies(store, ())
+
+
+def test_a_trial_that_goes_back_before_a_change_has_its_own_episodes(tmp_path, better):
+    """Its checkpoints since were damaged: what it goes on from are its own weights, from before."""
+    taken_over(tmp_path, better, episodes=lambda iteration: (500.0,))
+    task = {"changes": (change(5),), "checkpoints": {"every_iterations": 10, "keep": 9}}
+    after = Trial(tmp_path, engine=FakeEngine(lambda iteration: (7.0,)), **task)
+    after.run_to(6)
+    assert after.kept == [4, 5, 6]
+    for iteration in (5, 6):
+        (after.store.checkpoint_folder(iteration) / "engine.json").write_text("{}")
+    again = Trial(tmp_path, engine=FakeEngine(lambda iteration: (7.0,)), **task)
+    assert again.loop.iteration == 4
+    assert again.run_to(5).training_return == (4 * 500.0 + 7.0) / 5
