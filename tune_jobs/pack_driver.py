@@ -173,6 +173,13 @@ class PackDriver:
         self._fill(pack, self._slots)
         self._write(pack)
 
+    def lost(self, pack_id: str) -> None:
+        """A pack's process ended because another one is the pack: no failure of its members; it is started again."""
+        pack = self._packs[pack_id]
+        pack.is_up = False
+        for trial_id in pack.members:
+            self._keeper.lost(trial_id)
+
     def closed(self, pack_id: str) -> None:
         """Tune has ended a pack: it has nothing to do, or the sweep stops and it did not save in time."""
         pack = self._packs[pack_id]

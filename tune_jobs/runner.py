@@ -262,8 +262,7 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
 
     def _failed(self, trial: Trial, *, retried: bool) -> None:
         trial_id, error = _trial_id(trial), _error_of(trial)
-        if isinstance(getattr(error, "cause", None), OwnershipLostError):
-            # Another process has it: nothing went wrong with the trial.
+        if _was_lost(error):
             self._keeper.lost(trial_id)
             return
         message = describe_failure(error, self._store.trial(trial_id).log_tail(), timeout_s=self._timeout_s)
@@ -307,8 +306,11 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """The pack's process died; Tune starts another one."""
-        pack_id, tail = _pack_id(trial), self._driver.log_tail(_pack_id(trial))
-        self._driver.died(pack_id, describe_failure(_error_of(trial), tail, timeout_s=self._timeout_s, what="pack"))
+        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), _error_of(trial)
+        if _was_lost(error):
+            self._driver.lost(pack_id)
+            return
+        self._driver.died(pack_id, describe_failure(error, tail, timeout_s=self._timeout_s, what="pack"))
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """It died too often."""
@@ -326,6 +328,11 @@ def _error_of(trial: Trial) -> BaseException | None:
         return None
     error: BaseException = cloudpickle.loads(Path(path).read_bytes())
     return error
+
+
+def _was_lost(error: BaseException | None) -> bool:
+    """Whether a process ended because another one has what it worked on: no failure of a trial."""
+    return isinstance(getattr(error, "cause", None), OwnershipLostError)
 
 
 def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float, what: str = "trial") -> str:

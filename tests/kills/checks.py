@@ -32,9 +32,10 @@ _ALLOWED_PATTERN = re.compile("|".join(f"(?:{pattern})" for pattern in _ALLOWED)
 
 def problems(folder: Path, num_env_steps: int, *, finishes: bool) -> list[str]:
     """What is wrong with a sweep; empty if all is well."""
+    store = SweepStore(folder)
+    found: list[str] = []
     try:
-        store = SweepStore(folder)
-        found = _of_records(store)
+        found += _of_records(store)
         for trial in store.read_trials():
             found += _of_results(store.trial(trial.trial_id).results_path, num_env_steps)
             for iteration in store.trial(trial.trial_id).checkpoint_iterations():
@@ -44,8 +45,8 @@ def problems(folder: Path, num_env_steps: int, *, finishes: bool) -> list[str]:
             names = ("best/before_after.mp4", "best/after.gif", "report/index.html")
             found += [f"{name} is missing" for name in names if not (folder / name).is_file()]
         return found + _foreign(folder)
-    except TuneJobsError as error:
-        return [error.message]
+    except (TuneJobsError, OSError) as error:
+        return [*found, str(error)]
 
 
 def _of_records(store: SweepStore) -> list[str]:

@@ -28,7 +28,7 @@ def tune_trial(folder, trial_id, cause):
 def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path, event):
     store = make_sweep(tmp_path / "mine", 2)
     keeper = RecordKeeper(store, ["t0000", "t0001"], lambda record: None)
-    events = _TrialEvents(store, keeper)
+    events = _TrialEvents(store, keeper, timeout_s=600.0)
     for trial_id, cause in (("t0000", OwnershipLostError("taken")), ("t0001", ValueError("broke"))):
         keeper.started(trial_id)
         getattr(events, event)(0, [], tune_trial(tmp_path, trial_id, cause))

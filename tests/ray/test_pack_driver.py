@@ -232,3 +232,14 @@ def test_a_member_that_another_process_took_waits_again_and_has_not_failed(tmp_p
     driven.tell(t0001=(200, "completed"))
     assert driven.assigned() == [2, 0]
     assert driven.status(0) == ("running", 0)
+
+
+def test_a_pack_that_another_process_is_has_not_died(tmp_path):
+    driven = Driven(tmp_path, 2, num_packs=1)
+    driven.driver.lost("p00")
+    assert driven.assigned() == [0, 1]
+    assert [driven.status(number) for number in (0, 1)] == [("paused", 0)] * 2
+    driven.driver.started("p00")
+    # Nor does it count later, for who goes on alone.
+    driven.driver.died("p00", "killed")
+    assert driven.assigned() == [0, 1]
