@@ -30,6 +30,7 @@ from policies.errors import EnvError
 from policies.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.first_step import check_first_step
 from policies.rendering import draw_without_display
+from policies.space_hints import action_hint, observation_hint
 
 if TYPE_CHECKING:
     from policies.hyperparams import Algorithm
@@ -312,20 +313,20 @@ def _check_observation_space(info: EnvInfo) -> None:
         raise EnvError(
             f"{info.env_id} has observations of kind {type(space).__name__} ({space}); only Box observations are "
             "supported: vectors of numbers, and images.",
-            "Choose an env whose observations are a vector of numbers, such as 'CartPole-v1'.",
+            observation_hint(info.env_id, space),
         )
     if len(space.shape) not in (1, 3) or 0 in space.shape:
         raise EnvError(
             f"{info.env_id} has observations of shape {space.shape}; only vectors, of shape (n,), and images, of shape "
             "(rows, columns, channels), are supported.",
-            "Choose an env with such observations, or wrap it in one of your own that reshapes them.",
+            observation_hint(info.env_id, space),
         )
     if not np.issubdtype(space.dtype, np.floating) and not (info.observes_images and space.dtype == np.uint8):
         kinds = "bytes (uint8) and floating-point numbers" if info.observes_images else "floating-point observations"
         raise EnvError(
             f"{info.env_id} has {'images' if info.observes_images else 'observations'} of dtype {space.dtype}; only "
             f"{kinds} are supported.",
-            "Register a variant of the env that returns float32 observations, scaled to about [-1, 1].",
+            f"{observation_hint(info.env_id, space)} Scale them to about [-1, 1] there, or set normalize_observations.",
         )
 
 
@@ -337,7 +338,7 @@ def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
         raise EnvError(
             f"{info.env_id} has actions of kind {type(space).__name__} ({space}); only Discrete and 1-D Box "
             "actions are supported.",
-            "Choose an env with Discrete or 1-D Box actions.",
+            action_hint(info.env_id, space),
         )
     if algorithm == "dqn":
         raise EnvError(
@@ -348,5 +349,5 @@ def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
         raise EnvError(
             f"{info.env_id} has actions of shape {space.shape} and dtype {space.dtype}; only floating-point "
             "Box actions of shape (n,) are supported.",
-            "Choose an env with Discrete or 1-D floating-point Box actions.",
+            action_hint(info.env_id, space),
         )

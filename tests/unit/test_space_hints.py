@@ -1,0 +1,153 @@
+"""Environments whose spaces no algorithm takes: what the refusal says to wrap them in is what makes them trainable."""
+
+import importlib
+import re
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from policies import env_modules
+from policies.env_modules import allow_modules
+from policies.envs import check_env
+from policies.errors import EnvError
+
+NUMBERS = spaces.Box(-1, 1, (3,), np.float32)
+OBSERVATIONS = {
+    "discrete": spaces.Discrete(16),
+    "discrete from 3": spaces.Discrete(5, start=3),
+    "multi-discrete": spaces.MultiDiscrete([3, 4]),
+    "multi-binary": spaces.MultiBinary(4),
+    "whole numbers": spaces.Box(0, 9, (4,), np.int64),
+    "bytes": spaces.Box(0, 255, (6,), np.uint8),
+    "matrix": spaces.Box(-1, 1, (3, 2), np.float32),
+    "matrix of whole numbers": spaces.Box(0, 9, (3, 2), np.int32),
+    "grey image": spaces.Box(0, 255, (12, 9), np.uint8),
+    "image of whole numbers": spaces.Box(0, 255, (12, 9, 3), np.int64),
+    "four dimensions": spaces.Box(-1, 1, (2, 2, 2, 2), np.float32),
+    "number": spaces.Box(-1, 1, (), np.float32),
+    "dict": spaces.Dict({"here": spaces.Discrete(3), "speed": NUMBERS}),
+    "tuple": spaces.Tuple((NUMBERS, spaces.Dict({"flags": spaces.MultiBinary(2)}))),
+    "text": spaces.Text(4),
+}
+ACTIONS = {
+    "multi-discrete": spaces.MultiDiscrete([3, 2, 4]),
+    "multi-discrete matrix": spaces.MultiDiscrete([[3, 2], [2, 2]]),
+    "multi-binary": spaces.MultiBinary(3),
+    "multi-binary matrix": spaces.MultiBinary([2, 2]),
+    "matrix": spaces.Box(-1, 1, (2, 2), np.float32),
+    "number": spaces.Box(-1, 1, (), np.float32),
+}
+BEYOND = {
+    "graph": (spaces.Graph(NUMBERS, None), NUMBERS, "gymnasium.ObservationWrapper"),
+    "sequence": (spaces.Sequence(NUMBERS), NUMBERS, "gymnasium.ObservationWrapper"),
+    "empty": (spaces.Box(-1, 1, (0,), np.float32), NUMBERS, "gymnasium.ObservationWrapper"),
+    "dict of actions": (NUMBERS, spaces.Dict({"a": NUMBERS}), "gymnasium.ActionWrapper"),
+    "many combinations": (NUMBERS, spaces.MultiDiscrete([1000] * 3), "gymnasium.ActionWrapper"),
+}
+
+
+class Odd(gym.Env):
+    """Of any spaces; refuses an action that is not in its own."""
+
+    def __init__(self, observations, actions):
+        self.observation_space, self.action_space = observations, actions
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+@pytest.fixture
+def refusal(monkeypatch):
+    """What check_env says of an env of these spaces."""
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    monkeypatch.setitem(gym.registry, "Odd-v0", None)
+
+    def refuse(observations, actions, algorithm="ppo"):
+        del gym.registry["Odd-v0"]
+        gym.register("Odd-v0", lambda: Odd(observations, actions))
+        with pytest.raises(EnvError) as caught:
+            check_env("Odd-v0", None, algorithm)
+        return caught.value
+
+    return refuse
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    """Writes a module of the user's own, as README shows one, with an expression in it."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(expression):
+        (tmp_path / "wrapped_envs.py").write_text(
+            "import gymnasium\nimport numpy\n\n\n"
+            f"def make(render_mode=None):\n    return {expression}\n\n\n"
+            'gymnasium.register("Wrapped-v0", make)\n'
+        )
+        allow_modules(["wrapped_envs"])
+
+    yield write
+    sys.modules.pop("wrapped_envs", None)
+    gym.registry.pop("Wrapped-v0", None)
+    importlib.invalidate_caches()
+
+
+def expression_in(error):
+    (found,) = re.findall("`(.+?)`", error.hint)
+    return found
+
+
+@pytest.mark.parametrize("kind", OBSERVATIONS)
+def test_the_wrapper_that_is_named_makes_observations_that_are_taken(kind, refusal, own_module):
+    error = refusal(OBSERVATIONS[kind], spaces.Discrete(2))
+    assert "Odd-v0 has" in error.message
+    own_module(expression_in(error))
+    for algorithm in ("ppo", "dqn"):
+        info = check_env("wrapped_envs:Wrapped-v0", None, algorithm)
+    env = gym.make("Wrapped-v0")
+    for _ in range(5):
+        observation, _ = env.reset()
+        assert info.observation_space.contains(observation)
+        assert np.isfinite(observation).all()
+
+
+@pytest.mark.parametrize("kind", ACTIONS)
+def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(kind, refusal, own_module):
+    own_module(expression_in(refusal(NUMBERS, ACTIONS[kind])))
+    info = check_env("wrapped_envs:Wrapped-v0", None, "ppo")
+    env, space = gym.make("Wrapped-v0"), info.action_space
+    env.reset()
+    actions = range(int(space.n)) if isinstance(space, spaces.Discrete) else [space.sample() for _ in range(5)]
+    sent = []
+    step = env.unwrapped.step
+    env.unwrapped.step = lambda action: sent.append(tuple(np.ravel(action))) or step(action)
+    for action in actions:
+        env.step(action)
+    assert len(set(sent)) == len(actions)
+
+
+@pytest.mark.parametrize("kind", BEYOND)
+def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind, refusal):
+    observations, actions, words = BEYOND[kind]
+    assert words in refusal(observations, actions).hint
+
+
+def test_a_class_of_a_module_is_made_as_such(monkeypatch):
+    from policies.space_hints import observation_hint
+
+    assert "wrappers.FlattenObservation(my_envs.Walk())" in observation_hint("my_envs:Walk", spaces.Discrete(2))
+
+
+def test_frozen_lake_can_be_trained_on_in_the_wrapper_that_is_named(own_module, monkeypatch):
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    with pytest.raises(EnvError) as caught:
+        check_env("FrozenLake-v1", None, "ppo")
+    own_module(expression_in(caught.value))
+    assert check_env("wrapped_envs:Wrapped-v0", None, "dqn").observation_space.shape == (16,)
