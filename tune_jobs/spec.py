@@ -11,7 +11,15 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
 
 from analysis.wording import counted
 from policies.errors import SpecError
@@ -20,7 +28,7 @@ from tune_jobs.packs import why_none_is_packed
 from tune_jobs.search_checks import search_problems
 from tune_jobs.search_space import Domain, Number, WholeNumber
 from tune_jobs.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
-from tune_jobs.spec_problems import Problem, ProblemsError, details_of, did_you_mean, dotted, explain
+from tune_jobs.spec_problems import Problem, WrongSpecError, details_of, did_you_mean, dotted, explain
 
 SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
@@ -205,12 +213,20 @@ class SweepSpec(_Section):
             return data
         return {key: value for key, value in data.items() if value is not None}
 
-    @model_validator(mode="after")
-    def _is_consistent(self) -> Self:
-        problems = hyperparam_problems(self.algorithm, self.hyperparams, self.space) + _section_problems(self)
+    @model_validator(mode="wrap")
+    @classmethod
+    def _is_right(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Look at the whole too, and tell what is wrong in the sweep file's words; SpecErrors pass through pydantic."""
+        try:
+            spec = handler(data)
+        except ValidationError as error:
+            from tune_jobs.spec_words import problems_of  # knows this class
+
+            raise WrongSpecError.of("SweepSpec", problems_of(error, data)) from error
+        problems = hyperparam_problems(spec.algorithm, spec.hyperparams, spec.space) + _section_problems(spec)
         if problems:
-            raise ProblemsError(problems)
-        return self
+            raise WrongSpecError.of("SweepSpec", problems)
+        return spec
 
     @property
     def grace_env_steps(self) -> int:

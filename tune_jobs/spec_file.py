@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from analysis.records import SweepRecord
 from policies.arguments import checked
@@ -16,12 +16,9 @@ from policies.errors import CheckpointError, SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tune_jobs.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.search_space import Domain
-from tune_jobs.spec import NAME_RULE, SweepSpec, hyperparam_problems
-from tune_jobs.spec_problems import Detail, Problem, ProblemsError, details_of, did_you_mean, dotted, explain
+from tune_jobs.spec import SweepSpec
+from tune_jobs.spec_problems import SPEC_HINT, Problem, WrongSpecError, did_you_mean
 from tune_jobs.sweep_yaml import parse_yaml
-
-_HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
-
 
 # What the characters that are read may take up at most, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
@@ -119,15 +116,10 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
         set_paths = []
     try:
         return SweepSpec.model_validate(data)
-    except ValidationError as error:
-        problems = _problems(error, data)
-    lines = [
-        f"{path}: {text}{' (from --set)' if _is_set(path, set_paths) else ''}" if path else text
-        for path, text in dict.fromkeys(problems)
-    ]
-    if len(lines) == 1:
-        raise SpecError(f"{label}: {lines[0]}", _HINT)
-    raise SpecError(f"{label}: {len(lines)} problems:\n" + "\n".join(f"  {line}" for line in lines), _HINT)
+    except WrongSpecError as error:
+        found = error.problems
+    told = [Problem(path, f"{text}{' (from --set)' if _is_set(path, set_paths) else ''}") for path, text in found]
+    raise WrongSpecError.of(label, told)
 
 
 def stored_spec(record: SweepRecord) -> SweepSpec:
@@ -138,13 +130,12 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
     """
     try:
         return SweepSpec.model_validate(record.spec)
-    except ValidationError as error:
-        problems = _problems(error, record.spec)
-    told = "; ".join(f"spec.{path}: {text}" for path, text in dict.fromkeys(problems))
-    raise CheckpointError(
-        f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
-        "Restore it from a backup, or use the version of tune-jobs that stands in it.",
-    )
+    except WrongSpecError as error:
+        told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
+        raise CheckpointError(
+            f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
+            "Restore it from a backup, or use the version of tune-jobs that stands in it.",
+        ) from error
 
 
 def json_schema() -> dict[str, Any]:
@@ -193,7 +184,7 @@ def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         data = parse_yaml(text, label)
     if not isinstance(data, Mapping):
         kind = "is empty" if data is None else f"holds a {type(data).__name__}"
-        raise SpecError(f"{label}: {kind}, not the fields of a sweep", _HINT)
+        raise SpecError(f"{label}: {kind}, not the fields of a sweep", SPEC_HINT)
     plain: dict[str, Any] = to_plain(data, label)
     return label, plain
 
@@ -254,99 +245,3 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
 def _is_set(path: str, set_paths: Sequence[str]) -> bool:
     """Whether a problem's path lies at or below a path that --set gave."""
     return any(re.match(rf"{re.escape(given)}(?:$|[.\[])", path) for given in set_paths)
-
-
-def _problems(error: ValidationError, data: Mapping[str, Any]) -> list[Problem]:
-    details = details_of(error)
-    problems = [problem for detail in details for problem in _from_detail(detail)]
-    if not any(isinstance(detail.get("ctx", {}).get("error"), ProblemsError) for detail in details):
-        # A wrong field kept pydantic from running the checks that look at the whole: run them on what is
-        # right.
-        problems += _hyperparam_problems(data)
-    return problems
-
-
-def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
-    algorithm, fixed, space = data.get("algorithm"), data.get("hyperparams"), data.get("space")
-    if algorithm not in list(HYPERPARAMS_BY_ALGORITHM):  # a list, as what stands there may be unhashable
-        return []
-    adapter: TypeAdapter[Any] = TypeAdapter(Domain)
-    domains = {}
-    for name, value in space.items() if isinstance(space, Mapping) else ():
-        try:
-            domains[name] = adapter.validate_python(value)
-        except ValidationError:
-            continue  # already among the problems; only its name is left to check
-    known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
-    unknown = {name: None for name in space if name not in known} if isinstance(space, Mapping) else {}
-    problems = hyperparam_problems(algorithm, fixed if isinstance(fixed, Mapping) else {}, domains)
-    unseen = hyperparam_problems(algorithm, {name: None for name in unknown if name not in domains}, {})
-    return problems + [Problem(path.replace("hyperparams.", "space.", 1), text) for path, text in unseen]
-
-
-_FORMS = {
-    "name": f"use {NAME_RULE}",
-    "rl_module": "write module:Class",
-    "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
-    "search": "give random or tpe, or a mapping of its fields",
-    "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
-}
-"""How fields are written that may have several forms, or one that no type describes."""
-
-
-def _from_detail(detail: Detail) -> list[Problem]:
-    location = _without_tags(detail["loc"])
-    path = dotted(location)
-    inner = detail.get("ctx", {}).get("error")
-    if isinstance(inner, ProblemsError):
-        return inner.problems
-    if detail["type"] == "extra_forbidden":
-        return [Problem(path, _unknown_key(location))]
-    if detail["type"] == "missing":
-        options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
-        return [Problem(path, f"is missing{f': give {options}' if options else ''}")]
-    if path in _FORMS:
-        return [Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")]
-    if detail["type"] == "model_type":
-        fields = ", ".join(_section(location).model_fields)
-        return [Problem(path, f"{shortened(detail['input'])} is not allowed: give a mapping of its fields ({fields})")]
-    return [Problem(path, explain(detail))]
-
-
-def _without_tags(location: Iterable[int | str]) -> list[int | str]:
-    """Pydantic names the kind of a domain twice, as the union's member and as its field."""
-    parts: list[int | str] = []
-    for part in location:
-        if not (parts and part == parts[-1] and parts[0] == "space" and len(parts) == 3):
-            parts.append(part)
-    return parts
-
-
-def _unknown_key(location: Sequence[int | str]) -> str:
-    name, model = str(location[-1]), _section(location[:-1])
-    # A field that exists elsewhere under just this name is meant more likely than a similar one here.
-    suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
-    listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
-    return f"there is no field {name!r} here.{suggestion}{listed}"
-
-
-def _section(location: Sequence[int | str]) -> type[BaseModel]:
-    model: Any = SweepSpec
-    for part in location:
-        model = model.model_fields[str(part)].annotation
-    found: type[BaseModel] = model
-    return found
-
-
-def _other_place(name: str) -> str:
-    """A hint for a field that exists, but in another section."""
-    places = [
-        f"{section}.{name}"
-        for section, field in SweepSpec.model_fields.items()
-        if isinstance(field.annotation, type)
-        and issubclass(field.annotation, BaseModel)
-        and name in field.annotation.model_fields
-    ]
-    if any(name in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values()):
-        places += [f"hyperparams.{name}", f"space.{name}"]
-    return f" Did you mean {' or '.join(places)}?" if places else ""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from pydantic import ValidationError
 
-from policies.errors import shortened
+from policies.errors import SpecError, shortened
+
+SPEC_HINT = "Correct it and launch again; `tune-jobs schema` prints every field, `tune-jobs presets` lists examples."
 
 Detail = Mapping[str, Any]
 """One thing that pydantic found: type, loc, input, ctx."""
@@ -23,16 +25,25 @@ class Problem(NamedTuple):
     """What is wrong there."""
 
 
-class ProblemsError(ValueError):
-    """Several problems at once, found by a validator that sees the whole sweep.
+class WrongSpecError(SpecError):
+    """A sweep is wrong; `problems` are all that is, the message tells them."""
 
-    Args:
-        problems: What is wrong, and where.
-    """
+    problems: tuple[Problem, ...] = ()
 
-    def __init__(self, problems: Iterable[Problem]) -> None:
-        self.problems = list(problems)
-        super().__init__("; ".join(f"{path}: {text}" for path, text in self.problems))
+    @classmethod
+    def of(cls, label: str, problems: Iterable[Problem]) -> Self:
+        """The error for a sweep.
+
+        Args:
+            label: What the message calls the sweep.
+            problems: What is wrong, and where; what stands there twice is told once.
+        """
+        found = tuple(dict.fromkeys(problems))
+        lines = [f"{path}: {text}" if path else text for path, text in found]
+        told = lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems:", *lines])
+        error = cls(f"{label}: {told}", SPEC_HINT)
+        error.problems = found
+        return error
 
 
 # By the type of pydantic's error; in braces what its context holds.

@@ -1,5 +1,6 @@
 """Whatever is wrong in whichever field: it is said in the words of a sweep file, not in those of the library below."""
 
+import pickle
 import re
 
 import pytest
@@ -163,3 +164,22 @@ def test_one_hidden_size_is_one_hidden_layer():
 def test_one_number_is_a_continuous_action():
     fields = {"env": "Pendulum-v1", "algorithm": "constant", "hyperparams": {"action": 0.5}}
     assert make_plan(load_spec(fields), Machine(1)).trials[0].hyperparams["action"] == [0.5]
+
+
+# -- a spec that is made in Python
+
+
+@pytest.mark.parametrize("make", [lambda fields: SweepSpec(**fields), SweepSpec.model_validate])
+def test_a_spec_that_is_made_in_python_is_told_in_the_same_words(make):
+    wrong = {**MINIMAL, "algorithm": "pp0", "stop": 3, "enviroment": 1, "space": {"lr": {"uniform": [1]}}}
+    with pytest.raises(SpecError) as caught:
+        make(wrong)
+    message = caught.value.message
+    assert message.startswith("SweepSpec: 4 problems:\n  ")
+    assert "algorithm: 'pp0' is not allowed: it should be 'ppo', 'dqn'" in message
+    assert "enviroment: there is no field 'enviroment' here. Did you mean 'env'?" in message
+    assert not FOREIGN.search(shown_without_values(message.removeprefix("SweepSpec")))
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (again.message, again.hint, again.problems) == (message, caught.value.hint, caught.value.problems)
+    with pytest.raises(SpecError):
+        SweepSpec.model_validate(3)
