@@ -134,7 +134,11 @@ def trials(*, sweep: str, storage: str | None, as_json: bool) -> None:
 @run_options
 @click.pass_context
 def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: bool, **options: Any) -> None:
-    """Go on with a sweep that was interrupted: what is done stays, trials go on from their checkpoints."""
+    """Go on with a sweep that was interrupted: what is done stays, trials go on from their checkpoints.
+
+    Such a trial begins new episodes there, and DQN fills its replay memory anew: its numbers differ from those of a
+    trial that nothing has interrupted.
+    """
     from tune_jobs import cli_output, sweeps
 
     with stdout_for(as_json=as_json):

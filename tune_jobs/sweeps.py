@@ -128,6 +128,9 @@ def resume(
 ) -> SweepResult:
     """Run what is missing of a sweep: trials that had begun go on from their latest checkpoints.
 
+    Such a trial begins new episodes there, and DQN fills its replay memory anew: its numbers differ from those of a
+    trial that nothing has interrupted.
+
     Args:
         sweep: Name or folder.
         storage: Folder for sweeps.
