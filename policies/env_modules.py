@@ -14,7 +14,7 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -51,6 +51,17 @@ def allow_modules(names: Iterable[str]) -> None:
                 "Give the name that an import statement would: my_envs for the file my_envs.py.",
             )
     _allowed.update(wanted)
+
+
+@contextlib.contextmanager
+def allowed_again() -> Iterator[None]:
+    """Afterwards allow what is allowed now, and nothing that the block has: a sweep's modules are its own."""
+    before = set(_allowed)
+    try:
+        yield
+    finally:
+        _allowed.clear()
+        _allowed.update(before)
 
 
 def allowed_modules() -> tuple[str, ...]:

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
+import platform
+import re
 import secrets
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from policies.errors import CannotRunError
+
+# Of a temporary name: where its process ran (not told until 0.9), its id, and chance.
+_WRITER = re.compile(r"\.((?P<place>[0-9a-f]{8})-)?(?P<pid>[0-9]+)-[0-9a-f]{8}(\.\w+)?")
+# What cannot be seen from here, as it is another machine's, is nobody's after so long.
+_ABANDONED_AFTER_S = 24 * 3600.0
 
 
 def write_atomic(path: Path, data: bytes | str) -> None:
@@ -57,7 +66,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     # Hidden, so that a listing of "*.json" or "*.mp4" never picks up an unfinished file. Made by the writer
     # itself and not by tempfile.mkstemp, whose mode 0600 would keep other users of a shared folder from
     # reading the result.
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    writer = f"{_this_place()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = path.with_name(f".{path.stem}.{writer}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -69,6 +79,43 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def is_abandoned(path: Path) -> bool:
+    """Whether this is a temporary file of `atomic_path` whose writer is gone: killed, before it could remove it."""
+    found = _WRITER.search(path.name) if path.name.startswith(".") else None
+    if found is None or found.end() != len(path.name) or path.is_symlink() or not path.is_file():
+        return False
+    if found["place"] == _this_place():
+        return not _is_alive(int(found["pid"]))
+    try:
+        return time.time() - path.stat().st_mtime > _ABANDONED_AFTER_S
+    except OSError:
+        return False
+
+
+@functools.cache
+def _this_place() -> str:
+    """Eight digits for where process ids mean something: this run of this machine, in this container."""
+    known = []
+    with contextlib.suppress(OSError):
+        known.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
+        known.append(str(Path("/proc/self/ns/pid").readlink()))
+    return hashlib.sha256(" ".join([platform.node(), *known]).encode()).hexdigest()[:8]
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    # Its parent has not asked how it ended; it writes no more.
+    with contextlib.suppress(OSError, IndexError):
+        known = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        return known.rpartition(")")[2].split()[0] != "Z"
+    return True
 
 
 def _cannot_write(path: Path, error: OSError) -> CannotRunError:

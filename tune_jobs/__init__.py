@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from policies.env_modules import allow_modules as allow_modules
     from policies.errors import TuneJobsError as TuneJobsError
     from policies.policy import load_policy as load_policy
+    from tune_jobs.interruption import SweepInterrupted as SweepInterrupted
     from tune_jobs.spec import SweepSpec as SweepSpec
     from tune_jobs.spec_file import list_presets as list_presets
     from tune_jobs.spec_file import load_spec as load_spec
@@ -42,6 +43,7 @@ _HOME = {
     "TuneJobsError": "policies.errors",
     "allow_modules": "policies.env_modules",
     "load_policy": "policies.policy",
+    "SweepInterrupted": "tune_jobs.interruption",
     "SweepSpec": "tune_jobs.spec",
     "list_presets": "tune_jobs.spec_file",
     "load_spec": "tune_jobs.spec_file",

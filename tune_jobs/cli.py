@@ -19,8 +19,10 @@ from tune_jobs.cli_base import (
     allow_module_option,
     env_option,
     json_option,
+    losing_what_nobody_reads,
     num_episodes_option,
     print_version,
+    result_of,
     run_options,
     set_option,
     stdout_for,
@@ -85,8 +87,9 @@ def launch(
     from tune_jobs import cli_output, sweeps
 
     with stdout_for(as_json=as_json):
-        result = sweeps.launch(spec, overrides=overrides, name=name, storage=storage, **options)
-    cli_output.show_result(result, storage=storage, as_json=as_json)
+        result = result_of(sweeps.launch, spec, overrides=overrides, name=name, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
 
 
@@ -142,8 +145,9 @@ def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: b
     from tune_jobs import cli_output, sweeps
 
     with stdout_for(as_json=as_json):
-        result = sweeps.resume(sweep, storage=storage, **options)
-    cli_output.show_result(result, storage=storage, as_json=as_json)
+        result = result_of(sweeps.resume, sweep, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
 
 
@@ -159,8 +163,9 @@ def extend(
     from tune_jobs import cli_output, sweeps
 
     with stdout_for(as_json=as_json):
-        result = sweeps.extend(sweep, num_samples, storage=storage, **options)
-    cli_output.show_result(result, storage=storage, as_json=as_json)
+        result = result_of(sweeps.extend, sweep, num_samples, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
     ctx.exit(result.exit_code)
 
 
@@ -302,6 +307,9 @@ def schema(*, as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON either 
 
 def main() -> None:
     """Entry point of the `tune-jobs` script."""
+    from tune_jobs.interruption import end_in_order
+
+    end_in_order()
     cli(prog_name="tune-jobs")
 
 

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from policies.errors import TuneJobsError
 
+if TYPE_CHECKING:
+    from tune_jobs.driving import SweepResult
+
 _INTERRUPTED = 130
+_UNCHANGED = {
+    "launch": "No trial had begun, and nothing was kept.",
+    "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` goes on with it.",
+    "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
+}
 _JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -31,10 +40,10 @@ class CommandGroup(click.Group):
             if ctx.meta.get(_JSON):
                 _print_json_error(error.format_message(), "", error.exit_code)
             raise
-        except KeyboardInterrupt:
-            runs_trials = ctx.invoked_subcommand in ("launch", "resume", "extend")
-            hint = "What is done is kept; `tune-jobs resume SWEEP` goes on with it." if runs_trials else ""
-            _print_error(ctx, "Interrupted.", hint, _INTERRUPTED)
+        except KeyboardInterrupt as interruption:
+            hint = _hint_after(interruption, ctx.invoked_subcommand or "")
+            with losing_what_nobody_reads(True):  # noqa: FBT003
+                _print_error(ctx, "Interrupted.", hint, _INTERRUPTED)
             ctx.exit(_INTERRUPTED)
         except TuneJobsError as error:
             if ctx.meta.get(DEBUG):
@@ -50,6 +59,14 @@ class CommandGroup(click.Group):
                 hint = f"This is a bug in tune-jobs. The traceback is in {_save_traceback()}; --debug prints it."
             _print_error(ctx, message, hint, TuneJobsError.exit_code)
             ctx.exit(TuneJobsError.exit_code)
+
+
+def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
+    from tune_jobs.interruption import SweepInterrupted
+
+    if isinstance(interruption, SweepInterrupted):
+        return _UNCHANGED[command]
+    return "What is done is kept; `tune-jobs resume SWEEP` goes on with it." if command in _UNCHANGED else ""
 
 
 def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) -> None:
@@ -159,3 +176,36 @@ def stdout_for(*, as_json: bool) -> Iterator[None]:
     """With --json nothing but the document may reach standard output, whatever a library prints."""
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         yield
+
+
+def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> SweepResult:
+    """What a launch, resume or extend came to, also where a signal ended it.
+
+    Raises:
+        KeyboardInterrupt: It ended before the sweep had begun.
+    """
+    from tune_jobs.interruption import SweepInterrupted
+
+    try:
+        return call(*args, **kwargs)
+    except SweepInterrupted as interruption:
+        if interruption.result is None:
+            raise
+        return interruption.result
+
+
+@contextlib.contextmanager
+def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT001
+    """Of an interrupted command: its terminal may be what went away, which is no error then."""
+    try:
+        yield
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except OSError:
+        if not interrupted:
+            raise
+        # Python flushes both once more when it ends.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for number in (1, 2):
+            os.dup2(nowhere, number)
+        os.close(nowhere)

@@ -116,7 +116,9 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
         for note in result.notes:
             console.print(f"note: {note}", style="yellow")
     if result.interrupted:
-        click.echo(f"Interrupted; what is done is kept. Go on with: {how_to_resume}", err=True)
+        done = result.sweep.state == "completed"
+        kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Go on with"
+        click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
 
 
 def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None:

@@ -7,8 +7,10 @@ storage.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import secrets
+import signal
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -25,10 +27,13 @@ from policies.env_modules import module_folders
 from policies.errors import CannotRunError, TuneJobsError
 from policies.files import write_atomic
 from tune_jobs.address import recorded_cluster
+from tune_jobs.connected_ray import alive_nodes, check_connected_to, cluster_machine, connected_machine, is_client
+from tune_jobs.interruption import current
 from tune_jobs.live import quiet
 from tune_jobs.machine import Machine
 from tune_jobs.places import within
 from tune_jobs.ray_environment import prepare_environment
+from tune_jobs.ray_processes import ending_if_it_fails
 from tune_jobs.ray_reaper import reaping
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
@@ -60,22 +65,58 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
         machine: What to start Ray with on this machine.
 
     Raises:
-        CannotRunError: Nothing answers at the address, its Ray differs, or Ray does not start.
+        CannotRunError: Nothing answers at the address, its Ray differs, Ray does not start, or the caller is connected
+            to another one.
     """
     prepare_environment()
     if ray.is_initialized():
-        yield Connection(address, _is_client(), cluster_machine("the connected Ray cluster"))
+        check_connected_to(address)
+        yield Connection(address, is_client(), connected_machine())
         return
-    with reaping() if address is None else contextlib.nullcontext():
+    logger = logging.getLogger("ray")
+    level = logger.level
+    with contextlib.ExitStack() as stack:
         if address is None:
-            _start(machine)
-        else:
-            _join(address)
+            stack.enter_context(reaping())
         try:
+            with ending_if_it_fails(), _keeping_sigterm(), _deaf_to_hangups():
+                if address is None:
+                    _start(machine)
+                else:
+                    _join(address)
             source = "this machine" if address is None else f"the cluster at {address}"
-            yield Connection(address, _is_client(), cluster_machine(source))
+            yield Connection(address, is_client(), cluster_machine(source))
         finally:
-            ray.shutdown()
+            # Ray half shut down would be in the way of the next one, and its processes would live on.
+            with current().shielded():
+                ray.shutdown()
+                logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _keeping_sigterm() -> Iterator[None]:
+    """Ray 2.60's `init` sets a handler for SIGTERM that ends the process at once."""
+    utils = ray._private.utils  # noqa: SLF001 (nothing public keeps it from that)
+    original = utils.set_sigterm_handler
+    utils.set_sigterm_handler = lambda _: None
+    try:
+        yield
+    finally:
+        utils.set_sigterm_handler = original
+
+
+@contextlib.contextmanager
+def _deaf_to_hangups() -> Iterator[None]:
+    """Processes that are started in the block get no SIGHUP: a terminal that goes sends it to all that run in it.
+
+    Ray 2.60 does so with SIGINT. It would be gone before the trials have saved; here the signal waits for the end of
+    the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start(machine: Machine | None) -> None:
@@ -160,30 +201,6 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def _is_client() -> bool:
-    return bool(ray.util.client.ray.is_connected())
-
-
-def _alive_nodes() -> list[dict[str, Any]]:
-    return [node for node in ray.nodes() if node["Alive"]]
-
-
-def cluster_machine(source: str) -> Machine:
-    """The CPUs, GPUs and memory of the joined cluster's nodes."""
-    resources = [node["Resources"] for node in _alive_nodes()]
-    nodes = tuple((float(node.get("CPU", 0)), float(node.get("GPU", 0))) for node in resources)
-    num_cpus = sum(cpus for cpus, _ in nodes)
-    # What a node had free when its Ray started, less the object store.
-    shares = [node.get("memory", 0.0) / node["CPU"] for node in resources if node.get("CPU")]
-    return Machine(
-        num_cpus=num_cpus,
-        num_gpus=sum(gpus for _, gpus in nodes),
-        source=source,
-        nodes=nodes,
-        memory_bytes=min(shares) * num_cpus if shares and min(shares) > 0 else None,
-    )
-
-
 def check_storage(folder: Path) -> None:
     """Check, from a worker on every node, that it reads and writes the very folder that is seen here.
 
@@ -196,7 +213,7 @@ def check_storage(folder: Path) -> None:
     write_atomic(probe / "question", token)
     try:
         tasks = {}
-        for node in _alive_nodes():
+        for node in alive_nodes():
             strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
             remote = ray.remote(num_cpus=0, max_retries=0)(_answer).options(scheduling_strategy=strategy)
             name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"

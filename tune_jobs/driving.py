@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import platform
-import signal
 import subprocess
-import threading
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from tune_jobs.address import check_address
-from tune_jobs.machine import Machine
+from tune_jobs.interruption import current
+from tune_jobs.leftovers import remove_leftovers
+from tune_jobs.machine import Machine, local_machine
 from tune_jobs.monitor import SweepMonitor
 from tune_jobs.own_code import modules_of
-from tune_jobs.ownership import OWNER_FILE, Owner
+from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.plan import SweepPlan, TrialPlan
 from tune_jobs.spec import SweepSpec
 from tune_jobs.spec_file import stored_spec
@@ -96,25 +96,6 @@ def pending_record(trial: TrialPlan) -> TrialRecord:
     )
 
 
-def check_same_trials(store: SweepStore, plan: SweepPlan) -> None:
-    """Check that planning again gives the trials that are there.
-
-    Raises:
-        CannotRunError: It does not; a resumed trial would train with other values than it began with.
-    """
-    planned = {trial.trial_id: trial for trial in plan.trials}
-    for record in store.read_trials():
-        trial = planned.get(record.trial_id)
-        # A point that is not planned was chosen by the trials before it, which may be more by now.
-        same = trial is not None and (not trial.has_point or trial.hyperparams == record.first_hyperparams)
-        if trial is None or trial.seed != record.seed or not same:
-            raise CannotRunError(
-                f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: sweep.json was changed, "
-                "or was written by a version that draws other points.",
-                "Restore sweep.json, or launch a new sweep.",
-            )
-
-
 def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
@@ -149,6 +130,36 @@ def connected(address: str | None, here: Machine | None) -> AbstractContextManag
     return connect(address, here)
 
 
+def machine_here() -> Machine:
+    """What a sweep without an address runs on: the Ray that this process is connected to, else this machine."""
+    ray: Any = sys.modules.get("ray")
+    # A ray that is only being imported has no such function yet.
+    if ray is None or not getattr(ray, "is_initialized", bool)():
+        return local_machine()
+    from tune_jobs.connected_ray import connected_machine
+
+    return connected_machine()
+
+
+@contextlib.contextmanager
+def settled(store: SweepStore) -> Iterator[None]:
+    """However the block ends, leave no sweep behind that says it runs; its lock has to be held."""
+    is_ours = True
+    try:
+        yield
+    except OwnershipLostError:
+        is_ours = False
+        raise
+    finally:
+        # What cannot be read or written here was not before either: that error is told, or nothing was to be changed.
+        with current().shielded(), contextlib.suppress(TuneJobsError):
+            if is_ours and store.exists():
+                store.clear_stop_request()
+                remove_leftovers(store)
+                if store.read_record().state == "running":
+                    _close(store)
+
+
 def run_sweep(
     store: SweepStore,
     plan: SweepPlan,
@@ -159,31 +170,29 @@ def run_sweep(
     progress: str,
 ) -> SweepResult:
     """Run the unfinished trials of a sweep whose lock is held, then what comes after."""
-    started = time.time()
     # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
     run = Owner.take(store.folder / OWNER_FILE)
-    store.clear_stop_request()
-    record = store.read_record()
-    store.write_record(
-        record.model_copy(update={"state": "running", "started_at": record.started_at or started, "ended_at": None})
-    )
     todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
-    spec = stored_spec(record)
-    monitor = SweepMonitor(
-        store.name,
-        store.read_trials(),
-        max_env_steps_per_trial=spec.stop.num_env_steps,
-        max_concurrent=plan.max_concurrent,
-    )
     if todo:
+        record = store.read_record()
+        started = record.started_at or time.time()
+        store.write_record(record.model_copy(update={"state": "running", "started_at": started, "ended_at": None}))
+        spec = stored_spec(record)
+        monitor = SweepMonitor(
+            store.name,
+            store.read_trials(),
+            max_env_steps_per_trial=spec.stop.num_env_steps,
+            max_concurrent=plan.max_concurrent,
+        )
         _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
-    with run.held():
-        interrupted = _close(store, started)
     from tune_jobs.candidates import read_trials
 
     records = read_trials(store)
+    interrupted = any(trial.status not in FINISHED for trial in records)
     result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
-    return result if interrupted or not finish else _finished(store, result)
+    if interrupted or not finish:
+        return result
+    return replace(result, interrupted=True) if current().came else _finished(store, result)
 
 
 def _run_trials(
@@ -199,7 +208,12 @@ def _run_trials(
 ) -> None:
     from tune_jobs.live import shown
 
-    with shown(monitor, progress, store.driver_log, plan.notes), _stopping_on_signals(store, monitor):
+    def ask() -> None:
+        monitor.stopping = True
+        store.request_stop()
+
+    started = time.time()
+    with _noted(), shown(monitor, progress, store.driver_log, plan.notes):
         from tune_jobs.runner import RunJob, run_trials
 
         job = RunJob(
@@ -211,22 +225,35 @@ def _run_trials(
             packs=plan.packs,
             run=run.token,
         )
-        # Signals are handled anew once Ray is joined: it sets a handler of its own for SIGTERM, which ends the process.
-        with (
-            contextlib.suppress(KeyboardInterrupt),
-            connected(address, machine) as connection,
-            _stopping_on_signals(store, monitor),
-        ):
-            if connection.is_client:
-                from tune_jobs.remote_driver import run_trials_remotely
+        with current().asking(ask), connected(address, machine) as connection:
+            try:
+                if connection.is_client:
+                    from tune_jobs.remote_driver import run_trials_remotely
 
-                run_trials_remotely(job, monitor.update)
-            else:
-                run_trials(job, monitor.update)
+                    run_trials_remotely(job, monitor.update)
+                else:
+                    run_trials(job, monitor.update)
+            except CannotRunError:
+                # A signal that went to Ray's processes too, as one to a whole group does, is not Ray's failure.
+                if not current().came:
+                    raise
+            finally:
+                # Before Ray is shut down: where a part of it died, that takes long, and may end this process.
+                with current().shielded(), run.held():
+                    _close(store, started)
 
 
-def _close(store: SweepStore, started: float) -> bool:
-    """Write down how the run ended; returns whether it was interrupted."""
+@contextlib.contextmanager
+def _noted() -> Iterator[None]:
+    """End the block at a KeyboardInterrupt; it is raised again when everything is saved."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        current().came = True
+
+
+def _close(store: SweepStore, started: float | None = None) -> None:
+    """Write down how the run that began then ended; None: it had not begun."""
     interrupted = False
     for trial in store.read_trials():
         if trial.status not in FINISHED:
@@ -240,67 +267,69 @@ def _close(store: SweepStore, started: float) -> bool:
             update={
                 "state": "interrupted" if interrupted else "completed",
                 "ended_at": now,
-                "run_time_s": record.run_time_s + now - started,
+                "run_time_s": record.run_time_s + (0.0 if started is None else now - started),
             }
         )
     )
-    store.clear_stop_request()
-    return interrupted
 
 
 def _finished(store: SweepStore, result: SweepResult) -> SweepResult:
     """Choose, confirm and film the winner, and write the report; what can't be made is noted, not raised."""
-    from tune_jobs import finish
-
-    chosen: BestRecord | None = None
-    why: TuneJobsError | None = None
-    notes: list[str] = []
-    artifacts: dict[str, Path] = {}
-    try:
-        chosen = finish.choose_best(store)
-        artifacts["policy"] = store.best_folder / "policy.json"
-    except TuneJobsError as error:
-        why = error
-    failed = why is not None
-
-    def attempt(what: str, make: Callable[[], dict[str, Path]]) -> bool:
-        """Whether it went well, or could not have: not every environment can be drawn."""
-        try:
-            artifacts.update(make())
-        except TuneJobsError as error:
-            notes.append(f"No {what}: {error}")
-            return not isinstance(error, EnvFailedError)
-        return True
-
-    if chosen is not None:
-        failed |= not attempt("video", lambda: finish.make_videos(store))
-    attempt("report", lambda: {"report": finish.make_report(store, why)})
+    made = _Finish(store)
+    with _noted():
+        made.make_all()
     return replace(
         result,
-        best=chosen,
-        why_no_best=None if why is None else str(why),
-        artifacts=artifacts,
-        notes=tuple(notes),
-        finish_failed=failed,
+        best=made.best,
+        why_no_best=made.why_no_best,
+        finish_failed=made.failed,
+        artifacts=made.artifacts,
+        notes=tuple(made.notes),
+        interrupted=made.stopped or current().came,
     )
 
 
-@contextlib.contextmanager
-def _stopping_on_signals(store: SweepStore, monitor: SweepMonitor) -> Iterator[None]:
-    """Let the first Ctrl-C (or SIGTERM) ask the trials to save and stop, and the second end them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+class _Finish:
+    """What comes after the trials, as far as it was made."""
 
-    def ask(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 (the signature of a handler)
-        if monitor.stopping:
-            raise KeyboardInterrupt
-        monitor.stopping = True
-        store.request_stop()
+    def __init__(self, store: SweepStore) -> None:
+        self._store = store
+        self.best: BestRecord | None = None
+        self._why: TuneJobsError | None = None
+        self.artifacts: dict[str, Path] = {}
+        self.notes: list[str] = []
+        self.stopped = False
+        """Whether another process asked to stop before all was made."""
+        self.failed = False
+        """Whether no winner could be confirmed, or the environment failed where it was filmed."""
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    @property
+    def why_no_best(self) -> str | None:
+        """What kept a winner from being chosen."""
+        return None if self._why is None else str(self._why)
+
+    def make_all(self) -> None:
+        """Make everything, or what can be made."""
+        from tune_jobs import finish
+
+        try:
+            self.best = finish.choose_best(self._store)
+            self.artifacts["policy"] = self._store.best_folder / "policy.json"
+        except TuneJobsError as error:
+            self._why = error
+        self.failed = self._why is not None
+        if self.best is not None:
+            self._attempt("video", lambda: finish.make_videos(self._store))
+        self._attempt("report", lambda: {"report": finish.make_report(self._store, self._why)})
+
+    def _attempt(self, what: str, make: Callable[[], dict[str, Path]]) -> None:
+        # Another process may have asked: `stop` ends this too.
+        self.stopped = self.stopped or self._store.stop_requested()
+        if self.stopped:
+            return
+        try:
+            self.artifacts.update(make())
+        except TuneJobsError as error:
+            self.notes.append(f"No {what}: {error}")
+            # Else it could not have gone well: not every environment can be drawn.
+            self.failed = self.failed or isinstance(error, EnvFailedError)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 import threading
@@ -19,6 +20,7 @@ from rich.text import Text
 from analysis.records import FINISHED, TrialRecord
 from analysis.selection import Selection
 from tune_jobs.cli_output import format_duration, format_score, format_value
+from tune_jobs.interruption import current
 from tune_jobs.monitor import SweepMonitor
 
 _REFRESH_PER_S = 4
@@ -189,21 +191,53 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
                 yield
 
 
+class _PatientStream(io.TextIOWrapper):
+    """Drops what cannot be written: its terminal may have gone, or who read it from a pipe, and the sweep goes on."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            return super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            super().flush()
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            super().close()
+
+
 @contextlib.contextmanager
 def quiet(log: Path) -> Iterator[IO[str]]:
     """Send standard output and error to a file, C++ included; gives a stream to the real standard error."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = [os.dup(1), os.dup(2)]
-    with log.open("ab") as file, os.fdopen(os.dup(2), "w", encoding="utf-8") as stream:
+    _flush()
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(log.open("ab"))
+        stream = stack.enter_context(_PatientStream(os.fdopen(os.dup(2), "wb"), encoding="utf-8"))
+        stack.enter_context(_elsewhere(1, file))
+        stack.enter_context(_elsewhere(2, file))
         try:
-            for number in (1, 2):
-                os.dup2(file.fileno(), number)
             yield stream
         finally:
-            with contextlib.suppress(OSError, ValueError):
-                sys.stdout.flush()
-                sys.stderr.flush()
-            for number, original in enumerate(saved, start=1):
-                os.dup2(original, number)
-                os.close(original)
+            _flush()
+
+
+@contextlib.contextmanager
+def _elsewhere(number: int, file: IO[bytes]) -> Iterator[None]:
+    """Let a descriptor of this process lead to a file."""
+    original = os.dup(number)
+    try:
+        os.dup2(file.fileno(), number)
+        yield
+    finally:
+        with current().shielded():
+            os.dup2(original, number)
+            os.close(original)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        # A notebook's need not be files; a terminal's may be gone.
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()

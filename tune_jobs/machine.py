@@ -23,6 +23,8 @@ class Machine:
     memory_bytes: float | None = None
     """Memory that is available; on a cluster as if each CPU had as much as those of the node that has least a CPU.
     None: not known."""
+    more: str = "launch on a larger cluster with --address"
+    """How to get more of it, for hints."""
 
     def fitting(self, cpus: float, gpus: float) -> float:
         """How many processes with so many CPUs and GPUs fit at once, each on one node; infinite if it is 0 of both."""

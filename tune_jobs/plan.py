@@ -319,13 +319,14 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
         f" (1 process and {counted(runners, 'env runner')})" if runners and spec.resources.num_cpus is None else ""
     )
     if cpus > machine.num_cpus:
-        if runners:
-            hint = f"Set resources.num_env_runners to at most {max(0, int(machine.num_cpus) - 1)}"
-        else:
-            hint = f"Set resources.num_cpus to at most {int(machine.num_cpus)}"
+        hint = machine.more
+        if machine.num_cpus >= 1:
+            most = int(machine.num_cpus)
+            setting = f"num_env_runners to at most {most - 1}" if runners else f"num_cpus to at most {most}"
+            hint = f"set resources.{setting}, or {hint}"
         raise CannotRunError(
             f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
-            f"{hint}, or launch on a larger cluster with --address.",
+            f"{hint[0].upper()}{hint[1:]}.",
         )
     if gpus > machine.num_gpus:
         raise CannotRunError(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from analysis.records import TrialRecord
 from policies.arguments import checked
+from policies.env_modules import allowed_again
 from policies.errors import NotFoundError
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.Dat
     return trials_frame(read_trials(store), read_results(store), threshold=goal_of(store.read_record(), best))
 
 
+@allowed_again()
 @checked
 def report(sweep: str | Path, *, storage: str | Path | None = None) -> Path:
     """Write a sweep's report; returns its index.html.

@@ -6,6 +6,7 @@ Tune decides which trial runs where and when; what a trial is and how far it got
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,9 +20,10 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
 from analysis.records import CheckpointRecord
-from policies.errors import TuneJobsError
+from policies.errors import CannotRunError, TuneJobsError
 from policies.parents import this_process
 from tune_jobs.copies import remove_uncounted_copies
+from tune_jobs.interruption import current
 from tune_jobs.logs import died_by
 from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.pack_driver import PackDriver, PackScheduler
@@ -30,6 +32,7 @@ from tune_jobs.packs import PackPlan
 from tune_jobs.places import remove_folder, within
 from tune_jobs.population import PopulationScheduler
 from tune_jobs.ray_environment import prepare_environment
+from tune_jobs.ray_processes import RayDiedError, RayWatch
 from tune_jobs.record_keeper import Listener, RecordKeeper
 from tune_jobs.schedulers import build_scheduler, waits_for_others
 from tune_jobs.searcher import PointChooser, PointSearcher
@@ -67,6 +70,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 
     Raises:
         OwnershipLostError: Another process runs the sweep by now; nothing was written over its records.
+        CannotRunError: A part of Ray died; the records are written.
     """
     prepare_environment()
     store = SweepStore(job.sweep_folder)
@@ -79,22 +83,34 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     wanted = set(job.trial_ids)
     packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
     others = [name for name in job.trial_ids if name not in set(packed)]
-    run = _Run(job, store, listener, owner)
-    try:
-        if packed:
-            run.packs(packed)
-        # One after the other: a pack uses all the CPUs it is given all the time.
-        if others and not (packed and store.stop_requested()):
-            run.single_trials(others)
-    finally:
-        run.keeper.close()
+    with RayWatch.of_this_process() as watch:
+        run = _Run(job, store, listener, owner, watch)
+        try:
+            if packed:
+                run.packs(packed)
+            # One after the other: a pack uses all the CPUs it is given all the time.
+            if others and not (packed and store.stop_requested()):
+                run.single_trials(others)
+        except (RayDiedError, Exception) as error:
+            if isinstance(error, RayDiedError):
+                raise _ray_died(store, error) from error
+            # What Ray raises when a part of it is gone says little of it.
+            try:
+                watch.check_after(error)
+            except RayDiedError as death:
+                raise _ray_died(store, death) from error
+            raise
+        finally:
+            with current().shielded():
+                run.keeper.close()
 
 
 class _Run:
     """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
 
-    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Owner) -> None:
+    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Owner, watch: RayWatch) -> None:
         self._job = job
+        self._watch = watch
         self._store = store
         # What each process is told: which sweep, for which run, and who is gone when it is to end.
         self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
@@ -117,7 +133,7 @@ class _Run:
         driver = PackDriver(
             self._store, self._spec, plan, trial_ids, scheduler=self._scheduler, keeper=self.keeper, choose=choose
         )
-        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s)
+        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
         tune.Tuner(
             tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
@@ -138,7 +154,7 @@ class _Run:
         """Run trials one by one, as many at once as fit."""
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
-        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s)
+        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch)
         searcher = None
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
@@ -166,7 +182,7 @@ class _Run:
         return tune.RunConfig(
             name=name,
             storage_path=str(self._store.tune_folder),
-            stop=_StopWhenAsked(self._store, self.keeper, is_finished),
+            stop=_StopWhenAsked(self._store, self.keeper, is_finished, self._watch),
             verbose=0,
             failure_config=tune.FailureConfig(max_failures=max_failures),
             # Trials write their own checkpoints; Tune's are pointers, made when it pauses one.
@@ -195,7 +211,10 @@ def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
 class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
     """Ends the run when there is nothing to do, or once the running trials have saved, or took too long to."""
 
-    def __init__(self, store: SweepStore, keeper: RecordKeeper, is_finished: Callable[[], bool]) -> None:
+    def __init__(
+        self, store: SweepStore, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch
+    ) -> None:
+        self._watch = watch
         self._store = store
         self._keeper = keeper
         self._is_finished = is_finished
@@ -205,7 +224,12 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         return False
 
     def stop_all(self) -> bool:
-        """Whether to end the run now."""
+        """Whether to end the run now; Tune asks all the time.
+
+        Raises:
+            RayDiedError: It can't go on.
+        """
+        self._watch.check()
         if self._is_finished():
             return True
         if self._asked_at is None:
@@ -218,10 +242,11 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
 class _TrialEvents(tune.Callback):  # type: ignore[misc]
     """Tells the keeper of records what Tune does with the trials."""
 
-    def __init__(self, store: SweepStore, keeper: RecordKeeper, timeout_s: float) -> None:
+    def __init__(self, store: SweepStore, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
         self._store = store
         self._keeper = keeper
         self._timeout_s = timeout_s
+        self._watch = watch
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """A process took the trial."""
@@ -265,6 +290,7 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         if _was_lost(error):
             self._keeper.lost(trial_id)
             return
+        self._watch.check_after(error)
         message = describe_failure(error, self._store.trial(trial_id).log_tail(), timeout_s=self._timeout_s)
         self._keeper.failed(trial_id, message, retried=retried)
 
@@ -276,7 +302,8 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
 class _PackEvents(tune.Callback):  # type: ignore[misc]
     """Tells the driver of the packs what becomes of their processes."""
 
-    def __init__(self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float) -> None:
+    def __init__(self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
+        self._watch = watch
         self._driver = driver
         self._keeper = keeper
         self._timeout_s = timeout_s
@@ -310,6 +337,7 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
         if _was_lost(error):
             self._driver.lost(pack_id)
             return
+        self._watch.check_after(error)
         self._driver.died(pack_id, describe_failure(error, tail, timeout_s=self._timeout_s, what="pack"))
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
@@ -319,6 +347,14 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
 
     def __getstate__(self) -> dict[str, Any]:
         return {}
+
+
+def _ray_died(store: SweepStore, death: RayDiedError) -> CannotRunError:
+    return CannotRunError(
+        f"Ray's {death} died, or does not answer any more: no trial can be run on it.",
+        "Did the machine run out of memory? What is done is kept; go on with "
+        f"`tune-jobs resume {shlex.quote(store.name)}`.",
+    )
 
 
 def _error_of(trial: Trial) -> BaseException | None:

@@ -16,23 +16,21 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from analysis.records import BestRecord, EvaluationRecord, SweepRecord
 from policies.arguments import NumEpisodes, PositiveInt, Seed, checked
-from policies.env_modules import allow_modules
+from policies.env_modules import allowed_again
 from policies.errors import TuneJobsError
 from policies.guard import guarding
 from tune_jobs.driving import (
     SweepResult,
-    check_same_trials,
     connected,
-    pending_record,
+    machine_here,
     run_sweep,
+    settled,
     write_new,
 )
-from tune_jobs.machine import local_machine
+from tune_jobs.interruption import current, run_alone
 from tune_jobs.own_code import Source, load_source
 from tune_jobs.plan import make_plan
 from tune_jobs.results import dataframe, report, trials
-from tune_jobs.search_checks import check_extendable
-from tune_jobs.spec_file import stored_spec
 from tune_jobs.storage import choose_store, create_store, expanded, stem_of, storage_folder
 from tune_jobs.store import SweepStore, list_sweep_stores
 
@@ -58,6 +56,7 @@ class SweepStatus:
     """Whether a process runs it now."""
 
 
+@run_alone
 @checked
 @guarding(start=True)
 def launch(
@@ -89,13 +88,16 @@ def launch(
 
     Raises:
         SpecError: The sweep is wrong, or its name is taken. Nothing was written.
-        CannotRunError: It cannot run here. Nothing was written.
+        CannotRunError: It cannot run here, and nothing was written; Ray died, and what is done can be resumed; or
+            another thread of this process runs a sweep.
+        SweepInterrupted: Ctrl-C, SIGTERM or SIGHUP ended it, and what is done is saved. It is a KeyboardInterrupt; an
+            end by `stop` raises nothing.
     """
     spec = load_source(source, overrides, rl_module)
     names = (name if name is not None else spec.name, stem_of(source), storage_folder(storage))
     choose_store(*names)
     # Here and not only on the cluster's machine, so that a bad env or point is known before Ray starts.
-    machine = local_machine() if address is None else None
+    machine = machine_here() if address is None else None
     plan = make_plan(spec, machine) if machine is not None else None
     with contextlib.ExitStack() as stack:
         if plan is None:
@@ -108,14 +110,17 @@ def launch(
                 from tune_jobs.cluster import check_storage
 
                 check_storage(store.folder)
+            stack.enter_context(settled(store))
             write_new(store, spec, plan, address)
         except BaseException:
-            stack.pop_all().close()
-            store.discard()
+            with current().shielded():
+                stack.pop_all().close()
+                store.discard()
             raise
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
+@run_alone
 @checked
 def resume(
     sweep: str | Path,
@@ -141,11 +146,17 @@ def resume(
 
     Raises:
         NotFoundError: No such sweep.
-        CannotRunError: It is being run by another process, or cannot run here.
+        CannotRunError: It is being run by another process or thread, cannot run here, or Ray died.
+        SweepInterrupted: As `launch`.
     """
-    return _go_on(sweep, storage, address, 0, finish=finish, progress=progress, retry_failed=retry_failed)
+    from tune_jobs.finish import find_sweep
+    from tune_jobs.resuming import go_on
+
+    store = find_sweep(sweep, storage)
+    return go_on(store, address, 0, finish=finish, progress=progress, retry_failed=retry_failed)
 
 
+@run_alone
 @checked
 def extend(
     sweep: str | Path,
@@ -169,50 +180,14 @@ def extend(
     Raises:
         SpecError: num_samples is not positive, or the space has nothing random to draw.
         NotFoundError: No such sweep.
-        CannotRunError: It is being run by another process, or cannot run here.
+        CannotRunError: It is being run by another process or thread, cannot run here, or Ray died.
+        SweepInterrupted: As `launch`.
     """
-    return _go_on(sweep, storage, address, num_samples, finish=finish, progress=progress, retry_failed=False)
-
-
-@guarding()
-def _go_on(
-    sweep: str | Path,
-    storage: str | Path | None,
-    address: str | None,
-    num_samples: int,
-    *,
-    finish: bool,
-    progress: Progress,
-    retry_failed: bool,
-) -> SweepResult:
     from tune_jobs.finish import find_sweep
+    from tune_jobs.resuming import go_on
 
     store = find_sweep(sweep, storage)
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(store.lock())
-        record = store.read_record()
-        allow_modules(record.allowed_modules)
-        spec = stored_spec(record)
-        if num_samples:
-            check_extendable(spec)
-        spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
-        machine = local_machine() if address is None else None
-        if machine is None:
-            connection = stack.enter_context(connected(address, None))
-            from tune_jobs.cluster import check_storage
-
-            check_storage(store.folder)
-        plan = make_plan(spec, machine or connection.machine, store.read_trials(), retry_failed=retry_failed)
-        check_same_trials(store, plan)
-        for trial in plan.trials:
-            trial_store = store.trial(trial.trial_id)
-            if not trial_store.record_path.is_file():
-                trial_store.write_record(pending_record(trial))
-            elif retry_failed and (known := trial_store.read_record()).status == "failed":
-                trial_store.write_record(known.model_copy(update={"status": "pending", "error": None}))
-        changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
-        store.write_record(record.model_copy(update=changes))
-        return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
+    return go_on(store, address, num_samples, finish=finish, progress=progress, retry_failed=False)
 
 
 @checked
@@ -267,6 +242,7 @@ def _status(store: SweepStore) -> SweepStatus:
     return SweepStatus(record, {name: number for name, number in counts.items() if number}, alive)
 
 
+@allowed_again()
 @checked
 def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: NumEpisodes = 100) -> BestRecord:
     """Choose a sweep's winner, confirm it on fresh seeds, and copy its policy to best/.
@@ -279,6 +255,7 @@ def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: 
     return choose_best(find_sweep(sweep, storage), num_episodes)
 
 
+@allowed_again()
 @checked
 @guarding(start=True)
 def evaluate(
@@ -311,6 +288,7 @@ def evaluate(
     return finish.evaluate(finish.find_policy(source, storage, env_id, action), num_episodes, first_seed)
 
 
+@allowed_again()
 @checked
 @guarding()
 def video(

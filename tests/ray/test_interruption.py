@@ -99,7 +99,7 @@ def check_resumes(folder: Path) -> None:
     assert seconds == sorted(seconds)
 
 
-@pytest.mark.parametrize("interrupted", [signal.SIGINT, signal.SIGTERM], indirect=True)
+@pytest.mark.parametrize("interrupted", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], indirect=True)
 def test_a_signal_saves_and_stops(interrupted) -> None:
     folder, code, output = interrupted
     assert code == 130, output

@@ -11,6 +11,7 @@ from fake_sweeps import SWEEP, TRIALS, Status, evaluation
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli import cli
 from tune_jobs.cli_output import to_json
+from tune_jobs.interruption import SweepInterrupted
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
@@ -169,6 +170,7 @@ def test_evaluations_are_told_beside_random_ones(run, sweeps):
         (CannotRunError("The storage is full.", "Free some."), 5),
         (TrialsFailedError("All failed.", "See trials."), 3),
         (KeyboardInterrupt(), 130),
+        (SweepInterrupted(), 130),
     ],
 )
 def test_errors_end_with_message_hint_and_exit_code(run, sweeps, error, code):
@@ -176,10 +178,29 @@ def test_errors_end_with_message_hint_and_exit_code(run, sweeps, error, code):
     result = run("launch", "x")
     assert result.exit_code == code
     message = getattr(error, "message", "Interrupted.")
+    hint = "nothing was kept." if isinstance(error, SweepInterrupted) else "`tune-jobs resume SWEEP` goes on with it."
     assert f"error: {message}" in result.stderr
-    assert getattr(error, "hint", "tune-jobs resume SWEEP") in result.stderr
+    assert getattr(error, "hint", hint) in result.stderr
     document = json.loads(run("launch", "x", "--json").stdout)
     assert (document["error"], document["exit_code"]) == (message, code)
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        ("interrupted", "Interrupted; what is done is kept. Go on with: tune-jobs resume mine"),
+        ("completed", "Interrupted; all trials are done. Make what is missing with: tune-jobs resume mine"),
+    ],
+)
+def test_an_interrupted_sweep_is_shown_as_far_as_it_got(run, sweeps, state, told):
+    result = sweeps.answers["launch"]
+    sweep = result.sweep.model_copy(update={"state": state})
+    result = dataclasses.replace(result, sweep=sweep, interrupted=True, exit_code=130)
+    sweeps.answers["launch"] = SweepInterrupted(result)
+    shown = run("launch", "x")
+    assert shown.exit_code == 130
+    assert shown.stderr.strip().splitlines()[-1] == told
+    assert json.loads(run("launch", "x", "--json").stdout)["exit_code"] == 130
 
 
 def test_an_unexpected_error_is_one_line_and_its_traceback_is_kept(run, sweeps, tmp_path, monkeypatch):

@@ -1,0 +1,208 @@
+"""What a launch, resume or extend leaves when nothing is to be run, when it fails, and when a signal ends it."""
+
+import os
+import signal
+import sys
+
+import pytest
+
+from policies.errors import CannotRunError
+from tune_jobs import driving, finish, sweeps
+from tune_jobs.driving import write_new
+from tune_jobs.interruption import SweepInterrupted
+from tune_jobs.machine import Machine
+from tune_jobs.plan import make_plan
+from tune_jobs.spec_file import load_spec
+from tune_jobs.store import SweepStore
+
+SPEC = {"env": "CartPole-v1", "algorithm": "ppo", "space": {"lr": {"uniform": [1e-4, 1e-2]}}, "num_samples": 2}
+
+
+@pytest.fixture
+def store(tmp_path):
+    """A sweep whose trials are all done, two days ago."""
+    spec = load_spec(SPEC)
+    store = SweepStore(tmp_path / "mine")
+    store.create()
+    write_new(store, spec, make_plan(spec, Machine(2)), None)
+    for trial in store.read_trials():
+        store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "completed"}))
+    times = {"state": "completed", "started_at": 1_000.0, "ended_at": 2_000.0, "run_time_s": 1_000.0}
+    store.write_record(store.read_record().model_copy(update=times))
+    return store
+
+
+def test_a_finished_sweep_is_not_written_anew_when_nothing_is_run(store):
+    before = {path: path.read_bytes() for path in store.folder.rglob("*.json")}
+    result = sweeps.resume(store.folder, finish=False, progress="none")
+    assert (result.interrupted, result.exit_code, result.sweep.ended_at) == (False, 0, 2_000.0)
+    assert {path: path.read_bytes() for path in store.folder.rglob("*.json")} == before
+
+
+def test_finishing_anew_changes_no_times(store, monkeypatch):
+    monkeypatch.setattr(finish, "make_report", lambda store, _: store.report_folder / "index.html")
+    before = store.record_path.read_bytes()
+    # No trial has a checkpoint: there is no winner, and the report says so.
+    result = sweeps.resume(store.folder, progress="none")
+    assert result.why_no_best is not None
+    assert store.record_path.read_bytes() == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("step", ["choose_best", "make_report"])
+def test_a_signal_while_the_rest_is_made_ends_it_and_keeps_the_state(store, monkeypatch, number, step):
+    made = []
+
+    def interrupt(*_):
+        os.kill(os.getpid(), number)
+        made.append("more")
+
+    monkeypatch.setattr(finish, "make_report", lambda store, _: store.report_folder / "index.html")
+    monkeypatch.setattr(finish, step, interrupt)
+    with pytest.raises(SweepInterrupted) as caught:
+        sweeps.resume(store.folder, progress="none")
+    assert made == []
+    assert caught.value.result.exit_code == 130
+    assert "report" not in caught.value.result.artifacts
+    assert (store.read_record().state, store.read_record().ended_at) == ("completed", 2_000.0)
+    assert not store.is_driven()
+
+
+def test_stop_ends_what_comes_after_the_trials_too(store, monkeypatch):
+    def choose(store, **_):
+        store.request_stop()
+        raise CannotRunError("No best.")
+
+    monkeypatch.setattr(finish, "choose_best", choose)
+    monkeypatch.setattr(finish, "make_report", lambda store, _: pytest.fail("it was asked to stop"))
+    # Another process asked: nobody pressed Ctrl-C here, so nothing is raised.
+    result = sweeps.resume(store.folder, progress="none")
+    assert (result.interrupted, result.exit_code) == (True, 130)
+    assert not store.stop_requested()
+
+
+def pend(store):
+    """Let a trial wait, and the sweep say that it runs: its driver was killed."""
+    trial = store.read_trials()[1]
+    store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "running"}))
+    store.write_record(store.read_record().model_copy(update={"state": "running", "ended_at": None}))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(store, monkeypatch, number):
+    pend(store)
+
+    def connect(*_):
+        os.kill(os.getpid(), number)  # the first one asks
+        assert store.stop_requested()
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(driving, "connected", connect)
+    with pytest.raises(SweepInterrupted) as caught:
+        sweeps.resume(store.folder, progress="none")
+    assert caught.value.result.interrupted
+    assert store.read_record().state == "interrupted"
+    assert store.read_record().ended_at is not None
+    assert [trial.status for trial in store.read_trials()] == ["completed", "paused"]
+    assert not store.stop_requested()
+    assert not store.is_driven()
+
+
+@pytest.mark.parametrize("error", [CannotRunError("no Ray"), ValueError("a bug")])
+def test_a_run_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch, error):
+    pend(store)
+
+    def connect(*_):
+        raise error
+
+    monkeypatch.setattr(driving, "connected", connect)
+    with pytest.raises(type(error)):
+        sweeps.resume(store.folder, progress="none")
+    assert store.read_record().state == "interrupted"
+    assert not store.is_driven()
+
+
+def test_a_plan_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch):
+    pend(store)
+    monkeypatch.setattr("tune_jobs.resuming.machine_here", lambda: Machine(0))
+    with pytest.raises(CannotRunError, match="has 0"):
+        sweeps.resume(store.folder, progress="none")
+    assert store.read_record().state == "interrupted"
+
+
+def test_a_signal_before_a_new_sweep_is_there_leaves_nothing(tmp_path, monkeypatch):
+    def plan(*_, **__):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(sweeps, "make_plan", plan)
+    with pytest.raises(SweepInterrupted) as caught:
+        sweeps.launch(SPEC, name="new", storage=tmp_path / "storage", progress="none")
+    assert caught.value.result is None
+    assert not (tmp_path / "storage").exists()
+
+
+def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "write_new", lambda *_: os.kill(os.getpid(), signal.SIGHUP))
+    with pytest.raises(SweepInterrupted):
+        sweeps.launch(SPEC, name="new", storage=tmp_path / "storage", progress="none")
+    assert not (tmp_path / "storage").exists()
+
+
+def test_a_loop_over_launches_stops_at_the_first_signal(store, monkeypatch):
+    monkeypatch.setattr(finish, "choose_best", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    runs = []
+
+    def loop():
+        for _ in range(3):
+            runs.append(1)
+            try:
+                sweeps.resume(store.folder, progress="none")
+            except Exception:  # noqa: BLE001 (what such loops do)
+                continue
+
+    with pytest.raises(KeyboardInterrupt):
+        loop()
+    assert runs == [1]
+
+
+def test_the_plan_asks_the_ray_that_is_there(monkeypatch):
+    """Without importing ray where nobody has."""
+    here = driving.machine_here()
+    assert here.source == "this machine"
+    ray = type(sys)("ray")
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    assert driving.machine_here().source == "this machine"  # it is only being imported
+    ray.is_initialized = lambda: False
+    assert driving.machine_here().source == "this machine"
+    ray.is_initialized = lambda: True
+    connected_ray = type(sys)("tune_jobs.connected_ray")
+    connected_ray.connected_machine = lambda: Machine(1, source="the connected one")
+    monkeypatch.setitem(sys.modules, "tune_jobs.connected_ray", connected_ray)
+    assert driving.machine_here().source == "the connected one"
+
+
+@pytest.mark.parametrize(
+    ("cpus", "hint"), [(1, "Set resources.num_cpus to at most 1, or free some."), (0, "Free some.")]
+)
+def test_a_hint_asks_for_no_trial_without_a_cpu(cpus, hint):
+    spec = load_spec({**SPEC, "resources": {"num_cpus": 2}})
+    with pytest.raises(CannotRunError) as caught:
+        make_plan(spec, Machine(cpus, more="free some"))
+    assert caught.value.hint == hint
+
+
+def test_modules_of_a_sweep_are_not_allowed_to_the_next(tmp_path, monkeypatch):
+    """A class that was given to a launch is of that sweep alone."""
+    import odd_envs
+
+    from policies import env_modules
+
+    monkeypatch.setattr(env_modules, "_allowed", set())
+
+    def plan(*_, **__):
+        raise CannotRunError(str(env_modules.allowed_modules()))
+
+    monkeypatch.setattr(sweeps, "make_plan", plan)
+    with pytest.raises(CannotRunError, match="odd_envs"):
+        sweeps.launch({**SPEC, "env": odd_envs.Fragile}, name="new", storage=tmp_path, progress="none")
+    assert env_modules.allowed_modules() == ()

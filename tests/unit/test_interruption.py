@@ -1,0 +1,158 @@
+"""Signals and threads while a sweep runs: who is asked, what raises, and that one process runs one sweep at a time."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+
+from analysis.records import SweepRecord
+from policies.errors import CannotRunError
+from tune_jobs.driving import SweepResult
+from tune_jobs.interruption import SweepInterrupted, current, run_alone, taking_signals
+
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+def send(number):
+    # Python runs the handler before os.kill returns.
+    os.kill(os.getpid(), number)
+
+
+def make_result():
+    sweep = SweepRecord(
+        name="mine",
+        state="completed",
+        spec={},
+        evaluation_seeds=(),
+        confirmation_seeds=(),
+        num_trials=0,
+        created_at=0.0,
+    )
+    return SweepResult(Path("mine"), sweep, [])
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """No test may leave a handler behind."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    assert {number: signal.getsignal(number) for number in SIGNALS} == before
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_raises_where_nobody_is_asked(number):
+    with taking_signals() as interruption:
+        with pytest.raises(KeyboardInterrupt):
+            send(number)
+        assert interruption.came
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_first_signal_asks_and_the_second_raises(number):
+    asked = []
+    with taking_signals() as interruption, interruption.asking(lambda: asked.append(number)):
+        send(number)
+        assert (asked, interruption.came) == ([number], True)
+        with pytest.raises(KeyboardInterrupt):
+            send(number)
+        assert asked == [number]
+
+
+def test_signals_wait_for_what_must_not_be_cut_short():
+    asked = []
+    with taking_signals() as interruption, interruption.asking(lambda: asked.append(1)):
+        with interruption.shielded(), interruption.shielded():
+            send(signal.SIGTERM)
+            send(signal.SIGTERM)
+        assert (asked, interruption.came) == ([], True)
+        send(signal.SIGTERM)
+        assert asked == [1]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_nohup_means_it(number):
+    """A shell that starts a job in the background lets it ignore SIGINT, which `kill -INT` doesn't mean."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with taking_signals() as interruption, interruption.shielded():
+            send(number)
+            assert interruption.came == (number != signal.SIGHUP)
+        assert signal.getsignal(number) == signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+
+
+def test_an_interrupted_run_raises_with_what_there_is():
+    @run_alone
+    def run():
+        with current().shielded():
+            send(signal.SIGHUP)
+        return make_result()
+
+    with pytest.raises(SweepInterrupted) as caught:
+        run()
+    assert isinstance(caught.value, KeyboardInterrupt)
+    assert caught.value.result.interrupted
+    assert caught.value.result.exit_code == 130
+
+
+def test_a_run_interrupted_before_it_began_has_no_result():
+    @run_alone
+    def run():
+        send(signal.SIGINT)
+        return make_result()
+
+    with pytest.raises(SweepInterrupted) as caught:
+        run()
+    assert caught.value.result is None
+
+
+def test_a_run_that_another_process_stopped_raises_nothing():
+    @run_alone
+    def run():
+        return make_result()
+
+    assert run() == make_result()
+
+
+def test_a_process_runs_one_sweep_at_a_time():
+    begun, may_end = threading.Event(), threading.Event()
+    results = []
+
+    @run_alone
+    def first():
+        begun.set()
+        assert may_end.wait(60)
+        return make_result()
+
+    @run_alone
+    def second():
+        raise AssertionError("it must not begin")
+
+    # A thread other than the main one may run a sweep; it gets no signals.
+    thread = threading.Thread(target=lambda: results.append(first()))
+    thread.start()
+    try:
+        assert begun.wait(60)
+        before = [Path(f"/proc/self/fd/{number}").readlink() for number in (1, 2)]
+        with pytest.raises(CannotRunError, match="Another thread of this process"):
+            second()
+        assert [Path(f"/proc/self/fd/{number}").readlink() for number in (1, 2)] == before
+    finally:
+        may_end.set()
+        thread.join(60)
+    assert results == [make_result()]
+    # And the next one may.
+    assert run_alone(make_result)() == make_result()
+
+
+def test_a_run_that_fails_lets_the_next_one_begin():
+    @run_alone
+    def fails():
+        raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        fails()
+    assert run_alone(make_result)() == make_result()

@@ -1,0 +1,115 @@
+"""What Ray and Ray Tune change of a process is given back; what belongs to others is left alone."""
+
+import faulthandler
+import logging
+import os
+import random
+import resource
+import signal
+import sys
+import threading
+import warnings
+
+import numpy as np
+import pytest
+
+from policies.env_modules import allow_modules, allowed_modules
+from tune_jobs.process_state import given_back
+
+
+def state():
+    """What another library could see of it."""
+    root, known = logging.getLogger(), logging.getLogger("tune_jobs_test.known")
+    return {
+        "environment": dict(os.environ),
+        "signals": {number: signal.getsignal(number) for number in signal.valid_signals()},
+        "hooks": (sys.excepthook, threading.excepthook, faulthandler.is_enabled()),
+        "loggers": [(log.level, log.handlers[:], log.propagate, log.disabled) for log in (root, known)],
+        "factory": logging.getLogRecordFactory(),
+        "warnings": warnings.filters[:],
+        "random": random.getstate(),
+        "numpy": str(np.random.get_state()),  # noqa: NPY002 (the generator that is everybody's)
+        "files": resource.getrlimit(resource.RLIMIT_NOFILE),
+        "modules": allowed_modules(),
+    }
+
+
+def disturb():
+    os.environ.update(RAY_X="1", TUNE_X="1", PYTHONBREAKPOINT="none", PYTHONPATH="/nowhere", SDL_VIDEODRIVER="dummy")
+    signal.signal(signal.SIGUSR1, lambda *_: None)
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    sys.excepthook = threading.excepthook = lambda *_: None
+    faulthandler.enable()
+    for log in (logging.getLogger(), logging.getLogger("tune_jobs_test.known")):
+        log.setLevel(3)
+        log.addHandler(logging.NullHandler())
+        log.propagate = not log.propagate
+    logging.setLogRecordFactory(lambda *args: logging.LogRecord(*args))  # noqa: PLW0108 (another one than before)
+    warnings.filterwarnings("error", message="of no one")
+    random.random()
+    np.random.random()  # noqa: NPY002
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft - 1, hard))
+    allow_modules(["tune_jobs_test_module"])
+
+
+@pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt])
+def test_everything_is_as_before(monkeypatch, error):
+    monkeypatch.setenv("TUNE_MINE", "7")
+    # pytest has one of its own.
+    dumps = []
+    monkeypatch.setattr(faulthandler, "is_enabled", lambda: bool(dumps))
+    monkeypatch.setattr(faulthandler, "enable", lambda: dumps.append(1))
+    monkeypatch.setattr(faulthandler, "disable", dumps.clear)
+    logging.getLogger("tune_jobs_test.known")
+    before = state()
+
+    def run():
+        with given_back():
+            disturb()
+            os.environ["TUNE_MINE"] = "8"
+            assert [key for key, value in before.items() if state()[key] == value] == []
+            if error is not None:
+                raise error
+
+    if error is None:
+        run()
+    else:
+        with pytest.raises(error):
+            run()
+    assert state() == before
+
+
+def test_what_a_users_module_sets_as_it_is_imported_stays(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    with given_back():
+        monkeypatch.setenv("MUJOCO_GL", "egl")
+    assert os.environ["MUJOCO_GL"] == "egl"
+
+
+def test_modules_that_the_user_allowed_stay_allowed(monkeypatch):
+    from policies import env_modules
+
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    allow_modules(["of_the_user"])
+    with given_back():
+        allow_modules(["of_the_sweep"])
+        assert allowed_modules() == ("of_the_sweep", "of_the_user")
+    assert allowed_modules() == ("of_the_user",)
+
+
+def test_it_works_in_any_thread():
+    failures = []
+
+    def run():
+        try:
+            with given_back():
+                os.environ["RAY_X"] = "1"
+            assert "RAY_X" not in os.environ
+        except Exception as error:  # noqa: BLE001
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join(60)
+    assert failures == []
