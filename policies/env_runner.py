@@ -17,6 +17,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import ray
 import torch
 from gymnasium.wrappers.vector import DictInfoToList
 from numpy.typing import NDArray
@@ -80,6 +81,11 @@ class _Stream:
         self.tail: dict[str, NDArray[Any]] = {}
 
 
+def _is_actor() -> bool:
+    """Whether this process is one that Ray started for an actor, and not a user's own."""
+    return ray.is_initialized() and ray.get_runtime_context().get_actor_id() is not None
+
+
 class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     """Samples fragments of (T, N) arrays; Box observations, flat or images, Discrete or flat Box actions.
 
@@ -95,8 +101,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._seed_override: int | None = None
         self._just_ended: NDArray[np.bool_] | None = None
         self._n_step: NStep | None = None
-        if kwargs.get("worker_index", 0):
-            # A process of its own: it must not outlive the Ray that started it, whatever its env does.
+        if kwargs.get("worker_index", 0) and _is_actor():
+            # It must not outlive the Ray that started this process, whatever its env does.
             end_with_parent()
         super().__init__(**kwargs)
 

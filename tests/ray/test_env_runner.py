@@ -1,5 +1,7 @@
 """ArrayEnvRunner gives the episodes that RLlib's own runner gives, to the last bit."""
 
+import threading
+
 import numpy as np
 import pytest
 import torch
@@ -316,6 +318,8 @@ def test_neighbouring_env_runners_share_no_environment_seed():
         runner = ArrayEnvRunner(config=config, worker_index=worker_index)
         streams += [chunk.get_observations(0)[2] for chunk in runner.sample(num_timesteps=6, explore=True)]
     assert len(set(streams)) == len(streams) == 6
+    # Made in a user's own process, as here, it does not tie that to the process's parent.
+    assert "end with parent" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_what_the_environment_raises_is_raised():
