@@ -44,9 +44,8 @@ def parse_yaml(text: str, label: str) -> Any:
     """
     if len(text) > MAX_CHARACTERS:
         raise SpecError(f"{label}: has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read.", _SMALLER)
-    loader = _Loader(text)
     try:
-        node = loader.get_single_node()
+        node = _Loader(text).get_single_node()
         if node is None:
             return None
         _check_extent(node, label)
@@ -55,8 +54,6 @@ def parse_yaml(text: str, label: str) -> Any:
         raise SpecError(f"{label}{_place(error.problem_mark)}: {error.problem}", "Correct the YAML there.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SpecError(f"{label}: this is no YAML: {error}", "Correct the YAML.") from error
-    finally:
-        loader.dispose()
 
 
 class _Loader(yaml.SafeLoader):

@@ -113,6 +113,13 @@ def test_nothing_stands_twice(text, part):
 
 
 @pytest.mark.parametrize(
+    "text", ["a: \x00", "\x07", "a: '\ud800'", 'a: "\\u12"', "%YAML 3.0\n---\na: 1", "a: b: c", "\t- a"]
+)
+def test_what_is_no_yaml_is_told_so(text):
+    assert refused(text).startswith("x.yaml")
+
+
+@pytest.mark.parametrize(
     ("text", "parts"),
     [
         (LAUGHS, ["stands for 490,329,064 values", "at most 100,000"]),
