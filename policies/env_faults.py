@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import PurePath
+from traceback import walk_tb
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 from policies.errors import EnvFailedError
 
+_PACKAGE = PurePath(__file__).parent
 _notes_signals = False
 _signalled = False
 
@@ -67,7 +70,47 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     if not is_of_env(error):
         raise error
     detail = str(error).strip().rstrip(".")
+    frames = [
+        Frame(frame.f_code.co_filename, line, frame.f_code.co_name) for frame, line in walk_tb(error.__traceback__)
+    ]
+    # The outermost is the caller's.
+    if (place := frame_of_env(frames[:0:-1])) is not None:
+        detail += f" ({place})" if detail else f"at {place}"
     return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint)
+
+
+class Frame(NamedTuple):
+    """A call of a function."""
+
+    file: str
+    line: int
+    name: str
+
+    def __str__(self) -> str:
+        """Where it is, as editors take it."""
+        return f"{self.file}:{self.line} in {self.name}"
+
+
+def frame_of_env(frames: Sequence[Frame]) -> Frame | None:
+    """Of the frames inside a call of an env, innermost first, the innermost that is the env's own.
+
+    What an env calls of others is inside its own frames, Gymnasium and its wrappers around them. Those that lie in the
+    folder of the outermost one are its own.
+
+    Returns:
+        None: all are of this package or of Gymnasium.
+    """
+    own = [frame for frame in frames if not _is_around(frame.file)]
+    if not own:
+        return None
+    folder = PurePath(own[-1].file).parent
+    return next(frame for frame in own if folder in PurePath(frame.file).parents)
+
+
+def _is_around(file: str) -> bool:
+    """Whether a file is of Gymnasium, but for its environments, or of this package."""
+    path = PurePath(file)
+    return ("gymnasium" in path.parts and "envs" not in path.parts) or _PACKAGE in path.parents
 
 
 def close_env(env: Any) -> None:

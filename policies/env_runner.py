@@ -34,6 +34,7 @@ from policies.env_wrappers import FailurePenalty
 from policies.envs import ALLOWED_MODULES, FAILURE_PENALTY, make_vector_env
 from policies.parents import end_with_parent
 from policies.replay import NStep, Transitions
+from policies.ruined import check_outputs
 from policies.spaces import observation_dtype
 
 _WEIGHTS_SEQ_NO = "weights_seq_no"
@@ -290,14 +291,23 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         module = self.module
         out = module._forward_exploration(batch, t=num_units) if explore else module._forward_inference(batch)  # noqa: SLF001
         if Columns.ACTIONS not in out:
-            which = "exploration" if explore else "inference"
-            dist = getattr(self.module, f"get_{which}_action_dist_cls")().from_logits(out[Columns.ACTION_DIST_INPUTS])
-            if not explore:
-                dist = dist.to_deterministic()
-            out[Columns.ACTIONS] = dist.sample()
-            if explore:
-                out[Columns.ACTION_LOGP] = dist.logp(out[Columns.ACTIONS])
+            try:
+                self._draw(out, explore=explore)
+            except (ValueError, RuntimeError):
+                # A distribution's: what it says of its parameters names no cause.
+                check_outputs(out[Columns.ACTION_DIST_INPUTS], module)
+                raise
         return {key: value.cpu().numpy() for key, value in out.items()}
+
+    def _draw(self, out: dict[str, torch.Tensor], *, explore: bool) -> None:
+        """Draw actions from what a policy put out, or take the likeliest."""
+        which = "exploration" if explore else "inference"
+        dist = getattr(self.module, f"get_{which}_action_dist_cls")().from_logits(out[Columns.ACTION_DIST_INPUTS])
+        if not explore:
+            dist = dist.to_deterministic()
+        out[Columns.ACTIONS] = dist.sample()
+        if explore:
+            out[Columns.ACTION_LOGP] = dist.logp(out[Columns.ACTIONS])
 
     def _for_env(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Actions as the env takes them; the stored ones stay as the policy drew them."""

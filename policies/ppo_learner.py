@@ -9,6 +9,8 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 
+from policies.ruined import check_gradients, check_outputs
+
 _KL_COEFFS = "kl_coeffs"
 
 
@@ -19,6 +21,8 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
     the schedule's first value again after a restore, and its KL weight at the config's (2.60). Here the schedules move
     before each phase, and the KL weight is part of the learner's state.
 
+    Gradients and outputs that are not finite are errors: see `policies.ruined`.
+
     Modules that normalise observations get those of the phase after its updates: a batch is trained with the
     statistics it was sampled with, so that PPO's ratio begins at 1.
     """
@@ -26,6 +30,29 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._new_observations: dict[str, Tensor] = {}
+
+    def compute_loss_for_module(self, *, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Any]) -> Any:
+        """RLlib's loss.
+
+        Raises:
+            NonFiniteWeightsError: The policy's outputs are not finite.
+        """
+        try:
+            return super().compute_loss_for_module(module_id=module_id, config=config, batch=batch, fwd_out=fwd_out)
+        except (ValueError, RuntimeError):
+            # A distribution's: what it says of its parameters names no cause.
+            check_outputs(fwd_out[Columns.ACTION_DIST_INPUTS], self.module[module_id].unwrapped())
+            raise
+
+    def compute_gradients(self, loss_per_module: dict[str, Any], **kwargs: Any) -> dict[Any, Tensor]:
+        """RLlib's gradients.
+
+        Raises:
+            NonFiniteWeightsError: One is NaN or infinite.
+        """
+        gradients: dict[Any, Tensor] = super().compute_gradients(loss_per_module, **kwargs)
+        check_gradients(gradients.values(), self.module[next(iter(loss_per_module))].unwrapped())
+        return gradients
 
     def before_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
         """Move the schedules to the env steps sampled so far, those of this phase's batch among them."""

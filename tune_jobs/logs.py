@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path, PurePath
-from typing import NamedTuple
+from pathlib import Path
+
+from policies.env_faults import Frame, frame_of_env
 
 _TAIL_BYTES = 200_000
 _TIMEOUT_MARK = "Timeout ("
@@ -17,18 +18,6 @@ _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)'
 # Where a trial's own thread is, and where code of this package calls that of an environment.
 _LOOPS = ("/tune_jobs/trainable.py", "/tune_jobs/trial.py", "/tune_jobs/pack_loop.py", "/tune_jobs/pack_trainable.py")
 _CALLERS = ("/policies/packed/sub_envs.py", "/policies/checked_envs.py", "/policies/evaluate.py", "/policies/envs.py")
-
-
-class Frame(NamedTuple):
-    """One call of a thread that hung."""
-
-    file: str
-    line: int
-    name: str
-
-    def __str__(self) -> str:
-        """Where it is, as editors take it."""
-        return f"{self.file}:{self.line} in {self.name}"
 
 
 def log_mark(what: str) -> str:
@@ -103,16 +92,6 @@ def _hung_thread(lines: list[str]) -> list[str]:
 
 
 def _frame_of_env(frames: list[Frame]) -> Frame:
-    """Of frames, innermost first: the innermost that lies beside the env's own outermost one."""
+    """The env's own, if it was called; else the innermost."""
     callers = [index for index, frame in enumerate(frames) if frame.file.endswith(_CALLERS)]
-    inside = frames[: callers[0]] if callers else []
-    outside = [frame for frame in inside if not _is_wrapper(frame.file)]
-    if not outside:
-        return frames[0]
-    folder = PurePath(outside[-1].file).parent
-    return next(frame for frame in outside if folder in PurePath(frame.file).parents)
-
-
-def _is_wrapper(file: str) -> bool:
-    """Whether a frame is between this package and an environment: in Gymnasium, or in a wrapper of ours."""
-    return ("/gymnasium/" in file and "/gymnasium/envs/" not in file) or file.endswith("/policies/env_wrappers.py")
+    return (frame_of_env(frames[: callers[0]]) if callers else None) or frames[0]

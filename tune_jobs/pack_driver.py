@@ -23,12 +23,12 @@ from ray.tune.schedulers import FIFOScheduler, TrialScheduler
 from tune_jobs.pack_files import Assignment, PackFiles
 from tune_jobs.pack_loop import MemberReport
 from tune_jobs.packs import PackPlan
+from tune_jobs.progress import Progress
 from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.schedulers import grace_env_steps
 from tune_jobs.spec import SweepSpec
 from tune_jobs.store import SweepStore
 from tune_jobs.trainable import compared_by
-from tune_jobs.trial import Progress
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController

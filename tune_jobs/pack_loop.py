@@ -24,9 +24,10 @@ from policies.portable import PortablePolicy
 from policies.tallies import Reached, end_tally, tally_of
 from tune_jobs.engines.protocol import IterationStats, PackEngine, TrialTask
 from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.progress import Progress
 from tune_jobs.recovery import write_log
 from tune_jobs.store import SweepStore
-from tune_jobs.trial import Progress, TrialLoop
+from tune_jobs.trial import TrialLoop
 
 _NUM_WRITERS = 8
 

@@ -13,9 +13,9 @@ from typing import Any
 from analysis.records import TrialRecord
 from policies.tallies import Reached, read_tally
 from tune_jobs.ownership import Owner
+from tune_jobs.progress import Progress
 from tune_jobs.store import SweepStore
 from tune_jobs.tensorboard import ScalarWriter
-from tune_jobs.trial import Progress
 
 Listener = Callable[[TrialRecord], None]
 

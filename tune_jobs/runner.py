@@ -31,6 +31,7 @@ from tune_jobs.pack_trainable import PackTrainable
 from tune_jobs.packs import PackPlan
 from tune_jobs.places import remove_folder, within
 from tune_jobs.population import PopulationScheduler
+from tune_jobs.progress import Progress
 from tune_jobs.ray_environment import prepare_environment
 from tune_jobs.ray_processes import RayDiedError, RayWatch
 from tune_jobs.record_keeper import Listener, RecordKeeper
@@ -40,7 +41,6 @@ from tune_jobs.spec import SweepSpec
 from tune_jobs.spec_file import stored_spec
 from tune_jobs.store import SweepStore
 from tune_jobs.trainable import TrialTrainable
-from tune_jobs.trial import Progress
 
 # How long running trials may take to save a checkpoint once they were asked to stop; then they are ended.
 STOP_GRACE_S = 20.0

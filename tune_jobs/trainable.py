@@ -31,11 +31,12 @@ from policies.tallies import end_tally
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
 from tune_jobs.logs import begin_log
 from tune_jobs.ownership import OWNER_FILE, Owner
+from tune_jobs.progress import Progress
 from tune_jobs.recovery import latest_damaged
 from tune_jobs.schedulers import METRIC, WORST_SCORE, grace_env_steps
 from tune_jobs.spec_file import stored_spec
 from tune_jobs.store import SweepStore
-from tune_jobs.trial import Progress, TrialLoop
+from tune_jobs.trial import TrialLoop
 
 # Reporting every iteration of a fast env costs more than the iteration.
 REPORT_INTERVAL_S = 1.0

@@ -9,8 +9,9 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
 from policies.evaluate import Episodes, Evaluator
@@ -21,37 +22,11 @@ from policies.tallies import Reached, begin_tally, end_tally
 from tune_jobs.copies import pending_copy, remove_copies
 from tune_jobs.engines.protocol import IterationStats, TrainingEngine, TrialTask
 from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.progress import Progress
 from tune_jobs.recovery import take_up_checkpoints, take_up_copy, take_up_results, write_log
 from tune_jobs.store import SweepStore
 
 TRAINING_RETURN_EPISODES = 100
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a trial stands; what its process tells the one that drives the sweep."""
-
-    iteration: int
-    num_env_steps: int
-    num_episodes: int
-    time_s: float
-    training_return: float | None
-    evaluation_return: float | None
-    best_evaluation_return: float | None
-    best_iteration: int | None
-    evaluated: bool
-    """Whether `evaluation_return` is of this very iteration."""
-    status: str
-    """running, paused (asked to stop), completed or failed; a pack says stopped of a member that was to be ended."""
-    stop_reason: str | None = None
-    error: str | None = None
-    notes: tuple[str, ...] = ()
-    """What was damaged when the trial was opened, and what it goes on from instead."""
-    checkpoints: tuple[CheckpointRecord, ...] = ()
-    started_at: float | None = None
-    """Unix time at which the first iteration here began, seconds."""
-    ended_at: float | None = None
-    """Unix time at which the trial ended or paused; None while it runs."""
 
 
 class TrialLoop:
@@ -210,11 +185,11 @@ class TrialLoop:
         if progress is not None:
             return progress
         evaluation: Episodes | NonFiniteWeightsError | None = None
-        if self.take(self._engine.train_iteration()):
-            try:
+        try:
+            if self.take(self._engine.train_iteration()):
                 evaluation = self._evaluator.run(self.policy())
-            except NonFiniteWeightsError as error:
-                evaluation = error
+        except NonFiniteWeightsError as error:
+            evaluation = error
         return self.conclude(evaluation)
 
     def before_iteration(self, *, stop: bool) -> Progress | None:
@@ -247,9 +222,12 @@ class TrialLoop:
         record, reason = self._taken, self._reason
         if isinstance(evaluation, NonFiniteWeightsError):
             # Its later iterations would only repeat it, and a retry too: the trial is over.
-            self._last = record
-            self._unwritten.append(record)
-            return self._progress("failed", evaluated=False, error=f"{evaluation} (iteration {record.iteration})")
+            text = f"{evaluation} (iteration {self._last.iteration + 1}{_learning_settings(self.task.hyperparams)})"
+            if record.iteration > self._last.iteration:  # else its training raised it
+                self._unwritten.append(record)
+            self._last, reached = record, self._tally.reached
+            progress = self._progress("failed", evaluated=False, error=text)
+            return replace(progress, num_env_steps=reached.num_env_steps, num_episodes=reached.num_episodes)
         if evaluation is not None:
             score = finite_or_none(sum(evaluation.returns) / len(evaluation.returns))
             record = record.model_copy(update={"evaluation_return": score})
@@ -374,6 +352,12 @@ class TrialLoop:
             started_at=self._started_at,
             ended_at=None if status == "running" else time.time(),
         )
+
+
+def _learning_settings(hyperparams: dict[str, Any]) -> str:
+    """Of the hyperparameters what bounds the steps of weights."""
+    known = [name for name in ("lr", "lr_final", "grad_clip") if name in hyperparams]
+    return "".join(f", {name} {hyperparams[name]}" for name in known)
 
 
 def _reached(record: IterationRecord) -> Reached:

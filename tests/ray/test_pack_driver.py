@@ -8,10 +8,10 @@ from tune_jobs.pack_driver import PackDriver
 from tune_jobs.pack_files import PackFiles
 from tune_jobs.pack_loop import MemberReport
 from tune_jobs.packs import PackPlan
+from tune_jobs.progress import Progress
 from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.schedulers import build_scheduler
 from tune_jobs.spec import SweepSpec
-from tune_jobs.trial import Progress
 
 pytestmark = pytest.mark.ray
 

@@ -8,6 +8,7 @@ import torch
 from trials import TRIAL_SEED, make_task, run_trial
 
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from policies.policy import NonFiniteWeightsError
 from tune_jobs.spec import StopSpec
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
@@ -246,3 +247,33 @@ def test_a_whole_trial_with_this_engine(engine, tmp_path):
     assert [record.iteration for record in progress.checkpoints] == [1, 2, 3]
     assert all(Path(tmp_path / record.path / "rllib").is_dir() for record in progress.checkpoints)
     assert progress.evaluation_return is not None
+
+
+# -- training that went wrong
+
+
+def test_gradients_that_are_not_finite_are_an_error_and_not_set_to_0(engine, tmp_path):
+    engine.build(make_task(tmp_path, lr=1e30), None)
+    with pytest.raises(NonFiniteWeightsError, match="gradients of an update are NaN or infinite"):
+        engine.train_iteration()
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_weights_that_are_not_finite_are_named_where_actions_are_drawn(engine, tmp_path, env_id):
+    engine.build(make_task(tmp_path, env_id=env_id), None)
+    module = engine.algorithm.env_runner.module
+    with torch.no_grad():
+        next(parameter for name, parameter in module.named_parameters() if name.startswith("pi.")).fill_(torch.nan)
+    with pytest.raises(NonFiniteWeightsError, match=r"outputs are NaN or infinite: \d+ weights are too, first in pi"):
+        engine.algorithm.env_runner.sample(num_timesteps=8, explore=True)
+
+
+def test_an_update_by_weights_that_are_not_finite_names_them(engine, tmp_path):
+    engine.build(make_task(tmp_path), None)
+    learner = engine.algorithm.learner_group._learner
+    with torch.no_grad():
+        for name, parameter in learner.module["default_policy"].unwrapped().named_parameters():
+            if name.startswith("pi."):
+                parameter.fill_(torch.nan)
+    with pytest.raises(NonFiniteWeightsError, match=r"NaN or infinite: \d+ weights are too, first in pi"):
+        engine.train_iteration()

@@ -100,9 +100,10 @@ def make_task(folder: Path, **changes):
         "stop": {"num_iterations": 100},
         "evaluation": {"every_iterations": 1},
         "checkpoints": {"every_iterations": 10, "keep": 2},
+        "hyperparams": {},
     } | changes
     values = {name: sections[name](**value) if name in sections else value for name, value in values.items()}
     return TrialTask(
-        sweep_folder=folder, trial_id="t0000", seed=1024, algorithm="ppo", hyperparams={}, env_id="CartPole-v1",
+        sweep_folder=folder, trial_id="t0000", seed=1024, algorithm="ppo", env_id="CartPole-v1",
         env_args={}, evaluation_seeds=(1, 2), **values,
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 
@@ -93,6 +94,16 @@ class RefusesSeeds(Fragile):
         if seed == 13:
             raise ValueError("13 brings bad luck")
         return super().reset(seed=seed)
+
+
+class Deep(Fragile):
+    """Its error comes from what it calls."""
+
+    def step(self, action):
+        return self.parse("{")
+
+    def parse(self, text):
+        return json.loads(text)
 
 
 class OwnStop(BaseException):

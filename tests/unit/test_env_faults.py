@@ -117,6 +117,13 @@ def test_a_constructor_may_raise_anything(name):
             make_one(FAULTY, {"where": "init", "raises": name})
 
 
+def test_the_message_names_the_line_in_the_env_and_not_in_what_is_around_or_inside_it(make):
+    envs = make("odd_envs:Deep", "scalar", members={"a": 1})
+    go_on(envs)
+    with pytest.raises(EnvError, match=r"JSONDecodeError: .* \(/.*/odd_envs\.py:\d+ in parse\)"):
+        raise envs.errors["a"]
+
+
 # -- vector environments
 
 

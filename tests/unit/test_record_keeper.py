@@ -5,9 +5,9 @@ from fake_engine import FakeClock
 
 from analysis.records import CheckpointRecord, TrialRecord
 from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.progress import Progress
 from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.store import SweepStore
-from tune_jobs.trial import Progress
 
 
 @pytest.fixture

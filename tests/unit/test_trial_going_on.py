@@ -9,6 +9,8 @@ from fake_engine import FakeClock, FakeEngine
 from trial_runs import Trial
 
 from policies.errors import CheckpointError
+from policies.policy import NonFiniteWeightsError
+from policies.tallies import tally_of
 from tune_jobs.ownership import Owner, OwnershipLostError
 from tune_jobs.recovery import latest_damaged
 from tune_jobs.store import SweepStore, TrialStore
@@ -307,6 +309,22 @@ def test_nan_weights_end_a_trial_as_failed(tmp_path):
     assert progress.best_iteration == 4
     assert trial.kept == [3, 4]
     assert [(r.iteration, r.evaluation_return) for r in trial.results][-2:] == [(4, 4.0), (5, None)]
+
+
+def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path):
+    class Engine(FakeEngine):
+        def train_iteration(self):
+            if self.iteration == 3:
+                tally_of("t0000").add(40, 2)
+                raise NonFiniteWeightsError("The gradients of an update are NaN or infinite.", "Lower lr.")
+            return super().train_iteration()
+
+    trial = Trial(tmp_path, engine=Engine(), evaluation={"every_iterations": 50}, hyperparams={"lr": 0.5, "gamma": 0.9})
+    progress = trial.run()
+    assert (progress.status, progress.iteration, progress.num_env_steps, progress.num_episodes) == ("failed", 3, 340, 5)
+    assert progress.error == "The gradients of an update are NaN or infinite.\nLower lr. (iteration 4, lr 0.5)"
+    trial.loop.flush()
+    assert [record.iteration for record in trial.results] == [1, 2, 3]
 
 
 def test_what_an_engine_raises_is_raised_and_what_was_done_is_written(tmp_path):
