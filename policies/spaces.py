@@ -88,7 +88,9 @@ def _bounds_from_json(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) 
 def _numbers_to_json(value: Any) -> Any:
     if isinstance(value, list):
         return [_numbers_to_json(item) for item in value]
-    return str(float(value)) if isinstance(value, float) and not math.isfinite(value) else value
+    if isinstance(value, np.floating):  # a long double, which no Python number holds
+        value = float(value)
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _numbers_from_json(value: Any) -> Any:

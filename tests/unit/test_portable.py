@@ -150,6 +150,7 @@ def test_transposed_weights_are_saved_as_what_they_are(tmp_path):
         gym.spaces.Box(np.array([-4.8, -np.inf], np.float32), np.array([np.inf, 0.1], np.float32)),
         gym.spaces.Box(-1e-300, 1e300, (3,), np.float64),
         gym.spaces.Box(-np.inf, np.inf, (3,), np.float32),
+        gym.spaces.Box(np.array([-1, 0.5], np.longdouble), np.array([np.inf, 1], np.longdouble), dtype=np.longdouble),
         gym.spaces.Box(0, 255, (4, 5, 3), np.uint8),
         gym.spaces.Box(np.array([[0, 0], [0, 1]], np.uint8), np.full((2, 2), 9, np.uint8), (2, 2), np.uint8),
         gym.spaces.Discrete(5),
