@@ -46,8 +46,8 @@ def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's sign
 
     SPEC is a sweep file or a preset; SWEEP is a sweep's name or folder.
 
-    Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials failed, 4 no such sweep, trial or
-    checkpoint, 5 cannot run here, 130 interrupted.
+    Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials or the best's confirmation failed, 4 no such
+    sweep, trial or checkpoint, 5 cannot run here, 130 interrupted.
     """
     ctx.meta[DEBUG] = debug
 
