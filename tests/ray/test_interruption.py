@@ -32,7 +32,7 @@ def read(folder: Path) -> list[dict]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("trials/*/trial.json"))]
 
 
-def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], limit_s: float = 180) -> None:
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], limit_s: float = 600) -> None:
     deadline = time.monotonic() + limit_s
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -40,7 +40,7 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], li
         time.sleep(0.05)
 
 
-def wait_until_gone(pid: int, limit_s: float = 60) -> None:
+def wait_until_gone(pid: int, limit_s: float = 600) -> None:
     """Until a trial's process has ended; one that nobody waits for is a zombie."""
     deadline = time.monotonic() + limit_s
     while (stat := Path(f"/proc/{pid}/stat")).exists() and stat.read_text().rpartition(")")[2].split()[0] not in "ZX":
@@ -68,7 +68,7 @@ def interrupted(tmp_path: Path, request: pytest.FixtureRequest):
     try:
         wait_until(second_has_checkpoints, process)
         process.send_signal(request.param)
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=600)
     finally:
         process.kill()
     return folder, process.returncode, out + err

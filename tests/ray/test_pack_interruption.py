@@ -34,7 +34,7 @@ def test_members_go_on_from_their_checkpoints(tmp_path, number):
     try:
         wait_until(lambda: len(list(folder.glob("trials/*/checkpoints/[0-9]*/manifest.json"))) >= 4, process)
         process.send_signal(number)
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=600)
     finally:
         process.kill()
     assert process.returncode == (-number if number == signal.SIGKILL else 130), out + err

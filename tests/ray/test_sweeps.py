@@ -69,7 +69,7 @@ def assert_results_without_gaps(store, trial):
     assert records[-1].num_env_steps == trial.num_env_steps
 
 
-def eventually(condition, timeout_s=120.0):
+def eventually(condition, timeout_s=600.0):
     """Wait until something is so. The time-out only keeps a broken test from waiting for ever."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -235,7 +235,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     # In a pack some would be tried again because others died.
     spec = make_spec(
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
-        iteration_timeout_s=12, engine="rllib",
+        iteration_timeout_s=25, engine="rllib",
     )  # fmt: skip
     told = {}
 
@@ -263,7 +263,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     hung = told["t0004"]
     assert hung.num_env_steps > 60 * FAST["num_envs"]
     first = hung.error.splitlines()[0]
-    assert "died: an iteration took longer than iteration_timeout_s (12 s). It hung at " in first
+    assert "died: an iteration took longer than iteration_timeout_s (25 s). It hung at " in first
     assert re.search(r"/tune_jobs_test_envs\.py:\d+ in _go_wrong\.$", first)
     store = SweepStore(result.folder)
     for trial in result.trials:

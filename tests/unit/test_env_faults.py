@@ -230,7 +230,7 @@ def test_a_signal_to_the_process_is_no_fault_of_the_env(tmp_path, name, code):
     paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
     child = subprocess.run(
         [sys.executable, "-c", CHILD, name], env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True,
-        timeout=120, check=False,
+        timeout=600, check=False,
     )  # fmt: skip
     assert child.returncode == code, child.stderr
     assert child.stdout == ("raised a\n" if name == "none" else "")

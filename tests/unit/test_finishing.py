@@ -148,7 +148,7 @@ def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path, arguments, wo
         [sys.executable, "-m", "tune_jobs.cli", *arguments],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},
-        capture_output=True, text=True, check=False, timeout=300,
+        capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
     assert words in json.loads(done.stdout)["error"]

@@ -43,7 +43,7 @@ def is_running(pid):
     return state not in "ZX"
 
 
-def until(condition, what, timeout_s=60.0):
+def until(condition, what, timeout_s=600.0):
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {what}"
@@ -257,7 +257,7 @@ def test_an_interrupted_parent_ends_its_child(tmp_path):
     try:
         child, _ = map(int, until(lambda: pids.exists() and pids.read_text().split(), "the env is reset"))
         parent.send_signal(signal.SIGINT)
-        out, _ = parent.communicate(timeout=60)
+        out, _ = parent.communicate(timeout=600)
     finally:
         parent.kill()
         parent.wait()

@@ -65,7 +65,7 @@ def test_a_hang_is_told_by_the_env_s_frame(tmp_path, kind):
             [sys.executable, "-c", HANG, kind],
             stdout=file,
             env={"PYTHONPATH": f"{tmp_path}:."},
-            timeout=120,
+            timeout=600,
             check=False,
         ).returncode  # fmt: skip
     assert code == 1

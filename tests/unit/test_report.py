@@ -355,7 +355,7 @@ def test_pressing_a_heading_sorts_the_table(typical, tmp_path):
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
     done = subprocess.run(
         [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path}/profile", "--dump-dom", copy.as_uri()],
-        capture_output=True, text=True, check=True, timeout=60,
+        capture_output=True, text=True, check=True, timeout=600,
     )  # fmt: skip
     rows = [row for row in Page(done.stdout).rows if re.fullmatch(r"t\d{4}", row[0])]
     scores = [float(row[5]) for row in rows[:-1]]
