@@ -20,6 +20,7 @@ from policies.hyperparams import ConstantHyperparams
 from policies.policy import Policy, RandomPolicy, load_policy, policy_from_portable
 from policies.portable import PolicyNetwork, read_policy, save_policy
 from tune_jobs.candidates import choose, leave_out, read_trials
+from tune_jobs.places import refuse_links_in
 from tune_jobs.seeds import confirmation_seeds
 from tune_jobs.spec_file import stored_spec
 from tune_jobs.storage import expanded, storage_folder
@@ -360,6 +361,7 @@ def make_report(store: SweepStore, why_no_best: TuneJobsError | None = None) -> 
         for key, name in (("before", "before.mp4"), ("after", "after.mp4"))
         if (path := store.best_folder / name).is_file()
     }
+    refuse_links_in(store.report_folder)  # which it writes to
     return build_report(
         store.folder,
         sweep=store.read_record(),

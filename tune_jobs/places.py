@@ -72,8 +72,8 @@ def refuse_link(path: Path) -> None:
         )
 
 
-def refuse_links_in(folder: Path) -> None:
-    """Check that neither a folder nor anything in it is a symbolic link; it need not be there.
+def refuse_links_in(folder: Path) -> Path:
+    """Return a folder, which need not be there, if neither it nor anything in it is a symbolic link.
 
     Raises:
         CheckpointError: Something is.
@@ -81,6 +81,7 @@ def refuse_links_in(folder: Path) -> None:
     refuse_link(folder)
     for path in folder.rglob("*"):
         refuse_link(path)
+    return folder
 
 
 def remove_folder(folder: Path) -> None:

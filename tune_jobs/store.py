@@ -22,7 +22,15 @@ from tune_jobs.locks import held, is_held
 from tune_jobs.logs import log_tail
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
 from tune_jobs.ownership import OwnedFolder
-from tune_jobs.places import check_trial_id, checkpoint_iteration, is_trial_id, refuse_link, remove_folder, within
+from tune_jobs.places import (
+    check_trial_id,
+    checkpoint_iteration,
+    is_trial_id,
+    refuse_link,
+    refuse_links_in,
+    remove_folder,
+    within,
+)
 from tune_jobs.record_files import dump, dump_sealed, read_record
 from tune_jobs.results_file import read_results
 
@@ -213,8 +221,8 @@ class SweepStore:
 
     @property
     def best_folder(self) -> Path:
-        """The winner's policy, its evaluation and films."""
-        return within(self.folder, "best")
+        """The winner's policy, its evaluation and films; without links."""
+        return refuse_links_in(self.folder / "best")
 
     @property
     def report_folder(self) -> Path:

@@ -41,14 +41,15 @@ CONTENTS = {
 
 def make_template(folder):
     """A sweep with every kind of file that there is."""
-    store = make_sweep_folder(folder)
+    store = make_sweep_folder(folder, iterations=6, seeds_per_point=1)
     change = ChangeRecord(
-        iteration=3, num_env_steps=300, source_trial_id="t0002", source_iteration=2, before={"lr": 0.1},
+        iteration=3, num_env_steps=300, source_trial_id="t0000", source_iteration=2, before={"lr": 0.1},
         after={"lr": 0.2}, time=1.0,
     )  # fmt: skip
     trial = store.trial("t0001")
-    trial.write_record(trial.read_record().model_copy(update={"changes": (change,)}))
+    trial.write_record(trial.read_record().model_copy(update={"changes": (change,), "notes": ("a line was damaged",)}))
     sweeps.best(folder, num_episodes=2)
+    store.write_record(store.read_record().model_copy(update={"allowed_modules": ("json",), "address": "auto"}))
     PackFiles(folder, "p00").write(Assignment(("t0000",), {"t0000": 1}))
     member = random_member("t0000", hidden_sizes=[4])
     member.moments = {name: {key: np.zeros_like(value) for key, value in member.weights.items()} for name in

@@ -9,6 +9,7 @@ import numpy as np
 import odd_files
 import pytest
 
+from policies import env_modules
 from policies.errors import TuneJobsError
 from policies.packed.state import load_member
 from policies.policy import load_policy
@@ -23,6 +24,11 @@ from tune_jobs.store import SweepStore
 @pytest.fixture(scope="module")
 def template(tmp_path_factory):
     return odd_files.make_template(tmp_path_factory.mktemp("template") / "mine")
+
+
+@pytest.fixture(autouse=True)
+def _no_modules_stay_allowed(monkeypatch):
+    monkeypatch.setattr(env_modules, "_allowed", set())
 
 
 @pytest.fixture
