@@ -168,6 +168,11 @@ class Range(_Domain):
             raise ValueError(f"goes from {low!r} to {high!r}: the first number must be less than the second")
         if self.is_log and low <= 0:
             raise ValueError(f"starts at {low!r}: a log scale needs a start greater than 0")
+        # Beyond these, what is drawn is not what was asked for, or an error of NumPy's.
+        if self.is_whole and max(-low, high) >= 2**63:
+            raise ValueError(f"goes from {low!r} to {high!r}: whole numbers are drawn below 2**63")
+        if not math.isfinite(high - low) or (self.q is not None and max(-low, high) > 2.0**53 * self.q):
+            raise ValueError(f"goes from {low!r} to {high!r}: that is wider than floats can be told apart")
         if self.q is not None:
             first, last = self.factors
             if first > last:

@@ -153,3 +153,19 @@ def test_points_are_what_they_always_were():
 
 def test_an_empty_space_is_one_point_a_sample():
     assert draw_points({}, 3, 0) == [{}, {}, {}]
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        {"randint": [1, 2**63]}, {"lograndint": [1, 10**39]}, {"qrandint": [-(10**30), 10, 5]},
+        {"uniform": [-1e308, 1e308]}, {"quniform": [0, 1e300, 1e-300]}, {"qloguniform": [1e-300, 1e300, 1e-300]},
+    ],
+)  # fmt: skip
+def test_a_range_that_nothing_can_be_drawn_from_is_refused(raw):
+    assert "goes from" in message(raw)
+    (kind,) = raw
+    # Half as wide, or nearly so, is drawn from.
+    narrow = {"randint": [1, 2**63 - 1], "lograndint": [1, 10**18], "qrandint": [-(10**12), 10, 5]}
+    floats = {"uniform": [-8e307, 8e307], "quniform": [0, 1e15, 1], "qloguniform": [1, 1e15, 1]}
+    assert all(low is not None for low in samples(domain(**{kind: {**narrow, **floats}[kind]}), 20))
