@@ -102,7 +102,8 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         allow_modules(reader.sweep.allowed_modules)
         self._is_scheduled = spec.scheduler.type != "none"
         self._engine = self.make_engine()
-        self._evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, reader.sweep.evaluation_seeds)
+        with watchdog(spec.iteration_timeout_s, self._file):
+            self._evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, reader.sweep.evaluation_seeds)
         return PackLoop(
             self._engine,
             self._evaluator,

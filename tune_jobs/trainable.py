@@ -236,7 +236,8 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         allow_modules(reader.sweep.allowed_modules)
         key = json.dumps([task.env_id, task.env_args, task.evaluation_seeds], sort_keys=True)
         if key not in self._evaluators:
-            self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
+            with watchdog(task.iteration_timeout_s, self._file):
+                self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
         self._grace = grace_env_steps(reader.spec.scheduler, reader.spec.stop.num_env_steps)
         if self._engine is None:
             # All trials of a sweep are of one algorithm, so this process never needs another engine.
