@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import FIFOScheduler, TrialScheduler
 
+from tune_jobs.candidates import candidates
 from tune_jobs.pack_files import Assignment, PackFiles
 from tune_jobs.pack_loop import MemberReport
 from tune_jobs.packs import PackPlan
@@ -232,7 +233,7 @@ class PackDriver:
 
     def _stopped(self, pack: _Pack, trial_id: str) -> None:
         """A member that was to be ended is gone without a word: its checkpoints are those on disk."""
-        checkpoints = tuple(self._store.trial(trial_id).checkpoints())
+        checkpoints = tuple(candidates(self._store.trial(trial_id)))
         self._keeper.change(trial_id, checkpoints=checkpoints)
         self._keeper.ended(trial_id)
         self._leave(pack, trial_id)

@@ -119,6 +119,8 @@ def test_who_is_ended_and_cannot_save_is_ended_all_the_same(tmp_path, how):
     driven.tell(t0000=(200, 9.0), t0001=(200, 1.0))
     saved = CheckpointRecord(trial_id="t0001", iteration=2, num_env_steps=200, evaluation_return=1.0)
     driven.store.trial("t0001").write_checkpoint(saved, lambda folder: None)
+    # A newer one that is damaged costs neither the record nor the driver.
+    driven.store.trial("t0001").checkpoint_folder(3).mkdir()
     if how == "fails":
         driven.tell(t0001=failure(1, retried=True))
     else:
