@@ -184,14 +184,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.kills", description=__doc__)
     parser.add_argument("--kills", type=int, default=26, help="how many")
     parser.add_argument("--seed", type=int, default=8, help="of the moments")
-    parser.add_argument("--only", default="", metavar="A-B", help="of them the numbers A to B alone")
+    parser.add_argument("--only", default="", metavar="A-B,C", help="of them those of these numbers alone")
     parser.add_argument("--gone", type=float, default=10.0, metavar="S", help="seconds for all processes to end")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the sweeps there")
     options = parser.parse_args(arguments)
     plan = make_plan(options.kills, options.seed)
     if options.only:
-        first, _, last = options.only.partition("-")
-        plan = [kill for kill in plan if int(first) <= kill.number <= int(last or first)]
+        ranges = [part.partition("-") for part in options.only.split(",")]
+        chosen = {number for first, _, last in ranges for number in range(int(first), int(last or first) + 1)}
+        plan = [kill for kill in plan if kill.number in chosen]
     print(
         f"{'no':>3}  {'engine':<6}  {'killed':<6}  {'while':<10}  {'after s':>9}  {'gone s':>6}  {'resume s':>8}  "
         f"{'checkpoints':<15}  verdict"
