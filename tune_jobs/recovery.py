@@ -5,15 +5,18 @@ Results that can't be read go to `results.damaged`, checkpoints and copies to `d
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import time
 from pathlib import Path
 
-from analysis.records import CheckpointRecord
-from policies.errors import CheckpointError, NotFoundError
+from analysis.records import FORMAT_VERSION, CheckpointRecord
+from policies.errors import NotFoundError
 from tune_jobs.places import within
+from tune_jobs.record_files import seal
 from tune_jobs.results_file import ResultsFile, read_results
-from tune_jobs.store import TrialStore, verify_checkpoint
+from tune_jobs.store import MANIFEST, TrialStore, verify_checkpoint
 
 DAMAGED_FOLDER = "damaged"
 DAMAGED_RESULTS = "results.damaged"
@@ -54,26 +57,29 @@ def take_up_checkpoints(trial: TrialStore) -> tuple[list[CheckpointRecord], list
 
     Returns:
         The checkpoints, oldest first, and what to tell of those that were set aside.
+
+    Raises:
+        CheckpointError: One is of a newer format, or cannot be read now: nothing says that it is damaged.
     """
     known: list[CheckpointRecord] = []
-    damaged: list[tuple[Path, Exception]] = []
+    damaged: list[tuple[Path, NotFoundError]] = []
     for iteration in trial.checkpoint_iterations():
         try:
             known.append(trial.checkpoint(iteration))
-        except (CheckpointError, NotFoundError) as error:
-            damaged.append((trial.checkpoint_folder(iteration), error))
+        except NotFoundError as error:
+            damaged.append((_damaged(trial.checkpoint_folder(iteration), error), error))
     while known:
         folder = trial.checkpoint_folder(known[-1].iteration)
         try:
             verify_checkpoint(folder)
             break
-        except (CheckpointError, NotFoundError) as error:
-            damaged.append((folder, error))
+        except NotFoundError as error:
+            damaged.append((_damaged(folder, error), error))
             known.pop()
     start = f"checkpoint {known[-1].iteration:06d}" if known else "its start: no older one is whole"
     notes = [
         f"checkpoint {folder.name} is damaged and kept as {set_aside(trial, folder)}; "
-        f"the trial goes on from {start}. {_message(error)}"
+        f"the trial goes on from {start}. {error.message}"
         for folder, error in damaged
     ]
     return known, notes
@@ -83,11 +89,11 @@ def take_up_copy(trial: TrialStore, folder: Path) -> tuple[Path | None, list[str
     """Another trial's checkpoint that this one goes on from, verified; None, and set aside, if it is damaged."""
     try:
         verify_checkpoint(folder)
-    except (CheckpointError, NotFoundError) as error:
-        target = set_aside(trial, folder, prefix="copied-")
+    except NotFoundError as error:
+        target = set_aside(trial, _damaged(folder, error), prefix="copied-")
         note = (
             f"the copied checkpoint {folder.name} is damaged and kept as {target}; the trial goes on from its own "
-            f"latest checkpoint, with the values it was given. {_message(error)}"
+            f"latest checkpoint, with the values it was given. {error.message}"
         )
         return None, [note]
     return folder, []
@@ -117,5 +123,17 @@ def latest_damaged(trial: TrialStore) -> int:
     return max((int(name) for name in names if name.isdecimal()), default=0)
 
 
-def _message(error: Exception) -> str:
-    return error.message if isinstance(error, CheckpointError | NotFoundError) else str(error)
+def _damaged(folder: Path, error: NotFoundError) -> Path:
+    """The checkpoint's folder, if what is wrong with it is damage.
+
+    Raises:
+        NotFoundError: It is not, or may pass.
+    """
+    if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError):
+        raise error
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        manifest = json.loads(within(folder, MANIFEST).read_bytes())
+        # A version beyond ours is no flipped bit if the seal holds.
+        if manifest["format_version"] > FORMAT_VERSION and manifest["sha256"] == seal(manifest):
+            raise error
+    return folder

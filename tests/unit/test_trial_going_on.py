@@ -1,17 +1,21 @@
 """How a trial goes on from what is on disk, and how it ends when something goes wrong."""
 
+import errno
 import json
 import math
 import shutil
+from pathlib import Path
 
 import pytest
 from fake_engine import FakeClock, FakeEngine
 from trial_runs import Trial
 
+from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError
 from policies.policy import NonFiniteWeightsError
 from policies.tallies import tally_of
 from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.record_files import seal
 from tune_jobs.recovery import latest_damaged
 from tune_jobs.store import SweepStore, TrialStore
 
@@ -381,3 +385,39 @@ def test_results_tell_all_that_an_iteration_gave(tmp_path):
     times = [line["time_s"] for line in lines]
     assert times == sorted(times)
     assert times[0] > 0
+
+
+def rewritten(folder, **changes):
+    """A manifest that says something else, with its seal."""
+    manifest = json.loads((folder / "manifest.json").read_text()) | changes
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"sha256": seal(manifest)}))
+
+
+def test_a_checkpoint_of_a_newer_version_is_not_damaged(tmp_path):
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
+    store = TrialStore(tmp_path, "t0000")
+    rewritten(store.checkpoint_folder(4), format_version=FORMAT_VERSION + 1)
+    with pytest.raises(CheckpointError, match="Upgrade tune-jobs"):
+        Trial(tmp_path)
+    assert store.checkpoint_iterations()[-1] == 4
+    # A bit of its version that flipped is damage.
+    manifest = store.checkpoint_folder(4) / "manifest.json"
+    manifest.write_text(manifest.read_text().replace(f": {FORMAT_VERSION + 1}", f": {FORMAT_VERSION + 2}"))
+    assert Trial(tmp_path).engine.builds == ["000003"]
+
+
+def test_a_checkpoint_that_cannot_be_read_now_is_not_set_aside(tmp_path, monkeypatch):
+    """A disk or a network that fails for a moment is no damage: the retry may find it whole."""
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
+    store, read = TrialStore(tmp_path, "t0000"), Path.read_bytes
+
+    def fails(path):
+        if path == store.checkpoint_folder(4) / "manifest.json":
+            raise OSError(errno.EIO, "Input/output error")
+        return read(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", fails)
+        with pytest.raises(CheckpointError, match="Input/output error"):
+            Trial(tmp_path)
+    assert Trial(tmp_path).engine.builds == ["000004"]
