@@ -158,6 +158,25 @@ def test_a_sweep_that_cannot_be_read_does_not_hide_the_others(folder, template, 
     assert "other/sweep.json" in caplog.text
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["../../x", "..", "/", "...", "a\0b", "\ud800", "~nobody-of-this-name/x", "x" * 5_000, "x/" + "y" * 300],
+    ids=lambda name: ascii(name)[:30],
+)
+@pytest.mark.parametrize(
+    "verb", ["status", "trials", "dataframe", "best", "report", "stop", "resume", "restore", "evaluate", "video"]
+)
+def test_a_sweep_is_called_anything(tmp_path, monkeypatch, verb, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(TuneJobsError):
+        getattr(sweeps, verb)(name)
+    with pytest.raises(TuneJobsError):
+        load_policy(name)
+    with contextlib.suppress(TuneJobsError):
+        sweeps.list_sweeps(name)
+    assert not list(tmp_path.iterdir())
+
+
 # -- weights
 
 
