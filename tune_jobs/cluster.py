@@ -13,6 +13,7 @@ import secrets
 import signal
 import socket
 import tempfile
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -95,7 +96,11 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
 
 @contextlib.contextmanager
 def _keeping_sigterm() -> Iterator[None]:
-    """Ray 2.60's `init` sets a handler for SIGTERM that ends the process at once."""
+    """Let SIGTERM do afterwards, and in the block, what it did before.
+
+    Ray 2.60's `init` sets a handler that ends the process at once. And its native code puts another one before Python's
+    (Abseil's, for failures): it calls Python's, and aborts the process 3 s later, whatever that is saving then.
+    """
     utils = ray._private.utils  # noqa: SLF001 (nothing public keeps it from that)
     original = utils.set_sigterm_handler
     utils.set_sigterm_handler = lambda _: None
@@ -103,6 +108,13 @@ def _keeping_sigterm() -> Iterator[None]:
         yield
     finally:
         utils.set_sigterm_handler = original
+        handler = signal.getsignal(signal.SIGTERM)
+        if threading.current_thread() is threading.main_thread() and handler is not None:
+            # For Python nothing has changed; it sets what the system calls anew all the same.
+            signal.signal(signal.SIGTERM, handler)
+            if current().came:
+                # It may have come while theirs was set.
+                signal.alarm(0)
 
 
 @contextlib.contextmanager

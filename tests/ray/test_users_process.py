@@ -32,7 +32,7 @@ def told(tmp_path_factory):
     [
         ("a launch", "exit code 0"),
         ("a bad spec", "SpecError: "),
-        ("Ctrl-C", "SweepInterrupted: "),
+        ("a signal", "SweepInterrupted: "),
         ("two threads", "exit code 0; CannotRunError: Another thread of this process is running a sweep"),
         ("too few CPUs", "CannotRunError: One trial needs 2 CPUs; the Ray that this process is connected to has 1."),
         ("another Ray", "CannotRunError: This process is connected to the Ray at "),
