@@ -130,7 +130,7 @@ def test_null_in_files_of_older_versions_is_nan(store):
     assert math.isnan(found.episode_returns[0])
     assert found.episode_returns[1] == 3.0
     assert found.learner == {"loss": None}
-    best = json.loads(SAMPLES[BestRecord].model_dump_json()) | {"selection_score": None}
+    best = json.loads(SAMPLES[BestRecord].model_dump_json()) | {"selection_score": None, "format_version": 1}
     best["confirmation"]["returns"][0] = None
     store.write_best(SAMPLES[BestRecord])
     (store.best_folder / "evaluation.json").write_text(json.dumps(best))
