@@ -192,7 +192,9 @@ class EnvGuard:
             "arguments": {"env_id": env_id, **arguments},
         }
         try:
-            child.connection.send_bytes(json.dumps(asked).encode())
+            # A child that has ended is found by what does not come back.
+            with contextlib.suppress(OSError):
+                child.connection.send_bytes(json.dumps(asked).encode())
             answer = self._wait(child, env_id, timeout_s)
         except BaseException:
             # Also where this process is interrupted: whatever the child does, nobody waits for it any more.
@@ -254,6 +256,8 @@ def _died(child: _Child, env_id: str) -> TuneJobsError:
     code = child.process.returncode
     how = "closed its connection" if code is None else f"ended with exit code {code}"
     hint = "Mend the env: it must raise an error, not end the process that it runs in."
+    if child.page.call is Call.NONE:
+        hint = "See what it printed to standard error."
     if code is not None and code < 0:
         name, said = _signal_name(-code), (signal.strsignal(-code) or "").lower()
         how = f"was ended by {name} ({said})" if said else f"was ended by {name}"

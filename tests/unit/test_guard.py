@@ -263,3 +263,13 @@ def test_an_interrupted_parent_ends_its_child(tmp_path):
         parent.wait()
     assert (parent.returncode, out) == (0, "interrupted\n")
     assert not is_running(child)
+
+
+def test_a_child_that_cannot_begin_is_told_as_that(monkeypatch):
+    monkeypatch.setattr("policies.guard._BOOTSTRAP", "raise SystemExit(9)")
+    with EnvGuard() as guard:
+        guard.start()
+        guard._child.process.wait()
+        with pytest.raises(EnvFailedError, match="ended with exit code 9") as caught:
+            guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
+    assert "printed" in caught.value.hint
