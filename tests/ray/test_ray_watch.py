@@ -1,0 +1,75 @@
+"""When a part of Ray counts as dead, and what then fails because of it."""
+
+import socket
+import threading
+
+import pytest
+
+pytestmark = pytest.mark.ray
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_a_part_is_dead_when_it_has_been_silent_for_long():
+    from tune_jobs.ray_processes import RayDiedError, RayWatch
+
+    clock, answers = Clock(), {"this": True, "that": True}
+    watch = RayWatch({name: lambda name=name: answers[name] for name in answers}, 10.0, clock)
+
+    def look(at):
+        clock.now = at
+        watch.look()
+        watch.check()
+
+    look(0.0)
+    answers["that"] = False
+    look(5.0)
+    look(14.9)
+    # It was started again: the time counts from the beginning.
+    answers["that"] = True
+    look(16.0)
+    answers["that"] = False
+    look(20.0)
+    look(29.0)
+    with pytest.raises(RayDiedError, match="that"):
+        look(30.0)
+
+
+def test_what_a_trial_raised_is_not_waited_for():
+    from ray.exceptions import RayTaskError
+
+    from tune_jobs.ray_processes import RayDiedError, RayWatch
+
+    watch = RayWatch({"it": lambda: False}, 0.2)
+    watch.check_after(RayTaskError("step", "Traceback", ValueError("of the env")))
+    with pytest.raises(RayDiedError, match="it"):
+        watch.check_after(RuntimeError("of Ray"))
+    assert not issubclass(RayDiedError, Exception)
+
+
+def test_it_looks_by_itself_and_ends_with_its_block():
+    from tune_jobs.ray_processes import RayDiedError, RayWatch, _answers
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = server.getsockname()
+        assert _answers(socket.AF_INET, address)
+    looked = threading.Event()
+
+    def probe():
+        looked.set()
+        return _answers(socket.AF_INET, address)
+
+    with RayWatch({"it": probe}, 0.05) as watch:
+        assert looked.wait(60)
+        watch._thread.join(60)  # it has seen enough
+        with pytest.raises(RayDiedError):
+            watch.check()
+    with RayWatch({"it": lambda: True}, 0.05) as watch:
+        pass
+    watch._thread.join(60)
+    assert not watch._thread.is_alive()
