@@ -9,10 +9,11 @@ from spec_errors import MINIMAL, errors
 from policies import guarded
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import make_hyperparams
-from tune_jobs.driving import check_same_trials, pending_record, write_new
+from tune_jobs.driving import pending_record, write_new
 from tune_jobs.machine import Machine
 from tune_jobs.packs import pack_key, why_not_packed
 from tune_jobs.plan import make_plan
+from tune_jobs.resuming import check_same_trials
 from tune_jobs.spec_file import load_spec
 from tune_jobs.store import SweepStore
 

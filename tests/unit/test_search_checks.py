@@ -5,9 +5,10 @@ from spec_errors import MINIMAL, errors
 
 from analysis.records import ChangeRecord
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.driving import check_same_trials, pending_record, write_new
+from tune_jobs.driving import pending_record, write_new
 from tune_jobs.machine import Machine
 from tune_jobs.plan import make_plan
+from tune_jobs.resuming import check_same_trials
 from tune_jobs.spec_file import load_spec
 from tune_jobs.store import SweepStore
 
