@@ -4,8 +4,10 @@ import json
 import math
 
 import pytest
+from fake_engine import FakeEngine
 from fake_sweeps import Result, Status
 from synthetic_sweep import make_sweep
+from trial_runs import Trial
 
 from analysis.report import build_report
 from analysis.tables import groups_frame, iterations_frame, steps_to_solve_frame, trials_frame
@@ -84,3 +86,27 @@ def test_the_running_sweep_is_shown_and_written_for_tensorboard(made, tmp_path):
         writer.write(trial, evaluated=True)
     writer.flush()
     assert list(tmp_path.glob("trials/*/tensorboard/*"))
+
+
+def test_a_trial_with_returns_of_nan_and_infinity_goes_on_and_is_reported(tmp_path):
+    def episodes(iteration):
+        return (VALUES[iteration % 4], 1.0)
+
+    def score(iteration):
+        return VALUES[iteration % 3] if iteration % 2 else float(iteration)
+
+    first = Trial(tmp_path, engine=FakeEngine(episodes, raise_at=8), scores=score)
+    with pytest.raises(ZeroDivisionError):
+        first.run()
+    again = Trial(tmp_path, engine=FakeEngine(episodes), scores=score, stop={"num_iterations": 12})
+    progress = again.run()
+    assert (progress.status, progress.iteration, progress.best_evaluation_return) == ("completed", 12, 12.0)
+    results = again.results
+    assert [record.iteration for record in results] == list(range(1, 13))
+    assert repr([record.episode_returns[0] for record in results]) == repr([VALUES[i % 4] for i in range(1, 13)])
+    made = make_sweep(points=[{"lr": 0.1}])
+    report = build_report(
+        tmp_path, sweep=made.sweep, trials=made.trials, results={"t0000": results}, best=made.best, videos={}
+    )
+    assert report.is_file()
+    assert len(iterations_frame({"t0000": results})) == 12

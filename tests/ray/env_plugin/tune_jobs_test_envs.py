@@ -4,6 +4,7 @@ They are in a folder of their own, so that worker processes can import them from
 """
 
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -50,9 +51,10 @@ class Trouble(gym.Env):
     """A question a step (is the first number positive?), ten steps an episode; in some trials its step goes wrong.
 
     Args:
-        troubles: First seed of a trial, as text -> what happens there: `how` (`raise`, `hang`, or `exit`: the process
-            dies), `at` (which step of this environment's life, over all its episodes) and `marker` (a file that is
-            made when it happens; where it is there already, all is well).
+        troubles: First seed of a trial, as text -> what happens there: `how` (`raise`, `hang`, `exit`: the process
+            dies, `SystemExit`: it is raised, or `nan`, `inf`, `-inf`: that is the reward), `at` (which step of this
+            environment's life, over all its episodes) and `marker` (a file that is made when it happens; where it is
+            there already, all is well).
         pause_s: Seconds that every step takes, in any trial.
     """
 
@@ -77,23 +79,29 @@ class Trouble(gym.Env):
     def step(self, action):
         self.life += 1
         self.ticks += 1
+        reward = None
         if self.trouble is not None and self.life >= self.trouble.get("at", 1):
-            self._go_wrong(**self.trouble)
+            reward = self._go_wrong(**self.trouble)
         if self.pause_s:
             time.sleep(self.pause_s)
-        reward = float(action == (self.state[0] > 0))
+        if reward is None:
+            reward = float(action == (self.state[0] > 0))
         self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
         return self.state, reward, self.ticks >= 10, False, {}
 
     def _go_wrong(self, how, at=1, marker=None):
         if marker is not None:
             if Path(marker).exists():
-                return
+                return None
             Path(marker).touch()
         if how == "raise":
             raise ZeroDivisionError("the cart left the track")
         if how == "exit":
             os._exit(1)
+        if how == "SystemExit":
+            sys.exit("the cart has had enough")
+        if how in ("nan", "inf", "-inf"):
+            return float(how)
         # Not for ever, or a test of a broken watchdog would never end.
         time.sleep(120)
         raise TimeoutError("nothing ended the process")
