@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import platform
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
@@ -241,6 +242,16 @@ def _run_trials(
                 # Before Ray is shut down: where a part of it died, that takes long, and may end this process.
                 with current().shielded(), run.held():
                     _close(store, started)
+
+
+def end_process(store: SweepStore, error: CannotRunError) -> NoReturn:
+    """Write down how the run ended, say why, and end this process as it stands; from any thread."""
+    from tune_jobs.live import say_at_last
+
+    with contextlib.suppress(TuneJobsError):
+        _close(store)
+    say_at_last(f"error: {error}")
+    os._exit(error.exit_code)
 
 
 @contextlib.contextmanager

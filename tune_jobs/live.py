@@ -208,6 +208,17 @@ class _PatientStream(io.TextIOWrapper):
             super().close()
 
 
+_shown_on: list[_PatientStream] = []
+"""Where standard error leads to, while it is sent to a file."""
+
+
+def say_at_last(text: str) -> None:
+    """Tell something on the real standard error, from a process that ends now."""
+    for stream in _shown_on[-1:]:
+        stream.write(f"{text}\n")
+        stream.flush()
+
+
 @contextlib.contextmanager
 def quiet(log: Path) -> Iterator[IO[str]]:
     """Send standard output and error to a file, C++ included; gives a stream to the real standard error."""
@@ -215,6 +226,8 @@ def quiet(log: Path) -> Iterator[IO[str]]:
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(log.open("ab"))
         stream = stack.enter_context(_PatientStream(os.fdopen(os.dup(2), "wb"), encoding="utf-8"))
+        _shown_on.append(stream)
+        stack.callback(_shown_on.remove, stream)
         stack.enter_context(_elsewhere(1, file))
         stack.enter_context(_elsewhere(2, file))
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import signal
 import socket
 import threading
@@ -16,12 +17,16 @@ from typing import Any, Self
 import ray
 from ray.exceptions import RayTaskError
 
+from policies.errors import CannotRunError
 from tune_jobs.interruption import current
 
 _CONNECT_TIMEOUT_S = 5.0
 # A control process that a cluster's operator starts again may take a little. Ray 2.60 ends a process that has not
 # reached it for a minute, whatever that process still wants to save.
 _OWN_GRACE_S, _CLUSTER_GRACE_S = 4.0, 15.0
+
+# Who is told so leaves the block at once, unless it waits in a native call that only Ray could end.
+_STUCK_S = 20.0
 
 _CONTROL, _RAYLET = "control process (GCS)", "process on this node (raylet)"
 
@@ -58,6 +63,19 @@ class RayDiedError(BaseException):
     """A part of Ray is gone; no Exception, or Ray Tune would tidy up first, and wait for Ray in that."""
 
 
+def ray_died(sweep: str, death: RayDiedError) -> CannotRunError:
+    """What is told of it.
+
+    Args:
+        sweep: The sweep's name.
+        death: What died.
+    """
+    return CannotRunError(
+        f"Ray's {death} died, or does not answer any more: no trial can be run on it.",
+        f"Did the machine run out of memory? What is done is kept; go on with `tune-jobs resume {shlex.quote(sweep)}`.",
+    )
+
+
 class RayWatch:
     """Notices in the background that a part of Ray does not answer any more; a context manager.
 
@@ -65,15 +83,22 @@ class RayWatch:
         probes: Whether a part answers, by its name.
         grace_s: After so many seconds without an answer it is dead.
         clock: Seconds, monotonic.
+        stuck_s: After so many more the block is stuck.
     """
 
     def __init__(
-        self, probes: Mapping[str, Callable[[], bool]], grace_s: float, clock: Callable[[], float] = time.monotonic
+        self,
+        probes: Mapping[str, Callable[[], bool]],
+        grace_s: float,
+        clock: Callable[[], float] = time.monotonic,
+        stuck_s: float = _STUCK_S,
     ) -> None:
-        self._probes, self._grace_s, self._clock = dict(probes), grace_s, clock
+        self._probes, self._grace_s, self._clock, self._stuck_s = dict(probes), grace_s, clock, stuck_s
         self._silent_since: dict[str, float] = {}
         self._dead: str | None = None
         self._over = threading.Event()
+        self.when_stuck: Callable[[RayDiedError], None] | None = None
+        """Called in the background if the block goes on though a part is dead: Ray would end the process soon."""
         self._thread = threading.Thread(target=self._run, name="tune-jobs-ray-watch", daemon=True)
 
     @classmethod
@@ -140,6 +165,8 @@ class RayWatch:
         # Not more often: a raylet writes a line into its log whenever somebody asks and leaves.
         while self._dead is None and not self._over.wait(self._grace_s / 4):
             self.look()
+        if self._dead is not None and not self._over.wait(self._stuck_s) and self.when_stuck is not None:
+            self.when_stuck(RayDiedError(self._dead))
 
 
 def _answers(family: int, address: tuple[str, int] | str) -> bool:

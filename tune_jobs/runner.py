@@ -6,7 +6,7 @@ Tune decides which trial runs where and when; what a trial is and how far it got
 
 from __future__ import annotations
 
-import shlex
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
 from analysis.records import CheckpointRecord
-from policies.errors import CannotRunError, TuneJobsError
+from policies.errors import TuneJobsError
 from policies.parents import this_process
 from tune_jobs.copies import remove_uncounted_copies
 from tune_jobs.interruption import current
@@ -33,7 +33,7 @@ from tune_jobs.places import remove_folder, within
 from tune_jobs.population import PopulationScheduler
 from tune_jobs.progress import Progress
 from tune_jobs.ray_environment import prepare_environment
-from tune_jobs.ray_processes import RayDiedError, RayWatch
+from tune_jobs.ray_processes import RayDiedError, RayWatch, ray_died
 from tune_jobs.record_keeper import Listener, RecordKeeper
 from tune_jobs.schedulers import build_scheduler, waits_for_others
 from tune_jobs.searcher import PointChooser, PointSearcher
@@ -85,6 +85,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     others = [name for name in job.trial_ids if name not in set(packed)]
     with RayWatch.of_this_process() as watch:
         run = _Run(job, store, listener, owner, watch)
+        watch.when_stuck = functools.partial(_give_up, run)
         try:
             if packed:
                 run.packs(packed)
@@ -93,12 +94,12 @@ def run_trials(job: RunJob, listener: Listener) -> None:
                 run.single_trials(others)
         except (RayDiedError, Exception) as error:
             if isinstance(error, RayDiedError):
-                raise _ray_died(store, error) from error
+                raise ray_died(store.name, error) from error
             # What Ray raises when a part of it is gone says little of it.
             try:
                 watch.check_after(error)
             except RayDiedError as death:
-                raise _ray_died(store, death) from error
+                raise ray_died(store.name, death) from error
             raise
         finally:
             with current().shielded():
@@ -111,7 +112,7 @@ class _Run:
     def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Owner, watch: RayWatch) -> None:
         self._job = job
         self._watch = watch
-        self._store = store
+        self._store = self.store = store
         # What each process is told: which sweep, for which run, and who is gone when it is to end.
         self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
         self._spec = stored_spec(store.read_record())
@@ -349,12 +350,15 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
         return {}
 
 
-def _ray_died(store: SweepStore, death: RayDiedError) -> CannotRunError:
-    return CannotRunError(
-        f"Ray's {death} died, or does not answer any more: no trial can be run on it.",
-        "Did the machine run out of memory? What is done is kept; go on with "
-        f"`tune-jobs resume {shlex.quote(store.name)}`.",
-    )
+def _give_up(run: _Run, death: RayDiedError) -> None:
+    """Save, and end this process: its main thread waits for Ray, which would end it in less than a minute.
+
+    In the background, as the main thread can't; that one changes nothing meanwhile.
+    """
+    from tune_jobs.driving import end_process
+
+    run.keeper.close()
+    end_process(run.store, ray_died(run.store.name, death))
 
 
 def _error_of(trial: Trial) -> BaseException | None:

@@ -52,6 +52,20 @@ def test_what_a_trial_raised_is_not_waited_for():
     assert not issubclass(RayDiedError, Exception)
 
 
+def test_a_block_that_goes_on_is_stuck():
+    from tune_jobs.ray_processes import RayWatch
+
+    told, deaths = threading.Event(), []
+    with RayWatch({"it": lambda: False}, 0.05, stuck_s=0.05) as watch:
+        watch.when_stuck = lambda death: (deaths.append(str(death)), told.set())
+        assert told.wait(60)
+    assert deaths == ["it"]
+    with RayWatch({"it": lambda: False}, 0.05, stuck_s=3600) as watch:
+        watch.when_stuck = lambda death: deaths.append("too early")
+    watch._thread.join(60)
+    assert deaths == ["it"]
+
+
 def test_it_looks_by_itself_and_ends_with_its_block():
     from tune_jobs.ray_processes import RayDiedError, RayWatch, _answers
 
