@@ -31,7 +31,7 @@ def told(tmp_path_factory):
     ("what", "came_of_it"),
     [
         ("a launch", "exit code 0"),
-        ("a bad spec", "SpecError: "),
+        ("a bad spec", "WrongSpecError: sweep: algorithm: 'sac'"),
         ("a signal", "SweepInterrupted: "),
         ("two threads", "exit code 0; CannotRunError: Another thread of this process is running a sweep"),
         ("too few CPUs", "CannotRunError: One trial needs 2 CPUs; the Ray that this process is connected to has 1."),
