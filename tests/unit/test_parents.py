@@ -1,5 +1,6 @@
 """Processes end with the one that started them, killed or not, whatever they are doing."""
 
+import contextlib
 import os
 import select
 import signal
@@ -15,10 +16,10 @@ from policies.parents import is_gone, this_process
 BUSY = "pow(3, 10**10)"
 WAITING = "time.sleep(3600)"
 CHILD = """
-import sys, time
+import os, sys, time
 from policies.parents import end_with_parent
 end_with_parent({arguments})
-print("up", flush=True)
+print(os.getpid(), flush=True)
 {work}
 """
 PARENT = """
@@ -32,8 +33,8 @@ def ends_with_its_parent(arguments, work):
     """Start a process and in it a child; kill it when the child is up; wait until the child has ended too."""
     child = CHILD.format(arguments=arguments, work=work)
     parent = subprocess.Popen([sys.executable, "-c", PARENT, child], stdout=subprocess.PIPE)
+    pid = int(parent.stdout.readline())
     try:
-        assert parent.stdout.readline() == b"up\n"
         # The pipe is the child's too: it is closed when both have ended.
         parent.send_signal(signal.SIGKILL)
         parent.wait()
@@ -41,6 +42,9 @@ def ends_with_its_parent(arguments, work):
         return bool(ready) and parent.stdout.read() == b""
     finally:
         parent.kill()
+        # If it did not end by itself, it must not go on for ever either.
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
         parent.stdout.close()
 
 
@@ -59,7 +63,7 @@ def test_a_process_ends_once_a_condition_holds_and_one_that_raises_is_none(tmp_p
     code = CHILD.format(arguments=arguments, work=WAITING)
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
-        assert process.stdout.readline() == b"up\n"
+        assert int(process.stdout.readline()) == process.pid
         assert process.poll() is None
         file.touch()
         assert process.wait(60) == 1
