@@ -233,7 +233,9 @@ def stop_when(store, condition):
 
 def test_a_stopped_run_pauses_all_and_goes_on_where_it_was(tmp_path):
     store = make_sweep(tmp_path / "mine", 7, stop={"num_env_steps": 100_000})
-    thread = stop_when(store, lambda: any(store.trial("t0003").checkpoints()))
+    # Both packs begin when their processes are up, one perhaps long before the other.
+    first = [store.trial(f"t{index:04d}") for index in range(4)]
+    thread = stop_when(store, lambda: all(trial.checkpoint_iterations() for trial in first))
     records = run_packs(store, slots=2, pause_s=0.02)
     thread.join()
     assert [record.status for record in records] == ["paused"] * 4 + ["pending"] * 3
