@@ -19,13 +19,15 @@ from policies.tallies import only_tally
 
 _LARGEST = float(np.finfo(np.float32).max)
 """Learners compute in 32 bits: what is larger is infinite to them."""
+_LARGEST_32 = np.finfo(np.float32).max
+"""The same with its precision, or numbers of 16 bits would be compared with infinity."""
 _HINT = "Mend the env: training on it would ruin the weights."
 
 
 def is_sound(values: NDArray[Any]) -> bool:
     """Whether all numbers are finite, in 32 bits too."""
     # NaN is not <= anything.
-    return values.dtype == np.uint8 or bool((np.abs(values) <= _LARGEST).all())
+    return values.dtype == np.uint8 or bool((np.abs(values) <= _LARGEST_32).all())
 
 
 def check_reward(reward: float, env_id: str, num_steps: int) -> None:
@@ -59,7 +61,7 @@ def check_observation(observation: Any, env_id: str, num_steps: int) -> None:
     values = np.asarray(observation)
     if is_sound(values):
         return
-    place = int(np.flatnonzero(~(np.abs(values) <= _LARGEST))[0])
+    place = int(np.flatnonzero(~(np.abs(values) <= _LARGEST_32))[0])
     which = f"after env step {num_steps}" if num_steps else "from reset(), at the beginning"
     raise EnvFailedError(
         f"The observation {which} of an episode of {env_id} was {_name(float(values.flat[place]))} (number {place} of "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import venv
@@ -57,3 +58,18 @@ def test_a_sweep_from_launch_to_report(installed: Path, tmp_path: Path) -> None:
     report = tmp_path / "sweeps" / "cartpole-ppo" / "report" / "index.html"
     assert report.stat().st_size > 100_000
     assert (report.parents[1] / "best" / "after.mp4").is_file()
+
+
+def test_a_project_with_folders_of_our_names(installed: Path, tmp_path: Path) -> None:
+    """A script beside `policies` and `analysis`, and the command in that folder: both projects' modules are found."""
+    shutil.copytree(ROOT / "tests" / "ray" / "project", tmp_path, dirs_exist_ok=True)
+    python, program = str(installed / "python"), str(installed / "tune-jobs")
+    assert call([python, "train.py", "packed"], tmp_path).split() == ["packed", "completed", "completed", "1.0"]
+    (tmp_path / "walk.yaml").write_text(
+        "env: policies.walk:Walk\nalgorithm: ppo\nspace: {lr: {grid: [0.001]}}\nstop: {num_env_steps: 2048}\n"
+        "evaluation: {num_episodes: 2}\n"
+    )
+    done = call([program, "launch", "walk.yaml", "--allow-module", "policies.walk", "--json"], tmp_path)
+    assert [trial["status"] for trial in json.loads(done)["trials"]] == ["completed"]
+    for command in (["report", "packed"], ["evaluate", "packed", "--allow-module", "policies.walk"]):
+        call([program, *command], tmp_path)

@@ -16,7 +16,7 @@ from test_packed_env_failures import go_on
 from test_packed_envs import assert_equal_bits, make, own_modules, seen_by
 
 from policies import env_faults
-from policies.checked_envs import CheckedEnvs
+from policies.checked_envs import CheckedEnvs, is_sound
 from policies.envs import make_env, make_vector_env
 from policies.errors import EnvError
 from policies.evaluate import Evaluator, evaluate_policy
@@ -240,3 +240,11 @@ def test_ctrl_c_in_the_process_of_whoever_launched_is_ctrl_c(monkeypatch):
     monkeypatch.setattr(env_faults, "_notes_signals", False)
     with pytest.raises(KeyboardInterrupt):
         evaluate_policy(make_policy(FAULTY), env_id=FAULTY, env_args={"raises": "KeyboardInterrupt"}, seeds=[5])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
+def test_numbers_are_looked_at_in_every_precision(dtype):
+    assert is_sound(np.array([-1, np.finfo(np.float16).max], dtype))
+    for value in (np.nan, np.inf, -np.inf):
+        assert not is_sound(np.array([0, value], dtype))
