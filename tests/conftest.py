@@ -1,12 +1,20 @@
 """One Ray for all tests here, and a package of test environments that its worker processes find too."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
 PLUGIN = Path(__file__).parent / "ray" / "env_plugin"
+
+# Under nohup, or in a shell's background, signals are ignored, here and in what is started here. Tests of signals need
+# processes that get them: those that are started find the default in the place of a handler.
+if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
