@@ -39,8 +39,14 @@ $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
+# In two processes, for two cores: the tests that start Ray have one Ray between them, the others need none. What the
+# others print, skipped tests with their reasons too, comes when both are done.
+WITH_RAY := tests/cluster tests/learning tests/ray
 test: $(VENV)/installed-test lint types
-	$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest $(addprefix --ignore=,$(WITH_RAY)) > $(VENV)/tests-without-ray.log 2>&1 & others=$$!; \
+	$(BIN)/python -m pytest $(WITH_RAY); with_ray=$$?; \
+	wait $$others; without_ray=$$?; cat $(VENV)/tests-without-ray.log; \
+	exit $$((with_ray || without_ray))
 
 lint: $(VENV)/installed-test
 	$(BIN)/ruff check .
