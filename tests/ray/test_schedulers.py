@@ -1,9 +1,11 @@
-"""Early stopping by Ray Tune's schedulers, on trials whose scores are scripted."""
+"""Early stopping by Ray Tune's schedulers, on trials whose scores are scripted, and in a whole sweep."""
 
 import pytest
 from scripted_trials import run_scripted
+from test_sweeps import assert_results_without_gaps, launch, make_spec
 
 from tune_jobs.spec import SchedulerSpec
+from tune_jobs.store import SweepStore
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -45,3 +47,39 @@ def test_a_trial_without_a_finite_score_never_runs_on(tmp_path, kind):
     steps = run_scripted(tmp_path, spec(kind), scores, max_env_steps=1600, evaluate_every=2)
     assert [steps[0], steps[4], steps[5]] == [200, 200, 200]
     assert max(steps) == 1600
+
+
+@pytest.mark.parametrize("scheduler", ["asha", "hyperband", "median"])
+def test_every_scheduler_runs_to_the_end(tmp_path, scheduler):
+    """One learning rate learns, the others cannot: as many trials as it takes to compare."""
+    # HyperBand ends half of its first bracket at the first rung, where nothing is learned yet after 256 env steps.
+    grace = 768 if scheduler == "hyperband" else 256
+    spec = make_spec(
+        space={"lr": {"grid": [1e-2, 1e-7, 2e-7, 3e-7, 4e-7, 5e-7]}},
+        num_samples=1,
+        stop={"num_env_steps": 2_560},
+        scheduler={"type": scheduler, "grace_env_steps": grace, "reduction_factor": 2},
+        evaluation={"every_iterations": 2, "num_episodes": 10},
+    )
+    result = launch(tmp_path, spec, finish=False)
+    statuses = [trial.status for trial in result.trials]
+    assert set(statuses) <= {"completed", "stopped"}
+    assert (result.exit_code, result.sweep.state) == (0, "completed")
+    store = SweepStore(result.folder)
+    for trial in result.trials:
+        assert_results_without_gaps(store, trial)
+        if trial.status == "stopped":
+            assert trial.stop_reason.startswith("scheduler, at ")
+            assert grace <= trial.num_env_steps < 2_560
+            # What it reached counts: a stopped trial may still be the best.
+            assert trial.best_evaluation_return is not None
+            assert trial.checkpoints
+        else:
+            assert trial.num_env_steps >= 2_560
+            assert trial.stop_reason.startswith("num_env_steps")
+        assert trial.ended_at is not None
+    assert "completed" in statuses
+    if scheduler in ("asha", "hyperband"):
+        assert "stopped" in statuses
+    # Without a reason to stop it, the one that learns goes on to the end.
+    assert result.trials[0].status == "completed"
