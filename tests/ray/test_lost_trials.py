@@ -10,6 +10,7 @@ from scripted_packs import make_sweep
 
 from policies.errors import CheckpointError
 from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.ray_processes import RayWatch
 from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.runner import RunJob, _TrialEvents, run_trials
 from tune_jobs.trainable import TrialTrainable
@@ -28,7 +29,8 @@ def tune_trial(folder, trial_id, cause):
 def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path, event):
     store = make_sweep(tmp_path / "mine", 2)
     keeper = RecordKeeper(store, ["t0000", "t0001"], lambda record: None)
-    events = _TrialEvents(store, keeper, timeout_s=600.0)
+    # Of a Ray that lives: no part of it is silent.
+    events = _TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0))
     for trial_id, cause in (("t0000", OwnershipLostError("taken")), ("t0001", ValueError("broke"))):
         keeper.started(trial_id)
         getattr(events, event)(0, [], tune_trial(tmp_path, trial_id, cause))
