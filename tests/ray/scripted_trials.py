@@ -32,7 +32,7 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
             count = 1 + (int(path.read_text()) if path.exists() else 0)
             path.write_text(str(count))
             self._grace = grace
-            score = scores[int(self._trial[1])]
+            score = scores[int(self._trial[1].removeprefix("t"))]
             evaluated = count % evaluate_every == 0
             progress = Progress(
                 iteration=count, num_env_steps=count * steps, num_episodes=count, time_s=1.0, training_return=None,
@@ -46,7 +46,7 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
         tune.with_resources(Scripted, {"CPU": 1}),
         param_space={
             "sweep_folder": str(folder),
-            "trial_id": tune.grid_search([str(index) for index in range(len(scores))]),
+            "trial_id": tune.grid_search([f"t{index:04d}" for index in range(len(scores))]),
         },
         tune_config=tune.TuneConfig(
             scheduler=build_scheduler(scheduler, max_env_steps),
@@ -58,4 +58,4 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
         ),
         run_config=tune.RunConfig(name="run", storage_path=str(folder / "tune"), verbose=0),
     ).fit()
-    return [int((folder / f"{index}.txt").read_text()) * STEPS for index in range(len(scores))]
+    return [int((folder / f"t{index:04d}.txt").read_text()) * STEPS for index in range(len(scores))]
