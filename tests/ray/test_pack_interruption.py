@@ -44,6 +44,7 @@ def test_members_go_on_from_their_checkpoints(tmp_path, number):
         # On a busy machine one pack may not have begun yet: its members have nothing to save.
         begun = [record for record in before if record["checkpoints"]]
         assert begun
+        assert [record["num_iterations"] for record in before if not record["checkpoints"]] == [0] * (5 - len(begun))
         assert {record["status"] for record in begun} == {"paused"}
         assert {record["status"] for record in before} <= {"paused", "pending"}
         assert all(record["checkpoints"][-1]["iteration"] == record["num_iterations"] for record in begun)
