@@ -30,6 +30,37 @@ def is_sound(values: NDArray[Any]) -> bool:
     return values.dtype == np.uint8 or bool((np.abs(values) <= _LARGEST_32).all())
 
 
+def reward_as_number(reward: Any) -> float:
+    """A reward as the number that it is, or that is the only one of an array or a list, of any shape.
+
+    Raises:
+        TypeError: It is no number.
+        ValueError: It is not one number.
+    """
+    if isinstance(reward, np.ndarray | list | tuple):
+        # From NumPy 2.4 on, float() takes arrays without dimensions alone.
+        reward = np.asarray(reward).item()
+    return float(reward)
+
+
+class PlainSteps(gym.Wrapper[Any, Any, Any, Any]):
+    """A sub-environment for a vector of them: its rewards are plain numbers, and it tells no infos.
+
+    Nobody here reads infos, but Gymnasium makes arrays of them: it fails where those of two environments have other
+    types or shapes, or a number has more than 64 bits.
+    """
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment."""
+        observation, _ = self.env.reset(seed=seed, options=options)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment."""
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return observation, reward_as_number(reward), terminated, truncated, {}
+
+
 def check_reward(reward: float, env_id: str, num_steps: int) -> None:
     """Refuse a reward that is not finite.
 

@@ -23,6 +23,7 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from policies import calls
 from policies.calls import Call
+from policies.checked_envs import PlainSteps
 from policies.env_faults import close_env, is_of_env
 from policies.env_ids import find_env, normalize_env_id
 from policies.env_wrappers import FailurePenalty, ObservationWrappers
@@ -184,7 +185,7 @@ def make_vector_env(
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
                 env = gym.make_vec(
                     spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
-                    wrappers=(wrappers.wrap_pixels,), **kwargs,
+                    wrappers=(wrappers.wrap_pixels, PlainSteps), **kwargs,
                 )  # fmt: skip
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
@@ -275,7 +276,7 @@ def _check_limit(env_id: str, limit: Any) -> None:
 
 
 def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
-    """Whether the env has a vectorised version that accepts these arguments and the env's time limit."""
+    """Whether the env has a vectorised version that accepts these arguments and its time limit, and resets as ours."""
     # A vector entry point would leave out wrappers of the registry entry, and a time limit it does not take.
     if spec.vector_entry_point is None or spec.additional_wrappers:
         return False
@@ -286,9 +287,11 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
         entry_point = spec.vector_entry_point
         creator = entry_point if callable(entry_point) else load_env_creator(entry_point)
         inspect.signature(creator).bind(num_envs=1, **kwargs)
+        # A loop over envs resets as everybody here expects; the same name as a text is allowed too.
+        mode = (getattr(creator, "metadata", None) or {}).get("autoreset_mode", gym.vector.AutoresetMode.NEXT_STEP)
+        return bool(gym.vector.AutoresetMode(mode) is gym.vector.AutoresetMode.NEXT_STEP)
     except (ImportError, AttributeError, TypeError, ValueError):
         return False
-    return True
 
 
 def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:

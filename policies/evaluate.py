@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.checked_envs import check_observation, check_reward, is_sound
+from policies.checked_envs import check_observation, check_reward, is_sound, reward_as_number
 from policies.env_faults import close_env, env_failed
 from policies.envs import make_env, make_vector_env
 from policies.errors import EnvError, EnvFailedError, SpecError
@@ -283,7 +283,7 @@ class _Running:
         try:
             self.observation, reward, terminated, truncated, _ = self.env.step(action)
             self.length += 1
-            reward = float(reward)
+            reward = reward_as_number(reward)
             self.total += reward
         except BaseException as error:  # an env may raise anything
             raise self._env_failed("step", error) from error

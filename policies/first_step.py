@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from policies.checked_envs import is_sound, reward_as_number
 from policies.env_faults import env_failed
 from policies.errors import EnvError
 
@@ -131,12 +132,15 @@ def _reward_problem(reward: Any) -> str | None:
         return f"{reward!r} as reward, not a number"
     try:
         array = np.asarray(reward)
+        number = reward_as_number(reward)
         is_number = array.size == 1 and array.dtype.kind in "biuf"
     except Exception:  # noqa: BLE001 (whatever it is, it is no number)
         is_number = False
     if not is_number:
         return f"{_kind(reward)} as reward, not a number"
-    return None if np.isfinite(array).all() else f"the reward {float(array.item())!r}"
+    if is_sound(np.asarray(number)):
+        return None
+    return f"the reward {number!r}{_if_finite(number)}"
 
 
 def _is_bool(value: Any) -> bool:
@@ -156,11 +160,15 @@ def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
     # Of a fraction, bytes would lose what is behind the point.
     if array.dtype.kind not in ("biuf" if wanted.kind == "f" else "biu"):
         return f"observations of dtype {array.dtype} but declares {wanted}"
-    bad = ~np.isfinite(array)
-    if bad.any():
-        place = np.argwhere(bad)[0].tolist()
-        return f"observations that are not finite: {array[tuple(place)]} at {place}"
+    for place in np.ndindex(array.shape) if not is_sound(array) else ():
+        if not is_sound(value := np.asarray(array[place])):
+            return f"observations that are not finite: {value} at {list(place)}{_if_finite(value)}"
     return None
+
+
+def _if_finite(value: Any) -> str:
+    """What is added to a number that is not sound, though it is finite."""
+    return ", which is infinite in 32 bits" if np.isfinite(value) else ""
 
 
 def _kind(value: Any) -> str:

@@ -23,6 +23,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.checked_envs import reward_as_number
 from policies.envs import make_env
 from policies.errors import EnvError
 
@@ -280,7 +281,7 @@ def _trace(
         yield _Seen(0, np.array(env.reset(seed=seed)[0]))
         for num_steps, action in enumerate(actions, start=1):
             observation, reward, terminated, truncated, _ = env.step(action)
-            seen = _Seen(num_steps, np.array(observation), float(reward), bool(terminated), bool(truncated))
+            seen = _Seen(num_steps, np.array(observation), reward_as_number(reward), bool(terminated), bool(truncated))
             if terminated or truncated or num_steps == cut:
                 seen = seen._replace(first=np.array(env.reset()[0]))
             yield seen

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.checked_envs import check_observation, check_reward, is_sound
+from policies.checked_envs import check_observation, check_reward, is_sound, reward_as_number
 from policies.env_faults import close_env, env_failed
 from policies.envs import make_env
 from policies.errors import EnvError
@@ -161,7 +161,7 @@ class SubEnvs:
             observation, reward, terminated, truncated, _ = one.env.step(action)
             self._check_shape(one.env, observation)
             final[:] = observation
-            return float(reward), bool(terminated), bool(truncated)
+            return reward_as_number(reward), bool(terminated), bool(truncated)
         except BaseException as error:  # an env may raise anything
             raise self._failed("step", error) from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import os
 import time
 from pathlib import Path
@@ -125,6 +126,8 @@ class Malformed(gym.Env):
         "no reward": (GOOD, None, False, False, {}),
         "text reward": (GOOD, "1.0", False, False, {}),
         "nan reward": (GOOD, float("nan"), False, False, {}),
+        "huge reward": (GOOD, 1e300, False, False, {}),
+        "huge observation": (np.array([0.0, 1e39]), 1.0, False, False, {}),
         "two rewards": (GOOD, np.zeros(2), False, False, {}),
         "number terminated": (GOOD, 1.0, 0, False, {}),
         "no truncated": (GOOD, 1.0, False, None, {}),
@@ -137,7 +140,10 @@ class Malformed(gym.Env):
         "float64": (np.zeros(2), 1.0, False, False, {}),
         "list": ([0, 0], 1, np.bool_(0), np.array(False), {}),
         "reward in an array": (GOOD, np.ones(1), False, False, {}),
+        "reward in a list": (GOOD, [1.0], False, False, {}),
     }
+
+    INFOS = itertools.cycle([{"x": 1}, {"x": "text"}, {"x": 10**30}, {"x": np.zeros(2)}, {"x": np.zeros(3)}, {"x": {}}])
 
     def __init__(self, *, reset=None, step=None):
         self.reset_fault, self.step_fault = reset, step
@@ -147,4 +153,6 @@ class Malformed(gym.Env):
         return (self.GOOD, {}) if self.reset_fault is None else self.RESETS[self.reset_fault]
 
     def step(self, action):
+        if self.step_fault == "infos":
+            return self.GOOD, 1.0, False, False, next(self.INFOS)
         return (self.GOOD, 1.0, False, False, {}) if self.step_fault is None else self.STEPS[self.step_fault]

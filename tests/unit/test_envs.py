@@ -12,9 +12,13 @@ import pytest
 from policy_factory import register_test_envs
 
 from policies import env_modules
+from policies.baselines import ConstantPolicy
+from policies.checked_envs import CheckedEnvs
 from policies.env_modules import allow_modules
 from policies.envs import check_env, make_env, make_vector_env, normalize_env_id
 from policies.errors import EnvError
+from policies.evaluate import evaluate_policy
+from policies.packed.envs import make_packed_envs
 
 register_test_envs()
 
@@ -196,6 +200,23 @@ def test_a_vectorised_version_that_cannot_keep_the_time_limit_is_not_used():
 
 
 @pytest.mark.parametrize(
+    ("mode", "used"), [("NextStep", True), ("SameStep", False), ("Disabled", False), ("Soon", False)]
+)
+def test_a_vectorised_version_that_resets_at_another_time_is_not_used(mode, used):
+    class Vectorised(gym.vector.VectorEnv):
+        metadata = {"autoreset_mode": mode}  # noqa: RUF012
+
+        def __init__(self, num_envs):
+            raise AssertionError(num_envs)
+
+    gym.register("TestVector-v0", "gymnasium.envs.classic_control:CartPoleEnv", vector_entry_point=Vectorised)
+    try:
+        assert check_env("TestVector-v0", None, "ppo").has_vector_entry_point == used
+    finally:
+        del gym.registry["TestVector-v0"]
+
+
+@pytest.mark.parametrize(
     ("fault", "words"),
     [
         ("alone", r"reset\(\) of \S+ returns array.* not the two values"),
@@ -222,6 +243,8 @@ def test_a_malformed_reset_is_refused_with_what_it_returns(fault, words, limit):
         ("no reward", "None as reward, not a number"),
         ("text reward", "'1.0' as reward, not a number"),
         ("nan reward", "the reward nan"),
+        ("huge reward", r"the reward 1e\+300, which is infinite in 32 bits"),
+        ("huge observation", r"are not finite: 1e\+39 at \[1\], which is infinite in 32 bits"),
         ("two rewards", "as reward, not a number"),
         ("number terminated", r"0 \(int\) as terminated, not a bool"),
         ("no truncated", r"None \(NoneType\) as truncated, not a bool"),
@@ -240,9 +263,26 @@ def test_a_malformed_first_step_is_refused_with_what_it_returns(fault, words, li
     assert "(observation, reward, terminated, truncated, info)" in caught.value.hint
 
 
-@pytest.mark.parametrize("kind", ["float64", "list", "reward in an array"])
-def test_what_is_harmless_in_a_step_passes(kind):
-    assert check_env("hostile_envs:Malformed", {"step": kind}, "ppo").action_space.n == 2
+@pytest.mark.parametrize("kind", ["float64", "list", "reward in an array", "reward in a list", "infos"])
+def test_what_is_harmless_in_a_step_passes_and_can_be_stepped(kind):
+    args = {"step": kind}
+    assert check_env("hostile_envs:Malformed", args, "ppo").action_space.n == 2
+
+    vector = CheckedEnvs(make_vector_env("hostile_envs:Malformed", args, 2), "Malformed")
+    vector.reset(seed=0)
+    for _ in range(3):
+        assert vector.step(np.zeros(2, np.int64))[1].tolist() == [1.0, 1.0]
+
+    packed = make_packed_envs("hostile_envs:Malformed", args, 2, kind="scalar")
+    packed.add("a", 0)
+    assert packed.step(np.zeros(2, np.int64)).rewards.tolist() == [1.0, 1.0]
+    assert not packed.errors
+
+    episodes = evaluate_policy(
+        ConstantPolicy(packed.observation_space, packed.action_space, 0, env_id="Malformed"),
+        env_id="hostile_envs:Malformed", env_args=args, seeds=[0], max_episode_steps=3,
+    )  # fmt: skip
+    assert episodes.returns == (3.0,)
 
 
 def test_a_first_step_that_raises_is_refused():
