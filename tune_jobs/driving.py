@@ -157,8 +157,7 @@ def settled(store: SweepStore) -> Iterator[None]:
             if is_ours and store.exists():
                 store.clear_stop_request()
                 remove_leftovers(store)
-                if store.read_record().state == "running":
-                    _close(store)
+                _close_if_open(store)
 
 
 def run_sweep(
@@ -170,11 +169,35 @@ def run_sweep(
     finish: bool,
     progress: str,
 ) -> SweepResult:
-    """Run the unfinished trials of a sweep whose lock is held, then what comes after."""
+    """Run the unfinished trials of a sweep whose lock is held, then what comes after.
+
+    A KeyboardInterrupt ends it with what there is: the records are written, whatever was begun.
+    """
+    try:
+        return _run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
+    except KeyboardInterrupt:
+        with current().shielded():
+            current().came = True
+            _close_if_open(store)
+            return SweepResult(store.folder, store.read_record(), store.read_trials(), interrupted=True)
+
+
+def _run_sweep(
+    store: SweepStore,
+    plan: SweepPlan,
+    *,
+    address: str | None,
+    machine: Machine | None,
+    finish: bool,
+    progress: str,
+) -> SweepResult:
     # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
     run = Owner.take(store.folder / OWNER_FILE)
     todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
     if todo:
+        if current().came:
+            # While the records were written, which nothing cuts short.
+            raise KeyboardInterrupt
         record = store.read_record()
         started = record.started_at or time.time()
         store.write_record(record.model_copy(update={"state": "running", "started_at": started, "ended_at": None}))
@@ -186,6 +209,7 @@ def run_sweep(
             max_concurrent=plan.max_concurrent,
         )
         _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
+        _close_if_open(store)
     from tune_jobs.candidates import read_trials
 
     records = read_trials(store)
@@ -261,6 +285,13 @@ def _noted() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         current().came = True
+
+
+def _close_if_open(store: SweepStore) -> None:
+    """As `_close`, where Ray did not come so far that the run began."""
+    with current().shielded():
+        if store.read_record().state == "running":
+            _close(store)
 
 
 def _close(store: SweepStore, started: float | None = None) -> None:

@@ -4,7 +4,8 @@ Ctrl-C (SIGINT), SIGTERM and a terminal that went away (SIGHUP) mean the same. W
 them to save a checkpoint and stop; the second ends them. Everywhere else the first one ends what is being done. In
 both cases the records are written, Ray is shut down and the locks are freed before `SweepInterrupted` is raised.
 
-A SIGHUP that this process ignores stays ignored: nohup means it.
+A SIGHUP is never a second one: for one terminal that goes, a shell and the system may both send it, and who sends
+SIGTERM may send it too. A SIGHUP that this process ignores stays ignored: nohup means it.
 """
 
 from __future__ import annotations
@@ -43,11 +44,17 @@ class SweepInterrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """What signals do at the moment, and whether one came."""
+    """What signals do at the moment, and whether one came.
 
-    def __init__(self) -> None:
+    Args:
+        has_acted: Whether one ended what was before.
+    """
+
+    def __init__(self, *, has_acted: bool = False) -> None:
         self.came = False
         """Whether a signal came."""
+        self._has_acted = has_acted
+        """Whether one asked or raised, and was not only noted."""
         self._num_shields = 0
         self._ask: Callable[[], None] | None = None
 
@@ -60,11 +67,15 @@ class Interruption:
         self.came = True
         if self._num_shields:
             return
-        if self._ask is not None:
-            ask, self._ask = self._ask, None
-            ask()
-            return
-        raise KeyboardInterrupt
+        ask, self._ask = self._ask, None
+        is_echo = number == signal.SIGHUP and self._has_acted
+        self._has_acted = True
+        if ask is not None:
+            # Nobody is impatient yet: what comes while it is asked was sent together with this one.
+            with self.shielded():
+                ask()
+        elif not is_echo:
+            raise KeyboardInterrupt
 
     @contextlib.contextmanager
     def asking(self, ask: Callable[[], None]) -> Iterator[None]:
@@ -136,16 +147,18 @@ def taking_signals() -> Iterator[Interruption]:
         CannotRunError: Another thread of this process runs a sweep.
     """
     global _current  # noqa: PLW0603 (a process has one set of handlers)
+    interruption = Interruption()
     if not _only_one.acquire(blocking=False):
         raise CannotRunError(
             "Another thread of this process is running a sweep; one process runs one at a time.",
             "Wait until it is done, or launch this one in a process of its own.",
         )
     try:
-        _current = interruption = Interruption()
+        _current = interruption
         with _handled(interruption):
             yield interruption
     finally:
+        _current = Interruption(has_acted=interruption.came)
         _only_one.release()
 
 
@@ -153,7 +166,12 @@ def end_in_order() -> None:
     """From now on let SIGTERM and SIGHUP do what Ctrl-C does: for a program of ours, whatever it is doing."""
     for number in _SIGNALS:
         if not _is_ignored(number):
-            signal.signal(number, signal.default_int_handler)
+            signal.signal(number, _take_now)
+
+
+def _take_now(number: int, frame: FrameType | None) -> None:
+    """The handler outside of sweeps: what comes after one may be an echo of what ended it."""
+    _current.take(number, frame)
 
 
 def _is_ignored(number: int) -> bool:

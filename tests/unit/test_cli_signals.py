@@ -45,3 +45,33 @@ def test_nohup_means_it(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
+
+
+# As the one above, ended by two hangups: one to the process, one to its group.
+TWICE = """
+import os, signal, sys
+from pathlib import Path
+from tune_jobs import cli, sweeps
+
+def video(*_, **__):
+    path = Path(sys.argv[-1], "half.mp4")
+    path.write_text("half")
+    try:
+        os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        os.kill(os.getpid(), signal.SIGHUP)
+        path.unlink()
+
+sweeps.video = video
+cli.main()
+"""
+
+
+def test_two_hangups_are_one(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", TWICE, "video", "random", "--env", "CartPole-v1", "--output", str(tmp_path)],
+        capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (130, "error: Interrupted.\n")
+    assert list(tmp_path.iterdir()) == []

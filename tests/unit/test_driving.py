@@ -9,7 +9,7 @@ import pytest
 from policies.errors import CannotRunError
 from tune_jobs import driving, finish, sweeps
 from tune_jobs.driving import write_new
-from tune_jobs.interruption import SweepInterrupted
+from tune_jobs.interruption import SweepInterrupted, current
 from tune_jobs.machine import Machine
 from tune_jobs.plan import make_plan
 from tune_jobs.spec_file import load_spec
@@ -95,7 +95,7 @@ def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(store, monkeypat
     def connect(*_):
         os.kill(os.getpid(), number)  # the first one asks
         assert store.stop_requested()
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM if number == signal.SIGHUP else number)  # a SIGHUP is never the second
 
     monkeypatch.setattr(driving, "connected", connect)
     with pytest.raises(SweepInterrupted) as caught:
@@ -146,6 +146,37 @@ def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(tmp_path
     with pytest.raises(SweepInterrupted):
         sweeps.launch(SPEC, name="new", storage=tmp_path / "storage", progress="none")
     assert not (tmp_path / "storage").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("where", ["Owner.take", "SweepMonitor", "connected"])
+def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp_path, monkeypatch, number, where):
+    """Before the trials are prepared, too: "nothing was kept" would be wrong."""
+    original = getattr(driving.Owner, "take", None) if where == "Owner.take" else getattr(driving, where)
+
+    def interrupt(*args, **kwargs):
+        if current()._ask is not None:
+            os.kill(os.getpid(), number)  # the first one asks
+            raise KeyboardInterrupt
+        os.kill(os.getpid(), number)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(f"tune_jobs.driving.{where}", interrupt)
+    with pytest.raises(SweepInterrupted) as caught:
+        sweeps.launch(SPEC, name="new", storage=tmp_path, progress="none")
+    result = caught.value.result
+    assert result is not None
+    assert (result.sweep.state, result.exit_code, len(result.trials)) == ("interrupted", 130, 2)
+    assert SweepStore(tmp_path / "new").read_record().state == "interrupted"
+
+
+def test_a_signal_while_a_sweeps_new_trials_are_written_is_not_forgotten(store, monkeypatch):
+    pend(store)
+    monkeypatch.setattr("tune_jobs.resuming._add_trials", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(driving, "connected", lambda *_: pytest.fail("the trials must not begin"))
+    with pytest.raises(SweepInterrupted) as caught:
+        sweeps.resume(store.folder, progress="none")
+    assert caught.value.result.sweep.state == "interrupted"
 
 
 def test_a_loop_over_launches_stops_at_the_first_signal(store, monkeypatch):

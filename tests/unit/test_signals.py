@@ -56,8 +56,62 @@ def test_the_first_signal_asks_and_the_second_raises(number):
         send(number)
         assert (asked, interruption.came) == ([number], True)
         with pytest.raises(KeyboardInterrupt):
-            send(number)
+            send(signal.SIGTERM if number == signal.SIGHUP else number)
         assert asked == [number]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_hangup_is_never_the_second_signal(number):
+    """A dropped ssh line sends two, to the job and to its group; who sends SIGTERM may send SIGHUP at once."""
+    asked = []
+    with taking_signals() as interruption, interruption.asking(lambda: asked.append(1)):
+        send(number)
+        send(signal.SIGHUP)
+        send(signal.SIGHUP)
+        assert asked == [1]
+        with pytest.raises(KeyboardInterrupt):
+            send(signal.SIGINT)
+
+
+def test_a_second_hangup_does_not_cut_short_what_the_first_one_ended():
+    done = []
+    with taking_signals():
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                send(signal.SIGHUP)
+        finally:
+            send(signal.SIGHUP)
+            done.append(1)
+    assert done == [1]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_that_comes_while_one_asks_waits(number):
+    asked = []
+
+    def ask():
+        send(number)
+        asked.append(1)
+
+    with taking_signals() as interruption, interruption.asking(ask):
+        send(number)
+        assert asked == [1]
+        with pytest.raises(KeyboardInterrupt):
+            send(signal.SIGTERM)
+
+
+def test_a_hangup_that_was_only_noted_has_not_ended_anything():
+    with taking_signals() as interruption:
+        with interruption.shielded():
+            send(signal.SIGHUP)
+        with pytest.raises(KeyboardInterrupt):
+            send(signal.SIGHUP)
+
+
+def test_a_hangup_ends_each_of_a_loops_sweeps():
+    for _ in range(2):
+        with taking_signals(), pytest.raises(KeyboardInterrupt):
+            send(signal.SIGHUP)
 
 
 def test_signals_wait_for_what_must_not_be_cut_short():
