@@ -80,13 +80,19 @@ def _add_trials(
     store: SweepStore, record: SweepRecord, spec: SweepSpec, plan: SweepPlan, address: str | None, *, retry_failed: bool
 ) -> None:
     """Write the records of what a sweep is to run more; nothing if there is nothing to run."""
+    known = {trial.trial_id: trial for trial in store.read_trials()}
+    todo = []
     for trial in plan.trials:
-        trial_store = store.trial(trial.trial_id)
-        if not trial_store.record_path.is_file():
-            trial_store.write_record(pending_record(trial))
-        elif retry_failed and (known := trial_store.read_record()).status == "failed":
-            trial_store.write_record(known.model_copy(update={"status": "pending", "error": None}))
-    if all(trial.status in FINISHED for trial in store.read_trials()):
+        before = known.get(trial.trial_id)
+        if before is None:
+            todo.append(pending_record(trial))
+        elif retry_failed and before.status == "failed":
+            todo.append(before.model_copy(update={"status": "pending", "error": None}))
+    if not todo and all(trial.status in FINISHED for trial in known.values()):
         return
+    # First that there are to be more: whoever is killed then leaves a sweep that lacks trials, which a resume adds.
+    # Trials that the sweep's spec does not give would be refused for good.
     changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
     store.write_record(record.model_copy(update={**changes, "state": "running"}))
+    for trial_record in todo:
+        store.trial(trial_record.trial_id).write_record(trial_record)

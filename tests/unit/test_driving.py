@@ -1,13 +1,15 @@
 """What a launch, resume or extend leaves when nothing is to be run, when it fails, and when a signal ends it."""
 
 import os
+import shutil
 import signal
 import sys
 
 import pytest
 
 from policies.errors import CannotRunError
-from tune_jobs import driving, finish, sweeps
+from tune_jobs import driving, finish, resuming, sweeps
+from tune_jobs import store as store_module
 from tune_jobs.driving import write_new
 from tune_jobs.interruption import SweepInterrupted, current
 from tune_jobs.machine import Machine
@@ -46,6 +48,31 @@ def test_finishing_anew_changes_no_times(store, monkeypatch):
     result = sweeps.resume(store.folder, progress="none")
     assert result.why_no_best is not None
     assert store.record_path.read_bytes() == before
+
+
+def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with_all_of_its_trials(
+    store, tmp_path, monkeypatch
+):
+    """What a kill leaves is what is there before each write."""
+    write, left = store_module.write_atomic, []
+
+    def watched(path, data):
+        left.append(shutil.copytree(store.folder, tmp_path / f"killed-{len(left)}" / "mine"))
+        write(path, data)
+
+    monkeypatch.setattr(resuming, "run_sweep", lambda store, *_, **__: [t.trial_id for t in store.read_trials()])
+    with monkeypatch.context() as patch:
+        patch.setattr(store_module, "write_atomic", watched)
+        all_ids = sweeps.extend(store.folder, 2, progress="none")
+    assert all_ids == ["t0000", "t0001", "t0002", "t0003"]
+    assert len(left) >= 3
+    before, *during = left
+    assert sweeps.resume(before, progress="none") == all_ids[:2]
+    for folder in during:
+        assert sweeps.resume(folder, progress="none") == all_ids
+        record = SweepStore(folder).read_record()
+        assert (record.num_trials, record.spec["num_samples"]) == (4, 4)
+        assert [trial.seed for trial in sweeps.trials(folder)] == [trial.seed for trial in sweeps.trials(store.folder)]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
