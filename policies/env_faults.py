@@ -14,7 +14,7 @@ from traceback import walk_tb
 from types import FrameType
 from typing import Any, NamedTuple
 
-from policies.errors import EnvFailedError
+from policies.errors import EnvFailedError, said_by
 
 _PACKAGE = PurePath(__file__).parent
 _notes_signals = False
@@ -69,7 +69,7 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     """
     if not is_of_env(error):
         raise error
-    detail = str(error).strip().rstrip(".")
+    detail = said_by(error)
     frames = [
         Frame(frame.f_code.co_filename, line, frame.f_code.co_name) for frame, line in walk_tb(error.__traceback__)
     ]

@@ -22,7 +22,7 @@ from typing import Any
 
 from policies.arguments import checked
 from policies.env_faults import is_of_env
-from policies.errors import SpecError
+from policies.errors import SpecError, said_by
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
 _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
@@ -159,7 +159,7 @@ def _is_part(missing: str | None, module: str) -> bool:
 
 def _failed(module: str, error: BaseException) -> SpecError:
     return SpecError(
-        f"The module {module!r} cannot be imported: {type(error).__name__}: {error}.",
+        f"The module {module!r} cannot be imported: {type(error).__name__}: {said_by(error)}.",
         f'Try `python -c "import {module}"`, and mend what it says.',
     )
 

@@ -13,6 +13,8 @@ from importlib import metadata
 
 from gymnasium.envs import registration
 
+from policies.errors import said_by
+
 GROUP = "gymnasium.envs"
 _NO_NAMESPACE = "__root__"
 
@@ -32,7 +34,9 @@ def load_env_plugins() -> tuple[str, ...]:
             entry_point.load()()
         except Exception as error:  # noqa: BLE001 (its own environments are missing then, and no others)
             package = entry_point.dist.name if entry_point.dist is not None else entry_point.value
-            problems.append(f"The package {package} could not register its own: {type(error).__name__}: {error}.")
+            problems.append(
+                f"The package {package} could not register its own: {type(error).__name__}: {said_by(error)}."
+            )
         finally:
             registration.current_namespace = before
     return tuple(problems)

@@ -27,7 +27,7 @@ from policies.checked_envs import PlainSteps
 from policies.env_faults import close_env, is_of_env
 from policies.env_ids import find_env, normalize_env_id
 from policies.env_wrappers import FailurePenalty, ObservationWrappers
-from policies.errors import EnvError
+from policies.errors import EnvError, said_by
 from policies.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.first_step import check_first_step
 from policies.rendering import draw_without_display
@@ -299,7 +299,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
         raise error
     if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
         return error
-    detail = str(error).strip().rstrip(".") or "no message"
+    detail = said_by(error) or "no message"
     arguments = f" with arguments {dict(env_args)!r}" if env_args else ""
     message = f"The environment {env_id!r} cannot be made{arguments}: {type(error).__name__}: {detail}."
     if "box2d" in detail.lower():

@@ -5,7 +5,12 @@ Hierarchy: every error below is a `TuneJobsError`; the subclass decides the exit
 
 from __future__ import annotations
 
+import re
 from typing import Any, ClassVar
+
+# Halves of surrogate pairs, which no file takes, and what moves a terminal's cursor; not the ends of lines, nor tabs.
+_UNFIT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+_MAX_SAID = 2_000
 
 
 class TuneJobsError(Exception):
@@ -19,6 +24,8 @@ class TuneJobsError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, message: str, hint: str = "") -> None:
+        # It quotes what others wrote, and goes into files and to terminals.
+        message, hint = fit(message), fit(hint)
         # Both go to Exception.args, or the error cannot be unpickled when Ray carries it between processes.
         super().__init__(message, hint)
         self.message = message
@@ -63,6 +70,29 @@ class CannotRunError(TuneJobsError):
     """This machine or cluster cannot run it: resources, storage, address."""
 
     exit_code = 5
+
+
+def fit(text: str, max_length: int | None = None) -> str:
+    """A text such as every file and terminal takes it.
+
+    Args:
+        text: Any text.
+        max_length: Of what is longer the middle is left out, and said so; None: nothing is.
+    """
+    if max_length is not None and len(text) > max_length:
+        end = max_length // 4
+        left_out = len(text) - max_length
+        text = f"{text[: max_length - end]} [... {left_out:,} characters ...] {text[len(text) - end :]}"
+    return _UNFIT.sub(lambda found: found.group().encode("unicode_escape").decode("ascii"), text)
+
+
+def said_by(error: BaseException) -> str:
+    """What an exception of somebody else's says, without a dot at its end: it may be anything, megabytes too."""
+    try:
+        text = str(error)
+    except Exception:  # noqa: BLE001 (its own `__str__` fails)
+        return "it cannot be shown"
+    return fit(text.strip(), _MAX_SAID).rstrip(".")
 
 
 def shortened(value: Any) -> str:

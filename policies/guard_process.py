@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policies import calls, env_faults, env_modules
-from policies.errors import EnvFailedError, TuneJobsError
+from policies.errors import EnvFailedError, TuneJobsError, said_by
 
 if TYPE_CHECKING:
     from policies.evaluate import Episodes
@@ -80,14 +80,19 @@ def _answer(asked: Mapping[str, Any], told: calls.Page) -> dict[str, Any]:
         _see(asked)
         return {"result": _JOBS[asked["job"]](**arguments)}
     except BaseException as error:  # noqa: BLE001 (SystemExit, say: an env may raise anything)
-        said = {"kind": type(error).__name__, "message": str(error), "hint": "", "traceback": traceback.format_exc()}
+        said = {
+            "kind": type(error).__name__,
+            "message": said_by(error),
+            "hint": "",
+            "traceback": traceback.format_exc(),
+        }
         if isinstance(error, TuneJobsError):
             said |= {"message": error.message, "hint": error.hint}
         elif not isinstance(error, Exception):
             said |= {
                 "kind": EnvFailedError.__name__,
                 "message": f"{arguments['env_id']} raised {type(error).__name__} in {told.last_raised.phrase}: "
-                f"{error}.",
+                f"{said_by(error)}.",
                 "hint": "Mend the env: what goes wrong in it must be an Exception.",
             }
         return {"error": said}

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from policies.env_faults import close_env
 from policies.envs import make_env
-from policies.errors import EnvError, SpecError
+from policies.errors import EnvError, SpecError, said_by
 from policies.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
 from policies.movies import GifWriter, Mp4Writer
 from policies.policy import Policy
@@ -186,7 +186,7 @@ class _Stage:
             frame = np.asarray(self._env.render())
         except Exception as error:  # an env may raise anything
             raise EnvError(
-                f"{env_id} cannot be drawn: {type(error).__name__}: {error}.",
+                f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
                 "Install what it needs to draw without a display (for MuJoCo set MUJOCO_GL=egl or osmesa).",
             ) from error
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:

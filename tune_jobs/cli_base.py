@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from policies.errors import TuneJobsError
+from policies.errors import TuneJobsError, said_by
 
 if TYPE_CHECKING:
     from tune_jobs.driving import SweepResult
@@ -51,7 +51,7 @@ class CommandGroup(click.Group):
             _print_error(ctx, error.message, error.hint, error.exit_code)
             ctx.exit(error.exit_code)
         except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback on a user's terminal
-            message = f"Unexpected {type(error).__name__}: {error}"
+            message = f"Unexpected {type(error).__name__}: {said_by(error)}"
             if ctx.meta.get(DEBUG):
                 traceback.print_exc()
                 hint = ""

@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from policies.errors import TuneJobsError
+from policies.errors import TuneJobsError, said_by
 from policies.evaluate import Episodes, Evaluator
 from policies.policy import NonFiniteWeightsError, Policy
 from policies.portable import PortablePolicy
@@ -362,7 +362,7 @@ def _outcome(act: Callable[[], Progress | None]) -> Progress | Exception | None:
 
 
 def _describe(task: TrialTask, error: Exception) -> str:
-    message = str(error) if isinstance(error, TuneJobsError) else f"{type(error).__name__}: {error}"
+    message = str(error) if isinstance(error, TuneJobsError) else f"{type(error).__name__}: {said_by(error)}"
     return f"{message}\n{SweepStore(task.sweep_folder).trial(task.trial_id).log_tail()}".strip()
 
 

@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from analysis.records import TrialRecord
+from policies.errors import fit
 from policies.tallies import Reached, read_tally
 from tune_jobs.ownership import Owner
 from tune_jobs.progress import Progress
@@ -23,6 +24,8 @@ Listener = Callable[[TrialRecord], None]
 _WRITES_PER_S = 20.0
 # Of a trial: what was damaged when it was opened, the newest.
 _MAX_NOTES = 20
+# Of a failure: what was said, and 15 lines of a log.
+_MAX_ERROR = 20_000
 
 
 class RecordKeeper:
@@ -133,7 +136,7 @@ class RecordKeeper:
 
         Args:
             trial_id: The trial.
-            error: Why.
+            error: Why; of a long one the middle is left out.
             retried: Whether it is tried again.
             reached: How far it was; None: what its process has left behind says so.
         """
@@ -141,7 +144,7 @@ class RecordKeeper:
         if reached is None:
             reached = read_tally(self._store.trial(trial_id).tally_path)
         changes: dict[str, Any] = {} if reached is None else dataclasses.asdict(reached)
-        changes |= {"num_failures": self._records[trial_id].num_failures + 1, "error": error}
+        changes |= {"num_failures": self._records[trial_id].num_failures + 1, "error": fit(error, _MAX_ERROR)}
         if retried:
             self._update(trial_id, status="pending", **changes)
         else:

@@ -25,7 +25,8 @@ DAMAGED_RESULTS = "results.damaged"
 def write_log(path: Path, text: str) -> None:
     """Append to a trial's log what concerns this trial, whatever the process prints elsewhere."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
+    # What an env raised may be no text that UTF-8 has.
+    with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
         file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n")
 
 

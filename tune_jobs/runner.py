@@ -20,7 +20,7 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
 from analysis.records import CheckpointRecord
-from policies.errors import TuneJobsError
+from policies.errors import TuneJobsError, said_by
 from policies.parents import this_process
 from tune_jobs.copies import remove_uncounted_copies
 from tune_jobs.interruption import current
@@ -386,10 +386,10 @@ def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float
     """
     if isinstance(error, RayTaskError):
         cause = error.cause if isinstance(error.cause, BaseException) else error
-        message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {cause}"
+        message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {said_by(cause)}"
     elif isinstance(error, RayActorError):
         why = died_by(tail, timeout_s) or ("its node was taken away" if error.preempted else "")
         message = f"The process of the {what} died{f': {why}' if why else ''}."
     else:
-        message = str(error) if error is not None else "Unknown error."
+        message = said_by(error) if error is not None else "Unknown error."
     return f"{message}\n{tail}".strip()

@@ -22,10 +22,20 @@ class FakeEngine:
         steps: Env steps an iteration.
         nan_from: First iteration whose weights are not finite.
         raise_at: Iteration that raises.
+        says: What its error says.
     """
 
-    def __init__(self, episodes=lambda iteration: (20.0,), *, steps=100, nan_from=None, raise_at=None):
+    def __init__(
+        self,
+        episodes=lambda iteration: (20.0,),
+        *,
+        steps=100,
+        nan_from=None,
+        raise_at=None,
+        says="the cart left the track",
+    ):
         self.episodes, self.steps, self.nan_from, self.raise_at = episodes, steps, nan_from, raise_at
+        self.says = says
         self.iteration = 0
         self.builds = []
 
@@ -40,7 +50,7 @@ class FakeEngine:
     def train_iteration(self):
         self.iteration += 1
         if self.iteration == self.raise_at:
-            raise ZeroDivisionError("the cart left the track")
+            raise ZeroDivisionError(self.says)
         returns = self.episodes(self.iteration)
         return IterationStats(
             num_env_steps=self.iteration * self.steps,

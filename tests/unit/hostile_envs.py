@@ -35,7 +35,19 @@ def fail():
     raise ValueError("the motor broke")
 
 
+class MuteError(Exception):
+    def __str__(self):
+        raise RuntimeError("no words")
+
+
+def say(error):
+    raise error
+
+
 WAYS = {
+    "say_no_text": lambda: say(ValueError("\udcff")),
+    "say_much": lambda: say(ValueError("x" * 3_000_000)),
+    "say_nothing": lambda: say(MuteError()),
     "hang": hang,
     "hang_without_python": hang_without_python,
     "exit": lambda: os._exit(7),

@@ -91,6 +91,22 @@ def test_an_env_that_raises_what_ends_a_process_has_failed(where, words):
         guarded.check_env(HOSTILE, {"how": "leave", "where": where})
 
 
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("say_no_text", r"ValueError: \\udcff"),
+        ("say_much", r"ValueError: x+ \[... [0-9,]+ characters"),
+        ("say_nothing", "MuteError: it cannot be shown"),
+    ],
+)
+@pytest.mark.parametrize("where", ["constructor", "step"])
+def test_whatever_an_env_says_can_be_told(how, words, where):
+    with pytest.raises(EnvError, match=words) as caught:
+        guarded.check_env(HOSTILE, {"how": how, "where": where})
+    assert len(caught.value.message) < 4_000
+    caught.value.message.encode()
+
+
 def test_a_segmentation_fault_is_told_with_its_place():
     with pytest.raises(EnvFailedError, match=r'hostile_envs.py", line \d+ in segfault'):
         guarded.check_env(HOSTILE, {"how": "segfault"})

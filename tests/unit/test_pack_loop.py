@@ -200,6 +200,15 @@ def test_a_member_that_always_fails_fails_alone(tmp_path):
     assert pack.engine.num_iterations < 9 + 4
 
 
+def test_a_members_error_may_hold_what_is_no_text(tmp_path):
+    scripts = {"t0001": lambda: FakeEngine(raise_at=3, says="a \udcff")}
+    pack = Pack(tmp_path, lambda name: scripts.get(name, FakeEngine)(), stop={"num_iterations": 5})
+    pack.add("t0000", "t0001").run()
+    assert pack.of("t0001")[-1].error.startswith("ZeroDivisionError: a \\udcff")
+    assert "ZeroDivisionError: a \\udcff" in pack.store("t0001").log_path.read_text()
+    assert results(pack, "t0000") == list(range(1, 6))
+
+
 def test_a_member_that_failed_once_ends_as_if_it_had_not(tmp_path):
     counts = itertools.count()
     scripts = {"t0001": lambda: FakeEngine(raise_at=5 if next(counts) == 0 else None)}

@@ -92,6 +92,18 @@ def test_what_a_process_reads_is_on_disk_at_once(kept):
     assert len(told) == 40
 
 
+@pytest.mark.parametrize(
+    "error", ["\udcff in an env's error", "a terminal's \x1b[2J", "x" * 3_000_000], ids=["text", "control", "long"]
+)
+def test_whatever_made_a_trial_fail_can_be_written(kept, error):
+    store, keeper, _, told = kept
+    keeper.started("t0001")
+    keeper.failed("t0001", error, retried=False)
+    keeper.flush()
+    assert on_disk(store, "t0001") == told[-1]
+    assert len(told[-1].error) < 21_000
+
+
 def test_how_trials_end(kept):
     store, keeper, _, _ = kept
     for index in range(5):

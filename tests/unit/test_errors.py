@@ -1,0 +1,52 @@
+"""What is said of errors: whatever others wrote into theirs, every file and terminal takes it."""
+
+import json
+import pickle
+
+import pytest
+
+from policies.errors import EnvFailedError, TuneJobsError, fit, said_by
+
+
+class MuteError(Exception):
+    def __str__(self):
+        raise RuntimeError("no words")
+
+
+class WordlessError(Exception):
+    def __str__(self):
+        return 3  # noqa: PLE0307 (what is to be lived with)
+
+
+def test_what_others_wrote_is_text_that_can_be_written_and_shown():
+    error = TuneJobsError("a \udcff b \x1b[2J c \x00", "d\r\n\te\ud800")
+    assert (error.message, error.hint) == ("a \\udcff b \\x1b[2J c \\x00", "d\\r\n\te\\ud800")
+    str(error).encode()
+    assert pickle.loads(pickle.dumps(error)).args == error.args
+
+
+def test_text_in_any_script_stays_as_it_is():
+    assert fit("naïve 小車 🚗\n\tof two lines") == "naïve 小車 🚗\n\tof two lines"
+
+
+@pytest.mark.parametrize("error", [MuteError(), WordlessError()])
+def test_an_exception_that_cannot_be_shown_is_told_without_words(error):
+    assert said_by(error) == "it cannot be shown"
+
+
+def test_of_a_long_message_the_middle_is_left_out():
+    said = said_by(ValueError("begin" + "x" * 5_000_000 + "end."))
+    assert len(said) < 2_100
+    assert said.startswith("beginxxx")
+    assert "[... 4,998,009 characters ...]" in said
+    assert said.endswith("xxxend")
+
+
+@pytest.mark.parametrize("error", [ValueError("\udcff"), ValueError("y" * 1_000_000), MuteError(), WordlessError()])
+def test_an_envs_error_can_be_told(error):
+    from policies.env_faults import env_failed
+
+    failed = env_failed("It raised an error in step()", error)
+    assert isinstance(failed, EnvFailedError)
+    assert len(failed.message) < 3_000
+    json.dumps(failed.message, ensure_ascii=False).encode()
