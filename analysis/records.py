@@ -20,7 +20,8 @@ SweepState = Literal["running", "interrupted", "completed"]
 TRIAL_ID_PATTERN = "t[0-9]{4,9}"
 """What trials are called: part of their folders' paths."""
 TrialId = Annotated[str, Field(pattern=f"^{TRIAL_ID_PATTERN}$")]
-Iteration = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Iteration = Count
 FINISHED: frozenset[str] = frozenset({"completed", "failed", "stopped"})
 
 
@@ -47,7 +48,7 @@ class CheckpointRecord(_Record):
 
     trial_id: TrialId
     iteration: Iteration
-    num_env_steps: int
+    num_env_steps: Count
     training_return: float | None = None
     evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")
 
@@ -66,9 +67,9 @@ class CheckpointRecord(_Record):
 class IterationRecord(_Record):
     """One iteration of one trial: a line of results.jsonl."""
 
-    iteration: int
-    num_env_steps: int = Field(description="Env steps sampled so far in this trial.")
-    num_episodes: int = Field(description="Whole episodes so far in this trial.")
+    iteration: Iteration
+    num_env_steps: Count = Field(description="Env steps sampled so far in this trial.")
+    num_episodes: Count = Field(description="Whole episodes so far in this trial.")
     time_s: Number = Field(description="Seconds of training so far, evaluation and checkpoints included.")
     training_return: float | None = None
     evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")

@@ -3,10 +3,15 @@
 A process that is killed while it writes leaves half a line at the end. Elsewhere a line that can't be read is damage:
 of the disk, an editor, or two processes that wrote at once. One such line must not cost the others: who reads leaves it
 out and says so; who goes on with the trial moves it to a file of its own, `results.damaged`.
+
+Iterations rise and env steps don't fall, so lines that can be read contradict each other where they do otherwise. The
+fewest are left out that let the others agree: one number that is far too large must not cost all lines after it.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -51,16 +56,47 @@ def read_results(path: Path) -> ResultsFile:
         *lines, tail = path.read_bytes().split(b"\n")
     except FileNotFoundError:
         return ResultsFile()
-    found = ResultsFile(tail=tail)
+    bad: list[BadLine] = []
+    read: list[tuple[int, bytes, IterationRecord]] = []
     for number, line in enumerate(lines, start=1):
         try:
-            record = IterationRecord.model_validate_json(line)
+            read.append((number, line, IterationRecord.model_validate_json(line)))
         except ValidationError:
-            found.bad.append(BadLine(number, line, "is no result"))
-            continue
-        last = found.records[-1] if found.records else None
-        if last is not None and not (record.iteration > last.iteration and record.num_env_steps >= last.num_env_steps):
-            found.bad.append(BadLine(number, line, f"does not follow iteration {last.iteration}"))
-            continue
-        found.records.append(record)
+            bad.append(BadLine(number, line, "is no result"))
+    kept = [read[index] for index in _rising([record.iteration for _, _, record in read], strictly=True)]
+    kept = [kept[index] for index in _rising([record.num_env_steps for _, _, record in kept], strictly=False)]
+    bad += _contradictions(read, {number for number, _, _ in kept})
+    return ResultsFile([record for _, _, record in kept], sorted(bad, key=lambda line: line.number), tail)
+
+
+def _contradictions(read: Sequence[tuple[int, bytes, IterationRecord]], kept: set[int]) -> list[BadLine]:
+    """Lines that can be read but are not kept, each with what it contradicts."""
+    found = []
+    last: IterationRecord | None = None
+    for number, line, record in read:
+        if number in kept:
+            last = record
+        elif last is not None and (record.iteration <= last.iteration or record.num_env_steps < last.num_env_steps):
+            found.append(BadLine(number, line, f"does not follow iteration {last.iteration}"))
+        else:
+            found.append(BadLine(number, line, "contradicts the lines after it"))
     return found
+
+
+def _rising(values: Sequence[int], *, strictly: bool) -> list[int]:
+    """Where to find the most values that rise (or, not strictly, don't fall); of several such choices the first."""
+    # From the end: how many values, it included, can be taken from each on. Of those with k + 1 the largest is enough.
+    largest: list[int] = []  # negated, so that they are sorted
+    counts = []
+    for value in reversed(values):
+        index = (bisect_left if strictly else bisect_right)(largest, -value)
+        largest[index : index + 1] = [-value]
+        counts.append(index + 1)
+    counts.reverse()
+    chosen: list[int] = []
+    wanted = len(largest)
+    for index, count in enumerate(counts):
+        if count == wanted and (not chosen or values[chosen[-1]] + strictly <= values[index]):
+            chosen.append(index)
+            wanted -= 1
+    return chosen

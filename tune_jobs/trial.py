@@ -6,6 +6,7 @@ another node, in another process, goes on from its latest checkpoint.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -136,6 +137,7 @@ class TrialLoop:
         iteration = start.iteration if start is not None else 0
         changed_at = max((change.iteration for change in self.task.changes if change.iteration <= iteration), default=0)
         kept = [record for record in found.records if record.iteration <= iteration]
+        time_s = 0.0
         if self._store.results_path.exists():
             self._store.keep_iterations(kept)
         for record in kept:
@@ -143,10 +145,25 @@ class TrialLoop:
                 self._window.extend(record.episode_returns)
             if record.evaluation_return is not None:
                 self._evaluation_return = record.evaluation_return
-        if kept:
-            self._last = kept[-1]
-        if start is not None and self._last.iteration < start.iteration:
-            # Its own line could not be read. The curve has a hole there; the counts go on where they were.
+            self._last = record
+            # One that is no time would keep `time_s` from ever ending the trial, or end it at once.
+            if 0 <= record.time_s < math.inf:
+                time_s = record.time_s
+        self._last = self._last.model_copy(update={"time_s": time_s})
+        if start is None:
+            return
+        contradicts = (
+            not self._is_copy and kept and self._last.iteration == iteration
+            and self._last.num_env_steps != start.num_env_steps
+        )  # fmt: skip
+        if contradicts:
+            self._notes.append(
+                f"results.jsonl: iteration {iteration} says {self._last.num_env_steps} env steps; its checkpoint says "
+                f"{start.num_env_steps}, from which the trial goes on."
+            )
+        if contradicts or self._last.iteration < iteration:
+            # Its own line could not be read, or says something else: the checkpoint knows what it has learned from.
+            # The curve has a hole there; the counts go on where they were.
             self._last = self._last.model_copy(
                 update={
                     "iteration": start.iteration,

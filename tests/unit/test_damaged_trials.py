@@ -2,10 +2,11 @@
 
 import errno
 import json
+import math
 from pathlib import Path
 
 import pytest
-from fake_engine import FakeEngine
+from fake_engine import FakeClock, FakeEngine
 from trial_runs import Trial
 
 from analysis.records import FORMAT_VERSION
@@ -118,6 +119,32 @@ def test_a_line_that_cannot_be_read_is_set_aside_and_the_trial_goes_on(tmp_path,
     assert [record.num_env_steps for record in again.results] == [100 * number for number in expected]
     assert f"results.jsonl: line {place}" in progress.notes[0]
     assert progress.notes[0] in again.store.log_path.read_text()
+
+
+@pytest.mark.parametrize("steps", [399, 10**12])
+def test_a_trial_goes_on_from_the_env_steps_of_its_checkpoint_whatever_the_line_of_it_says(tmp_path, steps):
+    """Else it would be over at once."""
+    first = Trial(tmp_path, checkpoints={"every_iterations": 4, "keep": 1})
+    first.run_to(4)
+    *before, last = first.results
+    first.store.keep_iterations([*before, last.model_copy(update={"num_env_steps": steps})])
+    again = Trial(tmp_path, stop={"num_iterations": 6})
+    progress = again.run()
+    assert (progress.status, progress.iteration, progress.num_env_steps) == ("completed", 6, 600)
+    assert f"iteration 4 says {steps} env steps; its checkpoint says 400" in progress.notes[0]
+    assert [record.iteration for record in again.results if record.iteration != 4] == [1, 2, 3, 5, 6]
+
+
+@pytest.mark.parametrize("time_s", [math.nan, math.inf, -1e9])
+def test_a_time_that_is_none_neither_ends_a_trial_nor_keeps_it_from_ending(tmp_path, time_s):
+    first = Trial(tmp_path, clock=FakeClock(1.0), checkpoints={"every_iterations": 4, "keep": 1})
+    first.run_to(4)
+    *before, last = first.results
+    first.store.keep_iterations([*before, last.model_copy(update={"time_s": time_s})])
+    again = Trial(tmp_path, clock=FakeClock(1.0), stop={"num_iterations": 6})
+    progress = again.run()
+    assert (progress.status, progress.iteration) == ("completed", 6)
+    assert before[-1].time_s < progress.time_s < 1_000
 
 
 def test_results_that_are_gone_leave_a_hole_and_no_other_count(tmp_path):
