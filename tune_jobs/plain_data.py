@@ -51,6 +51,7 @@ class _Copy:
             return self._container(value, path)
         if isinstance(value, str):
             self._count(path, characters=len(value))
+            self._check_text(value, path)
             # Not a subclass of str, such as an enum's member.
             return str.__str__(value)
         if isinstance(value, int | float) and not isinstance(value, bool):
@@ -104,7 +105,18 @@ class _Copy:
         if isinstance(key, bool) or not isinstance(key, str | int | np.integer):
             raise self._error(path, f"has the key {shortened(key)}, which is no text", "Name fields by texts.")
         self._count(path, characters=len(name := str(key)))
+        self._check_text(name, path)
         return name
+
+    def _check_text(self, text: str, path: str) -> None:
+        """Refuse half a character: no file could hold it."""
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            half = ascii(text[error.start])
+            raise self._error(
+                path, f"{shortened(text)} has {half}, which is half a character", "Take it out."
+            ) from None
 
     def _count(self, path: str, *, values: int = 0, characters: int = 0) -> None:
         self._num_values += values

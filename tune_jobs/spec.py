@@ -33,6 +33,8 @@ from tune_jobs.spec_problems import Problem, WrongSpecError, details_of, did_you
 SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
 _NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
+_LARGEST_REWARD = 3.4e38
+"""Beyond it a number is infinite in 32 bits, in which learners compute."""
 NAME_RULE = "up to 100 letters, digits, '_', '-' and '.', beginning with none of the last two"
 
 Flag = Annotated[bool, Field(strict=True)]
@@ -57,7 +59,7 @@ class EnvSpec(_Section):
     pixels: Flag = Field(
         default=False, description="Observe small grey images of what the env renders, not its numbers."
     )
-    failure_penalty: Number | None = Field(
+    failure_penalty: Annotated[Number, Field(ge=-_LARGEST_REWARD, le=_LARGEST_REWARD)] | None = Field(
         None,
         description="Reward of the step in which the env ends by failure, such as the pole's fall. Training sees it, "
         "evaluation and reported returns never do. null: the env's own reward.",
@@ -211,7 +213,7 @@ class SweepSpec(_Section):
         # In YAML a section whose lines are all commented out is null.
         if not isinstance(data, Mapping):
             return data
-        return {key: value for key, value in data.items() if value is not None}
+        return {key: value for key, value in data.items() if value is not None or key not in cls.model_fields}
 
     @model_validator(mode="wrap")
     @classmethod

@@ -129,7 +129,8 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
         CheckpointError: The sweep's record holds none that this version accepts.
     """
     try:
-        return SweepSpec.model_validate(record.spec)
+        # Another version may have fields that are null, and that this one doesn't know.
+        return SweepSpec.model_validate({key: value for key, value in record.spec.items() if value is not None})
     except WrongSpecError as error:
         told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
         raise CheckpointError(
@@ -208,7 +209,13 @@ def _read_text(source: str | Path) -> tuple[str, str]:
         if len(content) > _MAX_BYTES:
             raise SpecError(f"{path}: is larger than {_MAX_BYTES:,} bytes", "Name a sweep file; those are short.")
         return path.name, content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise SpecError(
+            f"{path}: can't be read: line {line} is no UTF-8, from byte {error.object[error.start]:#04x} on",
+            "Name a text file, and save it as UTF-8.",
+        ) from error
+    except OSError as error:
         raise SpecError(f"{path}: can't be read: {error}", "Name a text file that you may read.") from error
 
 
@@ -237,9 +244,21 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
         section = child
     if text.strip():
         section[last] = parse_yaml(text, f"--set {override if len(override) <= 80 else path}")
-    else:
+    elif last in section or _is_known(path):
         section.pop(last, None)
+    else:
+        section[last] = None  # there is no such field, which is told with all that is wrong
     return path
+
+
+def _is_known(path: str) -> bool:
+    """Whether a sweep file may have a field."""
+    section, *names = path.split(".")
+    if section in ("hyperparams", "space") and names:
+        return any(names[0] in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values())
+    field = SweepSpec.model_fields.get(section)
+    inner = getattr(field.annotation, "model_fields", {}) if field is not None else {}
+    return field is not None and (not names or names[0] in inner)
 
 
 def _is_set(path: str, set_paths: Sequence[str]) -> bool:

@@ -51,7 +51,17 @@ def parse_yaml(text: str, label: str) -> Any:
         _check_extent(node, label)
         return _Builder(label).build(node)
     except yaml.MarkedYAMLError as error:
-        raise SpecError(f"{label}{_place(error.problem_mark)}: {error.problem}", "Correct the YAML there.") from error
+        # Some say half of it in each: "expected a single document in the stream", "but found another document".
+        told = ", ".join(filter(None, (error.context, error.problem)))
+        if "'\\t'" in told:
+            told = "a tab stands where YAML takes spaces alone"
+        raise SpecError(f"{label}{_place(error.problem_mark)}: {told}", "Correct the YAML there.") from error
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise SpecError(
+            f"{label}, line {line}: the character {text[error.position]!a} is not allowed in YAML",
+            "Take it out, or write it as an escape in double quotes.",
+        ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SpecError(f"{label}: this is no YAML: {error}", "Correct the YAML.") from error
 

@@ -41,6 +41,8 @@ from tune_jobs.trial import TrialLoop
 # Reporting every iteration of a fast env costs more than the iteration.
 REPORT_INTERVAL_S = 1.0
 _POINTER = "pointer.json"
+_LONGEST_WATCH_S = 1e9
+"""Thirty years; the fault handler's clock overflows at 300."""
 
 
 class TrialLog:
@@ -120,7 +122,7 @@ def watchdog(timeout_s: float, file: IO[bytes]) -> Iterator[None]:
 
     A hung `env.step` has no time-out of its own with RLlib; Tune then starts a new process.
     """
-    faulthandler.dump_traceback_later(timeout_s, exit=True, file=file)
+    faulthandler.dump_traceback_later(min(timeout_s, _LONGEST_WATCH_S), exit=True, file=file)
     try:
         yield
     finally:

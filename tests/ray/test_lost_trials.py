@@ -13,7 +13,7 @@ from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.ray_processes import RayWatch
 from tune_jobs.record_keeper import RecordKeeper
 from tune_jobs.runner import RunJob, _TrialEvents, run_trials
-from tune_jobs.trainable import TrialTrainable
+from tune_jobs.trainable import TrialTrainable, watchdog
 
 pytestmark = pytest.mark.ray
 
@@ -23,6 +23,12 @@ def tune_trial(folder, trial_id, cause):
     path = folder / f"{trial_id}.pkl"
     path.write_bytes(cloudpickle.dumps(RayTaskError("step", "a traceback", cause)))
     return types.SimpleNamespace(config={"trial_id": trial_id}, pickled_error_file=str(path))
+
+
+@pytest.mark.parametrize("timeout_s", [1e9, 1e10, 1e300])
+def test_a_limit_of_any_size_can_be_watched(tmp_path, timeout_s):
+    with (tmp_path / "log").open("wb") as file, watchdog(timeout_s, file):
+        pass
 
 
 @pytest.mark.parametrize("event", ["on_trial_recover", "on_trial_error"])

@@ -290,6 +290,16 @@ def test_a_file_that_is_no_text(tmp_path):
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SpecError, match="can't be read"):
         load_spec(path)
+    path.write_bytes("env: CartPole-v1\nname: caf\u00e9\n".encode("latin-1"))
+    with pytest.raises(SpecError, match="can't be read: line 2 is no UTF-8, from byte 0xe9 on") as caught:
+        load_spec(path)
+    assert "UTF-8" in caught.value.hint
+
+
+@pytest.mark.parametrize(("penalty", "limit"), [(1e39, "at most"), (-1e300, "at least -")])
+def test_a_failure_penalty_that_is_infinite_to_learners_is_refused(penalty, limit):
+    told = errors(env={"id": "CartPole-v1", "failure_penalty": penalty})
+    assert f"env.failure_penalty: {penalty!r} is not allowed: it should be {limit}" in told
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a b", "-x", "x" * 101, "é", "x\n"])

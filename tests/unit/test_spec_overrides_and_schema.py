@@ -33,6 +33,19 @@ def test_set_overrides_and_creates_fields():
     assert spec.hyperparams["grad_clip"] is None
 
 
+@pytest.mark.parametrize(
+    "path",
+    ["num_samples", "stop", "stop.time_s", "env.args.x", "hyperparams.grad_clip", "hyperparams.tau", "space.gamma"],
+)
+def test_set_to_nothing_of_what_is_not_there_changes_nothing(path):
+    assert load_spec(MINIMAL, [f"{path}="]) == load_spec(MINIMAL)
+
+
+def test_an_empty_field_is_only_a_default_if_there_is_one():
+    assert load_spec({**MINIMAL, "stop": None}) == load_spec(MINIMAL)
+    assert "num_sample: there is no field 'num_sample' here." in errors(num_sample=None)
+
+
 def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed():
     assert "is fixed at 0.001 and searched" in errors(
         space={"lr": {"uniform": [1e-4, 1e-2]}}, overrides=["hyperparams.lr=1e-3"]
@@ -54,6 +67,11 @@ def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed():
         ("space.lr={uniform: [1, 0]}", "space.lr.uniform: goes from 1.0 to 0.0"),
         ("space.lr={uniform: [", "--set space.lr={uniform: [, line 1"),
         ("stopp.x=1", "stopp: there is no field"),
+        # There is nothing to take out.
+        ("num_sample=", "num_sample: there is no field 'num_sample' here. Did you mean 'num_samples'? (from --set)"),
+        ("stop.times_s=", "stop.times_s: there is no field 'times_s' here."),
+        ("hyperparams.lrr=", "hyperparams.lrr: ppo has no hyperparameter 'lrr'."),
+        ("space.lrr=", "space.lrr: "),
     ],
 )
 def test_bad_overrides(override, part):

@@ -27,6 +27,21 @@ def refused(text, label="x.yaml"):
 
 
 @pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\n---\na: 2\n", "line 2, column 1: expected a single document in the stream, but found another document"),
+        ("a: &x 1\nb: &x 2\n", "line 2, column 4: found duplicate anchor 'x'; first occurrence, second occurrence"),
+        ("a:\n\tb: 1\n", "line 2, column 1: a tab stands where YAML takes spaces alone"),
+        ("a: 1\t\nb: 2\n", "line 1, column 5: a tab stands where YAML takes spaces alone"),
+        ("a: 1\nb: \x07\n", r"line 2: the character '\x07' is not allowed in YAML"),
+        ("a: 1\nb: \udcff\n", r"line 2: the character '\udcff' is not allowed in YAML"),
+    ],
+)
+def test_what_is_no_yaml_is_told_in_whole_sentences_with_its_place(text, message):
+    assert refused(text) == f"x.yaml, {message}"
+
+
+@pytest.mark.parametrize(
     ("text", "value"),
     [
         ("", None), ("~", None), ("null", None), ("Null", None), ("true", True), ("FALSE", False),
