@@ -29,6 +29,7 @@ from typing import IO, Any, Self
 from policies.calls import PAGE_BYTES, Call, Page
 from policies.env_modules import ENVIRONMENT_VARIABLE, allowed_modules, module_folders
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
+from policies.standard_streams import standard_streams
 
 CALL_TIMEOUT_S = 600.0
 """How long one call may take, where no sweep says it."""
@@ -76,6 +77,10 @@ class _Child:
         self.surroundings = surroundings
         self.modules: set[str] = set()
         self.has_worked = False
+        with standard_streams():
+            self._begin()
+
+    def _begin(self) -> None:
         self.connection, theirs = Pipe()
         self._page_file: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (until `close`)
         self._page_file.truncate(PAGE_BYTES)
@@ -100,6 +105,15 @@ class _Child:
             ) from error
         finally:
             theirs.close()
+
+    @property
+    def was_lost(self) -> bool:
+        """Whether it has ended though nobody had asked it anything: by the system, where memory is scarce, say.
+
+        One that could not even begin has not, and is to say so.
+        """
+        code = self.process.poll()
+        return code is not None and (self.has_worked or code < 0)
 
     def frames(self) -> list[str]:
         """Where the user's code is or was, innermost first, as Python's fault handler wrote it."""
@@ -210,7 +224,9 @@ class EnvGuard:
         """A child that sees what this process would let it see now."""
         modules = set(allowed_modules())
         child = self._child
-        if child is not None and (child.surroundings != _Surroundings.now() or not child.modules <= modules):
+        if child is not None and (
+            child.was_lost or child.surroundings != _Surroundings.now() or not child.modules <= modules
+        ):
             self.close()
         self.start()
         assert self._child is not None

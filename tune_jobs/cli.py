@@ -12,6 +12,7 @@ import click
 
 from policies.errors import SpecError
 from policies.guard import guarding
+from policies.standard_streams import standard_streams
 from tune_jobs.cli_base import (
     DEBUG,
     CommandGroup,
@@ -310,7 +311,8 @@ def main() -> None:
     from tune_jobs.interruption import end_in_order
 
     end_in_order()
-    cli(prog_name="tune-jobs")
+    with standard_streams():
+        cli(prog_name="tune-jobs")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from policies.env_modules import allowed_again
+from policies.standard_streams import standard_streams
 
 # What a user's own module sets when it is imported is not among them: it would not be set again.
 _VARIABLES = ("RAY_", "TUNE_", "GRPC_", "PYTHONPATH", "PYTHONBREAKPOINT", "SDL_", "PYGAME_HIDE_SUPPORT_PROMPT")
@@ -30,6 +31,7 @@ _VARIABLES = ("RAY_", "TUNE_", "GRPC_", "PYTHONPATH", "PYTHONBREAKPOINT", "SDL_"
 def given_back() -> Iterator[None]:
     """Give back what the block changes of this process."""
     with contextlib.ExitStack() as stack:
+        stack.enter_context(standard_streams())
         stack.enter_context(warnings.catch_warnings())
         stack.enter_context(allowed_again())
         for keep in (_variables, _hooks, _signal_handlers, _loggers, _random_numbers, _file_limit):

@@ -221,6 +221,22 @@ def test_a_child_is_used_again_and_ends_with_its_block():
     assert not is_running(pid)
 
 
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None])
+@pytest.mark.parametrize("has_worked", [True, False])
+def test_a_child_that_died_while_nobody_asked_is_replaced(number, has_worked):
+    """By the system, where memory is scarce; None: an env's own thread ended it."""
+    with EnvGuard() as guard:
+        guard.start()
+        if has_worked or number is None:
+            guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
+        if number is None:
+            guard._child.connection.send_bytes(b"no JSON")
+        else:
+            guard._child.process.send_signal(number)
+        guard._child.process.wait()
+        assert guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)["env_id"] == "CartPole-v1"
+
+
 def test_one_block_within_another_shares_its_guard():
     with guarding() as outer, guarding() as inner:
         assert inner is outer

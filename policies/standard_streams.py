@@ -1,0 +1,43 @@
+"""Standard input, output and error of a process that was started without them, as daemons and some shells do.
+
+Whatever such a process opens next gets their numbers, and what is printed goes into it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+_STREAMS = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
+
+
+@contextlib.contextmanager
+def standard_streams() -> Iterator[None]:
+    """Let those that are closed lead nowhere in the block; child processes inherit them."""
+    with contextlib.ExitStack() as stack:
+        for number, (name, mode) in enumerate(_STREAMS):
+            if not _is_open(number):
+                # The lowest number that is free is this one.
+                opened = os.open(os.devnull, os.O_RDWR)
+                stack.callback(_close, opened)
+                os.set_inheritable(opened, True)  # noqa: FBT003 (takes no keyword)
+            if getattr(sys, name) is None:
+                stack.callback(setattr, sys, name, None)
+                setattr(sys, name, stack.enter_context(Path(os.devnull).open(mode, encoding="utf-8")))
+        yield
+
+
+def _is_open(number: int) -> bool:
+    try:
+        os.fstat(number)
+    except OSError:
+        return False
+    return True
+
+
+def _close(number: int) -> None:
+    with contextlib.suppress(OSError):
+        os.close(number)

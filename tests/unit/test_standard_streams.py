@@ -1,0 +1,63 @@
+"""Processes without standard streams, as daemons are: what they open next is not written over."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from policies.standard_streams import standard_streams
+
+# Closes descriptors, then starts a guard's child, and sends what is printed to a log, as a sweep does.
+SCRIPT = """
+import json, os, sys
+from pathlib import Path
+for number in json.loads(sys.argv[1]):
+    os.close(number)
+sys.stdout = None
+
+from policies.guarded import check_env
+from tune_jobs.live import quiet
+from tune_jobs.process_state import given_back
+
+said = {"env": check_env("CartPole-v1", {}).env_id}
+with given_back(), Path("mine.txt").open("w") as mine:
+    with quiet(Path("log.txt")):
+        print("by Python")
+        os.write(1, b"by a library")
+    mine.write("mine")
+said["stdout"] = sys.stdout is None
+said["open"] = [number for number in range(3) if os.path.exists(f"/proc/self/fd/{number}")]
+Path("said.json").write_text(json.dumps(said))
+"""
+
+
+@pytest.mark.parametrize("closed", [[1], [2], [0, 1, 2]])
+def test_a_process_without_standard_streams_works_and_stays_without(tmp_path, closed):
+    subprocess.run(
+        [sys.executable, "-c", SCRIPT, json.dumps(closed)], check=True, cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    said = json.loads((tmp_path / "said.json").read_text())
+    assert said == {"env": "CartPole-v1", "stdout": True, "open": [n for n in range(3) if n not in closed]}
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert "by a library" in (tmp_path / "log.txt").read_text()
+
+
+@pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
+def test_commands_run_where_nobody_listens(tmp_path, closed):
+    done = subprocess.run(
+        [sys.executable, "-m", "tune_jobs.cli", "list", "--storage", str(tmp_path)],
+        preexec_fn=lambda: [os.close(number) for number in closed],
+        stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_streams_that_are_there_stay_as_they_are():
+    before = [(os.fstat(number), getattr(sys, name)) for number, name in enumerate(("stdin", "stdout", "stderr"))]
+    with standard_streams():
+        now = [(os.fstat(number), getattr(sys, name)) for number, name in enumerate(("stdin", "stdout", "stderr"))]
+        assert now == before
