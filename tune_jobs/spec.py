@@ -7,6 +7,7 @@ Files, presets and `--set` are read by `spec_file.load_spec`.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
@@ -18,6 +19,7 @@ from pydantic import (
     Field,
     ModelWrapValidatorHandler,
     ValidationError,
+    create_model,
     model_validator,
 )
 
@@ -340,15 +342,19 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
     return problems
 
 
+@functools.cache
+def _alone(algorithm: Algorithm, name: str) -> type[BaseModel]:
+    """A hyperparameter without the checks across several: the plan makes these for each point."""
+    field = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields[name]
+    model: type[BaseModel] = create_model("Alone", **{name: (field.annotation, field)})  # type: ignore[call-overload]
+    return model
+
+
 def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -> list[Problem]:
-    model = HYPERPARAMS_BY_ALGORITHM[algorithm]
     try:
-        checked = getattr(model.model_validate({name: value}), name)
+        checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
     except ValidationError as error:
-        # An empty location is a check across fields, made here against defaults: the plan makes it for each
-        # point.
-        details = [detail for detail in details_of(error) if detail["loc"]]
-        return [Problem(path + dotted(detail["loc"][1:], root=False), explain(detail)) for detail in details]
+        return [Problem(path + dotted(detail["loc"][1:], root=False), explain(detail)) for detail in details_of(error)]
     if not _same_kind(value, checked):
         meant = list(checked) if isinstance(checked, tuple) else checked
         return [Problem(path, f"{value!r} is of the wrong type: write {meant!r} if that is meant")]

@@ -22,6 +22,8 @@ from tune_jobs.sweep_yaml import parse_yaml
 
 # What the characters that are read may take up at most, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
+_SECTIONS_OF_TEXT = {"env": "id", "scheduler": "type", "search": "type"}
+"""Sections that may be written as one text, and the field that it stands for."""
 
 
 class Preset(NamedTuple):
@@ -163,17 +165,30 @@ def json_schema() -> dict[str, Any]:
     properties = schema["properties"]
     properties["hyperparams"] = {"description": properties["hyperparams"]["description"]}
     properties["space"] = {"description": properties["space"]["description"]}
-    for section in ("env", "scheduler", "search"):
-        # These may also be written as one text.
+    for section, key in _SECTIONS_OF_TEXT.items():
+        text = definitions[properties[section]["$ref"].rpartition("/")[2]]["properties"][key]
         properties[section] = {
-            "anyOf": [{"type": "string"}, {"$ref": properties[section]["$ref"]}],
+            "anyOf": [{"type": "string"} | text, {"$ref": properties[section]["$ref"]}],
             "description": properties[section]["description"],
         }
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "tune-jobs sweep"} | {
-        **schema,
-        "title": "tune-jobs sweep file",
-        "allOf": rules,
-    }
+    for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
+        # A section whose lines are all commented out is null.
+        told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}
+        properties[name] = {"anyOf": [properties[name], {"type": "null"}], **told}
+    whole: dict[str, Any] = _with_limits({**schema, "title": "tune-jobs sweep file", "allOf": rules})
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | whole
+
+
+_LIMITS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+
+
+def _with_limits(schema: Any) -> Any:
+    """A schema with limits in JSON Schema's words: pydantic 2.14 leaves its own where a validator comes before them."""
+    if isinstance(schema, list):
+        return [_with_limits(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {_LIMITS.get(key, key): _with_limits(value) for key, value in schema.items()}
 
 
 def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -232,9 +247,9 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
     section = data
     for index, parent in enumerate(parents):
         child = section.get(parent)
-        if child is None or (isinstance(child, str) and parent in ("env", "scheduler", "search") and index == 0):
+        if child is None or (isinstance(child, str) and parent in _SECTIONS_OF_TEXT and index == 0):
             # `env: CartPole-v1` is short for a mapping, which --set env.args... has to go into.
-            child = {} if child is None else {{"env": "id", "scheduler": "type", "search": "type"}[parent]: child}
+            child = {} if child is None else {_SECTIONS_OF_TEXT[parent]: child}
             section[parent] = child
         if not isinstance(child, dict):
             here = ".".join(parents[: index + 1])

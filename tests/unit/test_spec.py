@@ -184,6 +184,10 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
         ({"hyperparams": {"lr": "1e-3"}}, ["hyperparams.lr: '1e-3' is of the wrong type"]),
         ({"hyperparams": {"num_epochs": True}}, ["hyperparams.num_epochs: True is of the wrong type"]),
         ({"hyperparams": {"vf_share_layers": 1}}, ["hyperparams.vf_share_layers: 1 is of the wrong type"]),
+        # Also where it doesn't go with the others, which is looked at in each point.
+        ({"hyperparams": {"lr_final": "5"}}, ["hyperparams.lr_final: '5' is of the wrong type"]),
+        ({"hyperparams": {"train_batch_size": True}}, ["hyperparams.train_batch_size: True is of the wrong type"]),
+        ({"space": {"lr_decay_steps": {"grid": ["5"]}}}, ["space.lr_decay_steps.grid[0]: '5' is of the wrong type"]),
         ({"hyperparams": {"hidden_sizes": [32, 0]}}, ["hyperparams.hidden_sizes[1]: 0 is not allowed"]),
         ({"hyperparams": {"hidden_sizes": []}}, ["hyperparams.hidden_sizes"]),
         (

@@ -1,9 +1,13 @@
 """Sweep files: `--set`, and their JSON Schema."""
 
 import pytest
+from pydantic import BaseModel
 from spec_errors import MINIMAL, errors
 
 from policies.errors import SpecError
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.search_space import DOMAIN_KINDS
+from tune_jobs.spec import SweepSpec
 from tune_jobs.spec_file import json_schema, list_presets, load_spec
 
 # -- --set
@@ -121,6 +125,53 @@ def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
     ]
     for wrong in bad:
         assert list(validator.iter_errors(wrong)), wrong
+
+
+VALUES = [
+    None, True, 0, 1, -1, 1.5, 5.0, 1e3, 1e6, "", "5", "x", "m:C", "asha", "relu", [], [1], [1.5], ["a"], [[1, 2]],
+    [[1, 2, 3]], {}, {"a": 1}, {"grid": [8]}, {"grid": []},
+]  # fmt: skip
+
+
+def fields(model=SweepSpec, path=()):
+    for name, field in model.model_fields.items():
+        yield (*path, name)
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from fields(field.annotation, (*path, name))
+
+
+CASES = [
+    *(("ppo", path) for path in fields()),
+    *(("ppo", ("space", "lr", kind)) for kind in DOMAIN_KINDS if kind not in ("grid", "choice")),
+    *(
+        (algorithm, ("hyperparams", name))
+        for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items()
+        for name in model.model_fields
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "path"), CASES, ids=lambda part: part if isinstance(part, str) else ".".join(part)
+)
+def test_the_schema_and_the_model_refuse_the_same_values_of_a_field(algorithm, path):
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(json_schema())
+    for value in VALUES:
+        data = {"env": {"id": "x"}, "algorithm": algorithm}
+        section = data
+        for name in path[:-1]:
+            section = section.setdefault(name, {})
+        section[path[-1]] = value
+        try:
+            load_spec(data)
+        except SpecError as error:
+            # Told by the field itself, not by what goes together.
+            words = ("it should be", "is not a number", "of the wrong type")
+            told = [problem for problem in error.problems if any(word in problem.text for word in words)]
+            assert not told or list(validator.iter_errors(data)), value
+        else:
+            assert list(validator.iter_errors(data)) == [], value
 
 
 def test_the_schema_accepts_every_preset():
