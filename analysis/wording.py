@@ -75,5 +75,9 @@ def is_number(value: Any) -> bool:
 
 def shown_path(path: Path) -> str:
     """A path as a user would type it: relative where it lies below the current folder."""
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # it was deleted
+        return str(path)
     absolute = path.absolute()
-    return str(absolute.relative_to(Path.cwd())) if absolute.is_relative_to(Path.cwd()) else str(absolute)
+    return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)

@@ -21,6 +21,20 @@ _WRITER = re.compile(r"\.((?P<place>[0-9a-f]{8})-)?(?P<pid>[0-9]+)-[0-9a-f]{8}(\
 _ABANDONED_AFTER_S = 24 * 3600.0
 
 
+def absolute(path: Path) -> Path:
+    """A path from the root.
+
+    Raises:
+        CannotRunError: It is relative, and the working directory was deleted.
+    """
+    try:
+        return path.absolute()
+    except FileNotFoundError as error:
+        raise CannotRunError(
+            "The folder that this process works in was deleted.", "Change to one that exists, with `cd`, and try again."
+        ) from error
+
+
 def write_atomic(path: Path, data: bytes | str) -> None:
     """Write a file so that its name always holds either the old content or all of the new.
 

@@ -29,6 +29,7 @@ from typing import IO, Any, Self
 from policies.calls import PAGE_BYTES, Call, Page
 from policies.env_modules import ENVIRONMENT_VARIABLE, allowed_modules, module_folders
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
+from policies.files import absolute
 from policies.standard_streams import standard_streams
 
 CALL_TIMEOUT_S = 600.0
@@ -63,7 +64,7 @@ class _Surroundings:
 
     @classmethod
     def now(cls) -> _Surroundings:
-        folders = [os.getcwd()]  # noqa: PTH109 (sys.path holds strings)
+        folders = [str(absolute(Path()))]
         script = os.path.dirname(os.path.realpath(sys.argv[0]))  # noqa: PTH120 (as Ray finds it)
         if hasattr(sys.modules.get("__main__"), "__file__") and script in sys.path:
             folders.append(script)

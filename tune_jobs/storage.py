@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from policies.errors import SpecError
+from policies.files import absolute
 from tune_jobs.spec import check_sweep_name
 from tune_jobs.store import SweepStore, name_taken
 
@@ -15,7 +16,7 @@ DEFAULT_STORAGE = "sweeps"
 def storage_folder(storage: str | Path | None) -> Path:
     """The given folder, else $TUNE_JOBS_STORAGE, else ./sweeps; absolute."""
     chosen = storage or os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
-    return expanded(chosen).absolute()
+    return absolute(expanded(chosen))
 
 
 def expanded(path: str | Path) -> Path:

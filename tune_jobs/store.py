@@ -17,7 +17,7 @@ from pathlib import Path
 
 from analysis.records import BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from policies.files import write_atomic
+from policies.files import absolute, write_atomic
 from tune_jobs.locks import held, is_held
 from tune_jobs.logs import log_tail
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
@@ -212,7 +212,7 @@ class SweepStore:
 
     def __init__(self, folder: Path) -> None:
         # Ray takes only absolute paths for storage ("URI has empty scheme" otherwise).
-        self.folder = folder.absolute()
+        self.folder = absolute(folder)
         self.record_path = self.folder / "sweep.json"
         self._stop_path = self.folder / ".stop"
         self._lock_path = self.folder / ".lock"

@@ -2,17 +2,21 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from spec_errors import MINIMAL
 
-from policies.errors import CheckpointError, SpecError
+from analysis.wording import shown_path
+from policies.errors import CannotRunError, CheckpointError, SpecError
+from policies.guard import guarding
 from tune_jobs import sweeps
 from tune_jobs.driving import write_new
 from tune_jobs.machine import Machine
 from tune_jobs.plan import make_plan
 from tune_jobs.spec_file import load_spec
 from tune_jobs.storage import create_store, storage_folder
+from tune_jobs.store import SweepStore
 
 
 def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path):
@@ -87,3 +91,30 @@ def test_a_sweep_of_the_same_points_again_is_not_extended(tmp_path, space, why):
     with pytest.raises(SpecError, match=f"cannot be extended: {why}.*\n.*seeds_per_point"):
         sweeps.extend("mine", 1, storage=tmp_path)
     assert {path: path.read_bytes() for path in store.folder.rglob("*.json")} == before
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: storage_folder(None),
+        lambda: SweepStore(Path("mine")),
+        lambda: sweeps.list_sweeps(),
+        lambda: sweeps.launch(MINIMAL, name="new", progress="none"),
+        lambda: guarding(start=True).__enter__(),
+    ],
+)
+def test_a_working_directory_that_was_deleted_is_said(tmp_path, monkeypatch, use):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(CannotRunError, match="The folder that this process works in was deleted"):
+        use()
+
+
+def test_where_the_working_directory_was_deleted_whole_paths_do(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert sweeps.list_sweeps(tmp_path) == []
+    assert shown_path(tmp_path / "index.html") == str(tmp_path / "index.html")
