@@ -9,7 +9,7 @@ from spec_errors import MINIMAL
 
 from analysis.wording import shown_path
 from policies.errors import CannotRunError, CheckpointError, SpecError
-from policies.guard import guarding
+from policies.guard import EnvGuard
 from tune_jobs import sweeps
 from tune_jobs.driving import write_new
 from tune_jobs.machine import Machine
@@ -98,9 +98,9 @@ def test_a_sweep_of_the_same_points_again_is_not_extended(tmp_path, space, why):
     [
         lambda: storage_folder(None),
         lambda: SweepStore(Path("mine")),
-        lambda: sweeps.list_sweeps(),
+        sweeps.list_sweeps,
         lambda: sweeps.launch(MINIMAL, name="new", progress="none"),
-        lambda: guarding(start=True).__enter__(),
+        EnvGuard().start,
     ],
 )
 def test_a_working_directory_that_was_deleted_is_said(tmp_path, monkeypatch, use):
