@@ -55,6 +55,18 @@ _NO_TARGET_UPDATE = Rule(
 )
 
 
+def _target_follows_updates(h: DQNHyperparams, limits: Limits) -> bool:
+    """Whether the target network is updated after each update, whatever exactly the interval."""
+    if h.target_update_interval is None:
+        return True
+    if h.target_update_unit == "episode" or not limits.is_packed:  # RLlib's env runners may share a phase
+        return False
+    phase = math.ceil(h.train_freq / h.num_envs) * h.num_envs
+    most = math.ceil(phase * h.updates_per_env_step)
+    # Several are spread over their phase, at env steps that are fractions, and rounded.
+    return h.target_update_interval <= (phase if most == 1 else phase / most - 1e-6)
+
+
 def _schedule_is_over(h: DQNHyperparams, _: Limits) -> bool:
     return h.lr_final is not None and h.lr_decay_steps is not None and h.lr_decay_steps <= _first_update(h)
 
@@ -160,6 +172,12 @@ DQN_RULES: dict[str, Rules] = {
             "it is more than the env steps of a trial (at most {steps}), so the target network stays as it was",
             _updates_no_target,
             ("target_update_freq", *_LIMITS),
+            of_value=True,
+        ),
+        Rule(
+            "there are not fewer env steps between two updates, so the target network follows each",
+            _target_follows_updates,
+            ("target_update_freq", "tau", "target_update_unit", "train_freq", "num_envs", "updates_per_env_step"),
             of_value=True,
         ),
     ),

@@ -122,6 +122,7 @@ CASES = {
         no_update(5, 40),
         Case((5, 40), {"gamma": 0.0}, {}),
         Case((121, 999), other=40),
+        Case((1, 4), {"updates_per_env_step": 0.25}, other=9),
     ],
     ("dqn", "target_update_unit"): [
         Case(("env_step", "episode"), NO_TARGET, {"double_q": False}),

@@ -38,6 +38,7 @@ NEVER = {
         {**DQN, "hyperparams": {"epsilon_initial": 0.1, "epsilon_final": 0.1}}, grid(epsilon_decay=[10, 100]),
         "epsilon_initial is epsilon_final",
     ),
+    "target_update_freq": (DQN, grid(target_update_freq=[1, 2, 4]), "not fewer env steps between two updates"),
     "train_freq": ({**DQN, "hyperparams": {"num_envs": 8}}, grid(train_freq=[1, 4, 8]), "not more than num_envs"),
     "n_step": (
         {**DQN, "env": {"id": "CartPole-v1", "args": {"max_episode_steps": 5}}}, grid(n_step=[5, 9]), "no episode has",
