@@ -208,7 +208,10 @@ def _run_sweep(
             max_env_steps_per_trial=spec.stop.num_env_steps,
             max_concurrent=plan.max_concurrent,
         )
-        _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
+        try:
+            _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
+        finally:
+            run.release()
         _close_if_open(store)
     from tune_jobs.candidates import read_trials
 

@@ -53,9 +53,18 @@ class Owner:
         self._lock = threading.Lock()
 
     def __del__(self) -> None:
-        if self._descriptor is not None:
+        self._close()
+
+    def release(self) -> None:
+        """Close its file, which is opened again if it is needed: who holds this object may be in no hurry to let go."""
+        with self._lock:
+            self._close()
+
+    def _close(self) -> None:
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
             with contextlib.suppress(OSError):
-                os.close(self._descriptor)
+                os.close(descriptor)
 
     @classmethod
     def take(cls, path: Path, under: Owner | None = None) -> Owner:

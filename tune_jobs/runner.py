@@ -104,6 +104,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         finally:
             with current().shielded():
                 run.keeper.close()
+                owner.release()
 
 
 class _Run:

@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -204,6 +205,22 @@ def test_a_signal_while_a_sweeps_new_trials_are_written_is_not_forgotten(store, 
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.resume(store.folder, progress="none")
     assert caught.value.result.sweep.state == "interrupted"
+
+
+@pytest.mark.parametrize("error", [CannotRunError("no Ray"), KeyboardInterrupt()])
+def test_a_run_leaves_no_file_of_its_sweep_open(store, monkeypatch, error):
+    """Also while somebody holds what was raised, or nobody has collected garbage."""
+    pend(store)
+
+    def connect(*_):
+        raise error
+
+    monkeypatch.setattr(driving, "connected", connect)
+    with pytest.raises((CannotRunError, SweepInterrupted)) as caught:
+        sweeps.resume(store.folder, progress="none")
+    links = [link for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    assert [link for link in links if str(link.readlink()).startswith(str(store.folder))] == []
+    assert caught.value is not None
 
 
 def test_a_loop_over_launches_stops_at_the_first_signal(store, monkeypatch):

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -32,6 +33,21 @@ def test_who_takes_it_has_a_larger_epoch_and_who_had_it_has_lost_it(path):
         first.check()
     with second.held():
         pass
+
+
+def open_files(folder):
+    links = [link for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    return [link for link in links if str(link.readlink()).startswith(str(folder))]
+
+
+def test_a_released_owner_has_no_file_open_and_can_still_write(path):
+    owner = Owner.take(path)
+    for _ in range(2):
+        with owner.held():
+            assert len(open_files(path.parent)) == 1
+        owner.release()
+        assert open_files(path.parent) == []
+    assert owner.is_current()
 
 
 def test_a_token_can_be_passed_on(path):
