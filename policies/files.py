@@ -1,16 +1,23 @@
-"""Files that a reader never sees half of: written under a temporary name, synced, then renamed into place."""
+"""Files that a reader never sees half of: written under a temporary name, synced, then renamed into place.
+
+And files that others may have put there: who opens a named pipe waits for its other end, perhaps for ever, and a device
+may give bytes without end. What is opened here is a regular file.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
 import os
 import platform
 import re
 import secrets
+import stat
 import time
 from collections.abc import Iterator
+from io import BufferedReader, BufferedWriter
 from pathlib import Path
 
 from policies.errors import CannotRunError
@@ -19,6 +26,81 @@ from policies.errors import CannotRunError
 _WRITER = re.compile(r"\.((?P<place>[0-9a-f]{8})-)?(?P<pid>[0-9]+)-[0-9a-f]{8}(\.\w+)?")
 # What cannot be seen from here, as it is another machine's, is nobody's after so long.
 _ABANDONED_AFTER_S = 24 * 3600.0
+_OTHER_KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"}
+MAX_RECORD_BYTES = 64 * 2**20
+"""Of a file that is one record: far more than any has."""
+
+
+class RefusedFileError(OSError):
+    """It is no file, or far too large; it stays so, where other errors of reading may pass."""
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a file to read, without waiting for anybody.
+
+    Raises:
+        OSError: It cannot be opened, or is no file but a folder, a named pipe, a socket or a device.
+    """
+    return open(path, "rb", opener=_open_at_once)
+
+
+def open_to_append(path: Path) -> BufferedWriter:
+    """Open a log or another file that grows; missing parent folders are made.
+
+    Raises:
+        CannotRunError: It cannot be written, or is no file.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return open(path, "ab", opener=_open_at_once)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
+def read_regular(path: Path, max_bytes: int | None = MAX_RECORD_BYTES) -> bytes:
+    """The content of a file.
+
+    Args:
+        path: The file.
+        max_bytes: A larger one is not read; None: there is no bound.
+
+    Raises:
+        OSError: It cannot be read, is larger, or is no file.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if max_bytes is not None and size > max_bytes:
+            raise RefusedFileError(
+                errno.EFBIG, f"it has {size:,} bytes, and no more than {max_bytes:,} are read", str(path)
+            )
+        return file.read()
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    # Asked first, as opening a device may do something; and again, as there may be another one by then.
+    with contextlib.suppress(FileNotFoundError):
+        refuse_others(os.stat(path), path)  # noqa: PTH116 (as `open` gives it)
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
+    try:
+        refuse_others(os.fstat(descriptor), path)
+        if hasattr(os, "O_NONBLOCK"):
+            # It stays with the file, and so with the processes that it is passed on to.
+            os.set_blocking(descriptor, True)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def refuse_others(found: os.stat_result, path: str | Path) -> None:
+    """Raise unless it is a regular file.
+
+    Raises:
+        RefusedFileError: It is not; the text says what it is.
+    """
+    if not stat.S_ISREG(found.st_mode):
+        kind = _OTHER_KINDS.get(stat.S_IFMT(found.st_mode), "device")
+        raise RefusedFileError(errno.EINVAL, f"it is a {kind}, not a file", str(path))
 
 
 def absolute(path: Path) -> Path:
@@ -141,7 +223,7 @@ def _cannot_write(path: Path, error: OSError) -> CannotRunError:
 
 def sha256_file(path: Path) -> str:
     """SHA-256 of a file's content, as 64 lower-case hexadecimal digits."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

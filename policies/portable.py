@@ -21,7 +21,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from policies.errors import MALFORMED, CheckpointError, NotFoundError
-from policies.files import write_atomic
+from policies.files import read_regular, write_atomic
 from policies.policy_network import (
     BASELINE_KINDS,
     ConvLayer,
@@ -127,9 +127,9 @@ def read_policy(path: Path) -> PortablePolicy:
     """
     json_path, weights_path = _locate(Path(path))
     try:
-        description = json.loads(json_path.read_text(encoding="utf-8"))
-        weights = weights_path.read_bytes()
-    except (ValueError, RecursionError) as error:  # JSON and UTF-8 errors are both ValueErrors
+        description = json.loads(read_regular(json_path))
+        weights = read_regular(weights_path, max_bytes=None)
+    except (ValueError, RecursionError, MemoryError) as error:  # JSON and UTF-8 errors are both ValueErrors
         raise _broken(json_path, f"is not JSON: {error}") from error
     except OSError as error:
         raise NotFoundError(

@@ -13,6 +13,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from policies.files import read_regular
+
 _FORMAT = "=4d"
 _SIZE = struct.calcsize(_FORMAT)
 _ITERATIONS, _STEPS, _EPISODES, _TIME = range(4)
@@ -77,7 +79,7 @@ class Tally:
 def read_tally(path: Path) -> Reached | None:
     """What a tally's file says; None: there is none, or it is none."""
     try:
-        return _reached(*struct.unpack(_FORMAT, path.read_bytes()))
+        return _reached(*struct.unpack(_FORMAT, read_regular(path, _SIZE)))
     except (OSError, struct.error, ValueError, OverflowError):
         return None
 

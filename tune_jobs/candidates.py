@@ -18,8 +18,10 @@ from pathlib import Path
 from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
 from analysis.selection import Selection, select_best
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
+from policies.files import read_regular
 from policies.portable import PortablePolicy, read_policy
 from tune_jobs.manifests import verify_checkpoint
+from tune_jobs.results_file import MAX_RESULTS_BYTES
 from tune_jobs.store import SweepStore, TrialStore
 
 _LOG = logging.getLogger(__name__)
@@ -130,8 +132,11 @@ def _recorded(path: Path, wanted: set[int]) -> dict[int, list[_Numbers]]:
     """What a trial's results say of some iterations; lines that cannot be read say nothing."""
     found: defaultdict[int, list[_Numbers]] = defaultdict(list)
     try:
-        lines = path.read_bytes().split(b"\n")[:-1]
-    except OSError:
+        lines = read_regular(path, MAX_RESULTS_BYTES).split(b"\n")[:-1]
+    except FileNotFoundError:
+        return found
+    except OSError as error:
+        leave_out(CheckpointError(f"{path} cannot be read: {error.strerror or error}."))
         return found
     for line in lines:
         begins = _BEGINNING.match(line)

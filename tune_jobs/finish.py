@@ -53,8 +53,15 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepSto
 
 
 def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
-    """Every trial's results, by trial id."""
-    return {record.trial_id: store.trial(record.trial_id).read_iterations() for record in store.read_trials()}
+    """Every trial's results, by trial id; none, with a warning, of a trial whose file cannot be read at all."""
+    found = {}
+    for record in store.read_trials():
+        try:
+            found[record.trial_id] = store.trial(record.trial_id).read_iterations()
+        except CheckpointError as error:
+            leave_out(error)
+            found[record.trial_id] = []
+    return found
 
 
 @guarding()

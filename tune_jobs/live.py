@@ -19,6 +19,7 @@ from rich.text import Text
 
 from analysis.records import FINISHED, TrialRecord
 from analysis.selection import Selection
+from policies.files import open_to_append
 from tune_jobs.cli_output import format_duration, format_score, format_value
 from tune_jobs.interruption import current
 from tune_jobs.monitor import SweepMonitor
@@ -224,7 +225,7 @@ def quiet(log: Path) -> Iterator[IO[str]]:
     """Send standard output and error to a file, C++ included; gives a stream to the real standard error."""
     _flush()
     with contextlib.ExitStack() as stack:
-        file = stack.enter_context(log.open("ab"))
+        file = stack.enter_context(open_to_append(log))
         stream = stack.enter_context(_PatientStream(os.fdopen(os.dup(2), "wb"), encoding="utf-8"))
         _shown_on.append(stream)
         stack.callback(_shown_on.remove, stream)

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from policies.errors import CannotRunError
+from policies.files import refuse_others
 
 _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 _PATIENCE_S = 60.0
@@ -35,8 +36,7 @@ def held(path: Path, message: str, hint: str) -> Iterator[None]:
         CannotRunError: Another process holds it, or it cannot be written or locked.
     """
     try:
-        # Not through a symbolic link: the file it points to is none of ours.
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        descriptor = _opened(path, os.O_RDWR | os.O_CREAT)
     except OSError as error:
         reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
         raise CannotRunError(
@@ -58,7 +58,7 @@ def is_held(path: Path) -> bool:
     """
     try:
         # Read only: of a sweep of somebody else's, too, one may know whether it runs.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = _opened(path, os.O_RDONLY)
     except FileNotFoundError:
         return False
     except OSError as error:
@@ -73,6 +73,17 @@ def is_held(path: Path) -> bool:
         return False
     finally:
         os.close(descriptor)
+
+
+def _opened(path: Path, flags: int) -> int:
+    # Not through a symbolic link: the file it points to is none of ours. Nor does it wait for a pipe's other end.
+    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
+    try:
+        refuse_others(os.fstat(descriptor), path)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
 
 
 def _take(path: Path, descriptor: int) -> bool:

@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 from policies.env_faults import Frame, frame_of_env
+from policies.files import open_regular
 
 _TAIL_BYTES = 200_000
 _TIMEOUT_MARK = "Timeout ("
@@ -42,7 +43,7 @@ def log_tail(path: Path, what: str = "", num_lines: int = 15) -> str:
         The frames of the thread that hung, or the last lines; empty if there is no log.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
             lines = file.read().decode("utf-8", errors="replace").splitlines()
     except OSError:

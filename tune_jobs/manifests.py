@@ -15,7 +15,7 @@ from typing import Any
 
 from analysis.records import CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
-from policies.files import sha256_file, write_plain
+from policies.files import refuse_others, sha256_file, write_plain
 from tune_jobs.places import refuse_link
 from tune_jobs.record_files import dump_sealed, parse_record, read_json
 
@@ -113,13 +113,17 @@ def _files_in(folder: Path) -> dict[str, Path]:
     """The files of a checkpoint by name, without its manifest.
 
     Raises:
-        CheckpointError: Something in it is a symbolic link.
+        CheckpointError: Something in it is a symbolic link, or neither a file nor a folder.
     """
     files = {}
     for path in sorted(folder.rglob("*")):
         refuse_link(path)
         name = path.relative_to(folder).as_posix()
         if not path.is_dir() and name != MANIFEST:
+            try:
+                refuse_others(path.stat(), path)
+            except OSError as error:
+                raise CheckpointError(f"Checkpoint {folder}: of {name}, {error.strerror}.", _HINT) from error
             files[name] = path
     return files
 

@@ -24,6 +24,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from policies.errors import CannotRunError
+from policies.files import open_regular, refuse_others
 from tune_jobs.places import within
 
 OWNER_FILE = ".owner"
@@ -129,8 +130,9 @@ class Owner:
             try:
                 if self._descriptor is None:
                     self.path.parent.mkdir(parents=True, exist_ok=True)
-                    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+                    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
                     self._descriptor = os.open(self.path, flags, 0o666)
+                refuse_others(os.fstat(self._descriptor), self.path)
                 self._wait(self._descriptor)
             except OSError as error:
                 raise CannotRunError(
@@ -208,4 +210,5 @@ def _read(descriptor: int) -> str:
 
 
 def _line(path: Path) -> str:
-    return path.read_text(encoding="ascii", errors="replace").strip()
+    with open_regular(path) as file:
+        return file.read(_LINE_BYTES).decode("ascii", "replace").strip()

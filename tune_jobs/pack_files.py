@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from policies.errors import MALFORMED, CheckpointError, NotFoundError
-from policies.files import write_atomic
+from policies.files import read_regular, write_atomic
 from tune_jobs.logs import begin_log, log_tail
 from tune_jobs.ownership import OWNER_FILE
 from tune_jobs.places import check_trial_id, within
@@ -66,7 +66,7 @@ class PackFiles:
             CheckpointError: It is not there, or cannot be read.
         """
         try:
-            data = json.loads(self.assignment_path.read_bytes())
+            data = json.loads(read_regular(self.assignment_path))
             trial_ids = tuple(check_trial_id(trial_id) for trial_id in data["trial_ids"])
             failures = {check_trial_id(trial_id): int(number) for trial_id, number in data["num_failures"].items()}
             return Assignment(trial_ids, failures)

@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 
 from analysis.records import TRIAL_ID_PATTERN
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
 
 _CHECKPOINT_NAME = re.compile(r"[0-9]{6,19}")
 _TRIAL_ID = re.compile(TRIAL_ID_PATTERN)
@@ -96,3 +96,32 @@ def remove_folder(folder: Path) -> None:
     refuse_link(folder)
     # It leaves links in the folder unfollowed by itself.
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder that is not there yet, and those above it.
+
+    Raises:
+        CannotRunError: It cannot be made: something else is in its place, say.
+    """
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise CannotRunError(
+            f"The folder {folder} cannot be made: {error.strerror or error}.",
+            "Check that what it lies in is a folder, is writable and has free space.",
+        ) from error
+
+
+def remove_file(path: Path) -> None:
+    """Delete a file, if it is there.
+
+    Raises:
+        CannotRunError: It cannot be deleted: it is a folder, say.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise CannotRunError(
+            f"{path} cannot be removed: {error.strerror or error}.", "Remove it, and try again."
+        ) from error

@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError, NotFoundError
+from policies.files import read_regular
 from tune_jobs.spec_problems import details_of, dotted, explain
 
 _RecordT = TypeVar("_RecordT", bound=BaseModel)
@@ -60,14 +61,14 @@ def read_record(path: Path, kind: type[_RecordT], what: str, *, is_sealed: bool 
 def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, Any]:
     """Read the fields of a record; see `read_record`."""
     try:
-        data = json.loads(path.read_bytes())
+        data = json.loads(read_regular(path), object_pairs_hook=_once_each, parse_constant=_refuse_constant)
         # Half a pair of surrogates is JSON, but no text that could be shown or written again.
         json.dumps(data, ensure_ascii=False).encode()
     except FileNotFoundError as error:
         raise NotFoundError(f"No {what} at {path}.", "List the sweeps here with `tune-jobs list`.") from error
     except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(
-            f"{path} cannot be read as {what}: {error}.",
+            f"{path} cannot be read as {what}: {(error.strerror if isinstance(error, OSError) else None) or error}.",
             "Restore the file from a backup, or delete the folder.",
         ) from error
     if not isinstance(data, dict):
@@ -86,6 +87,20 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
             "Restore the file from a backup: what it says now is not used.",
         )
     return data
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object whose names differ: of two values readers would not take the same one."""
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in data if names.count(name) > 1)
+        raise ValueError(f"{twice[:80]!r} is there twice")
+    return data
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
 
 
 def _seal_of(data: dict[str, Any]) -> str | None:

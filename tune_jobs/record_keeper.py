@@ -153,7 +153,9 @@ class RecordKeeper:
 
     def _forget_tally(self, trial_id: str) -> None:
         """What is in a process's tally is in the record now, or its trial is over."""
-        self._store.trial(trial_id).tally_path.unlink(missing_ok=True)
+        # Where it is a folder, it is no tally, and read by nobody.
+        with contextlib.suppress(OSError):
+            self._store.trial(trial_id).tally_path.unlink(missing_ok=True)
 
     def flush(self) -> None:
         """Write what is due: first what was written longest ago."""

@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 
 from analysis.records import FORMAT_VERSION, CheckpointRecord
-from policies.errors import NotFoundError
+from policies.errors import CheckpointError, NotFoundError
+from policies.files import RefusedFileError, open_to_append, read_regular
 from tune_jobs.places import within
 from tune_jobs.record_files import seal
 from tune_jobs.results_file import ResultsFile, read_results
@@ -24,10 +25,10 @@ DAMAGED_RESULTS = "results.damaged"
 
 def write_log(path: Path, text: str) -> None:
     """Append to a trial's log what concerns this trial, whatever the process prints elsewhere."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # What an env raised may be no text that UTF-8 has.
-    with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
-        file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n")
+    line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
+    with open_to_append(path) as file:
+        # What an env raised may be no text that UTF-8 has.
+        file.write(line.encode(errors="backslashreplace"))
 
 
 def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
@@ -37,11 +38,20 @@ def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
 
     Returns:
         What can be read, and what to tell of the rest.
+
+    Raises:
+        CheckpointError: They cannot be read now.
     """
-    found = read_results(trial.results_path)
+    try:
+        found = read_results(trial.results_path)
+    except CheckpointError as error:
+        if not isinstance(error.__cause__, RefusedFileError):
+            raise
+        target = set_aside(trial, trial.results_path)
+        return ResultsFile(), [f"{error.message} It is kept as {target}; the trial goes on without it."]
     unreadable = [bad.content for bad in found.bad] + ([found.tail] if found.tail else [])
     if unreadable:
-        with trial.owned(), within(trial.folder, DAMAGED_RESULTS).open("ab") as file:
+        with trial.owned(), open_to_append(within(trial.folder, DAMAGED_RESULTS)) as file:
             file.write(b"".join(content + b"\n" for content in unreadable))
     if found.tail:
         # What every kill may leave, and no damage: it is done again.
@@ -101,7 +111,7 @@ def take_up_copy(trial: TrialStore, folder: Path) -> tuple[Path | None, list[str
 
 
 def set_aside(trial: TrialStore, folder: Path, prefix: str = "") -> str:
-    """Move a folder to where nobody takes it for a checkpoint.
+    """Move a folder to where nobody takes it for a checkpoint, or what is no file to where nobody takes it for one.
 
     Returns:
         Where it lies now, from the trial's folder.
@@ -113,7 +123,7 @@ def set_aside(trial: TrialStore, folder: Path, prefix: str = "") -> str:
         target = target.with_name(f"{prefix}{folder.name}-{number}")
     with trial.owned():
         target.parent.mkdir(exist_ok=True)
-        if folder.is_dir():
+        if folder.exists():
             folder.replace(target)
     return f"{DAMAGED_FOLDER}/{target.name}"
 
@@ -130,10 +140,10 @@ def _damaged(folder: Path, error: NotFoundError) -> Path:
     Raises:
         NotFoundError: It is not, or may pass.
     """
-    if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError):
+    if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError | RefusedFileError):
         raise error
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        manifest = json.loads(within(folder, MANIFEST).read_bytes())
+        manifest = json.loads(read_regular(within(folder, MANIFEST)))
         # A version beyond ours is no flipped bit if the seal holds.
         if manifest["format_version"] > FORMAT_VERSION and manifest["sha256"] == seal(manifest):
             raise error

@@ -18,8 +18,12 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from analysis.records import IterationRecord
+from policies.errors import CheckpointError
+from policies.files import read_regular
 
 _SHOWN_BYTES = 60
+MAX_RESULTS_BYTES = 2**30
+"""Of a trial of a million iterations."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,17 @@ def read_results(path: Path) -> ResultsFile:
     """Read what can be read; an empty one if there is no file.
 
     Raises:
-        OSError: It is there and cannot be read at all.
+        CheckpointError: It is there and cannot be read at all.
     """
     try:
-        *lines, tail = path.read_bytes().split(b"\n")
+        *lines, tail = read_regular(path, MAX_RESULTS_BYTES).split(b"\n")
     except FileNotFoundError:
         return ResultsFile()
+    except OSError as error:
+        raise CheckpointError(
+            f"{path} cannot be read: {error.strerror or error}.",
+            "Move it away; the trial goes on from its latest checkpoint, without this part of its curve.",
+        ) from error
     bad: list[BadLine] = []
     read: list[tuple[int, bytes, IterationRecord]] = []
     for number, line in enumerate(lines, start=1):

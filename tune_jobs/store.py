@@ -17,7 +17,7 @@ from pathlib import Path
 
 from analysis.records import BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from policies.files import absolute, write_atomic
+from policies.files import absolute, open_to_append, write_atomic
 from tune_jobs.locks import held, is_held
 from tune_jobs.logs import log_tail
 from tune_jobs.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
@@ -26,8 +26,10 @@ from tune_jobs.places import (
     check_trial_id,
     checkpoint_iteration,
     is_trial_id,
+    make_folder,
     refuse_link,
     refuse_links_in,
+    remove_file,
     remove_folder,
     within,
 )
@@ -101,7 +103,6 @@ class TrialStore(OwnedFolder):
 
     def write_record(self, record: TrialRecord) -> None:
         """Replace trial.json."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         write_atomic(self.record_path, dump(record))
 
     def append_iterations(self, records: Sequence[IterationRecord]) -> None:
@@ -109,8 +110,8 @@ class TrialStore(OwnedFolder):
         if not records:
             return
         text = "".join(dump(record, indent=None) for record in records)
-        with self.owned(), self.results_path.open("a", encoding="utf-8") as file:
-            file.write(text)
+        with self.owned(), open_to_append(self.results_path) as file:
+            file.write(text.encode())
 
     def read_iterations(self) -> list[IterationRecord]:
         """Every line of results.jsonl that can be read, in order, with a warning for others; empty without a file."""
@@ -121,7 +122,6 @@ class TrialStore(OwnedFolder):
 
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
         """Replace results.jsonl by these lines: those up to the checkpoint a trial goes on from."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         text = "".join(dump(record, indent=None) for record in records)
         with self.owned():
             write_atomic(self.results_path, text)
@@ -170,7 +170,7 @@ class TrialStore(OwnedFolder):
         target = self.checkpoint_folder(record.iteration)
         temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
         with self.owned():
-            temporary.mkdir(parents=True)
+            make_folder(temporary)
         try:
             write(temporary)
             write_manifest(temporary, record)
@@ -332,7 +332,6 @@ class SweepStore:
 
     def write_best(self, record: BestRecord) -> None:
         """Replace best/evaluation.json."""
-        self.best_folder.mkdir(parents=True, exist_ok=True)
         write_atomic(self.best_folder / "evaluation.json", dump_sealed(record))
 
     def request_stop(self) -> None:
@@ -345,7 +344,7 @@ class SweepStore:
 
     def clear_stop_request(self) -> None:
         """Forget the request."""
-        self._stop_path.unlink(missing_ok=True)
+        remove_file(self._stop_path)
 
     def is_driven(self) -> bool:
         """Whether a process drives this sweep now (on this machine, or on one that shares locks with it)."""

@@ -14,6 +14,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from analysis.records import TrialRecord
+from policies.files import open_to_append
 from tune_jobs.places import within
 
 _FILE_VERSION = b"brain.Event:2"
@@ -54,8 +55,7 @@ class ScalarWriter:
         """Append what was added to the files."""
         for trial_id, data in self._unwritten.items():
             folder = within(self._folder, "trials", trial_id, "tensorboard")
-            folder.mkdir(parents=True, exist_ok=True)
-            with within(folder, self._name).open("ab") as file:
+            with open_to_append(within(folder, self._name)) as file:
                 file.write(data)
         self._unwritten.clear()
 

@@ -26,6 +26,7 @@ from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
 from policies.errors import CheckpointError
 from policies.evaluate import Evaluator
+from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
 from policies.tallies import end_tally
 from tune_jobs.engines.protocol import TrainingEngine, TrialTask
@@ -55,8 +56,7 @@ class TrialLog:
     def open(self, path: Path) -> IO[bytes]:
         """Send standard output and error to this file from now on."""
         self.close()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("ab")
+        self._file = open_to_append(path)
         for number in (1, 2):
             os.dup2(self._file.fileno(), number)
         return self._file

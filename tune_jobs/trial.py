@@ -6,6 +6,7 @@ another node, in another process, goes on from its latest checkpoint.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections import deque
@@ -349,7 +350,7 @@ class TrialLoop:
     ) -> Progress:
         if status != "running":
             end_tally(self.task.trial_id)
-            with self._store.owned():
+            with self._store.owned(), contextlib.suppress(OSError):  # a folder is no tally
                 self._store.tally_path.unlink(missing_ok=True)
         return Progress(
             iteration=self._last.iteration,

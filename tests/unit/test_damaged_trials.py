@@ -3,7 +3,7 @@
 import errno
 import json
 import math
-from pathlib import Path
+import os
 
 import pytest
 from fake_engine import FakeClock, FakeEngine
@@ -11,6 +11,7 @@ from trial_runs import Trial
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError
+from tune_jobs import record_files
 from tune_jobs.record_files import seal
 from tune_jobs.recovery import latest_damaged
 from tune_jobs.store import TrialStore
@@ -157,6 +158,26 @@ def test_results_that_are_gone_leave_a_hole_and_no_other_count(tmp_path):
     assert [(record.iteration, record.num_env_steps) for record in again.results] == [(5, 500), (6, 600)]
 
 
+def fill(path):
+    path.touch()
+    os.truncate(path, 2**31)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, fill])
+def test_results_that_are_no_file_are_set_aside_and_the_trial_goes_on(tmp_path, make):
+    first = Trial(tmp_path, checkpoints={"every_iterations": 4, "keep": 1})
+    first.run_to(4)
+    path = first.store.results_path
+    path.unlink()
+    make(path)
+    again = Trial(tmp_path, stop={"num_iterations": 6})
+    progress = again.run()
+    assert (progress.status, [record.iteration for record in again.results]) == ("completed", [5, 6])
+    assert f"{path} cannot be read: it " in progress.notes[0]
+    assert "It is kept as damaged/results.jsonl" in progress.notes[0]
+    assert (path.parent / "damaged" / "results.jsonl").exists()
+
+
 def rewritten(folder, **changes):
     """A manifest that says something else, with its seal."""
     manifest = json.loads((folder / "manifest.json").read_text()) | changes
@@ -176,10 +197,19 @@ def test_a_checkpoint_of_a_newer_version_is_not_damaged(tmp_path):
     assert Trial(tmp_path).engine.builds == ["000003"]
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, fill])
+def test_a_checkpoint_whose_manifest_is_no_file_is_damaged(tmp_path, make):
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
+    manifest = TrialStore(tmp_path, "t0000").checkpoint_folder(4) / "manifest.json"
+    manifest.unlink()
+    make(manifest)
+    assert Trial(tmp_path).engine.builds == ["000003"]
+
+
 def test_a_checkpoint_that_cannot_be_read_now_is_not_set_aside(tmp_path, monkeypatch):
     """A disk or a network that fails for a moment is no damage: the retry may find it whole."""
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
-    store, read = TrialStore(tmp_path, "t0000"), Path.read_bytes
+    store, read = TrialStore(tmp_path, "t0000"), record_files.read_regular
 
     def fails(path):
         if path == store.checkpoint_folder(4) / "manifest.json":
@@ -187,7 +217,7 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_set_aside(tmp_path, monkeyp
         return read(path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "read_bytes", fails)
+        patch.setattr(record_files, "read_regular", fails)
         with pytest.raises(CheckpointError, match="Input/output error"):
             Trial(tmp_path)
     assert Trial(tmp_path).engine.builds == ["000004"]
