@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.env_faults import close_env, env_failed
-from policies.errors import EnvFailedError
+from policies.errors import EnvError, EnvFailedError
 from policies.tallies import only_tally
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -112,7 +112,8 @@ def _name(value: float) -> str:
 class CheckedEnvs(gym.vector.VectorWrapper):
     """A vector environment whose errors are `EnvError`s, and whose rewards and observations are finite.
 
-    For those that reset in the step after an episode's end, as `make_vector_env` makes them.
+    For those that reset in the step after an episode's end, as `make_vector_env` makes them. A vectorised version of a
+    user's own may return lists, or columns of rewards; here these are arrays. It has no infos, as nobody reads them.
 
     Args:
         env: Without a failure penalty: its own rewards are looked at.
@@ -122,6 +123,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
         super().__init__(env)
         self._env_id = env_id
+        self._shape = (env.num_envs, *(env.single_observation_space.shape or ()))
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
 
@@ -132,23 +134,32 @@ class CheckedEnvs(gym.vector.VectorWrapper):
             EnvFailedError: One raised an error, or its observation is not finite.
         """
         try:
-            observations, info = self.env.reset(seed=seed, options=options)
+            observations, _ = self.env.reset(seed=seed, options=options)
         except BaseException as error:
             raise env_failed(f"{self._env_id} raised an error in reset()", error) from error
         self._lengths[:], self._ended[:] = 0, False
+        observations = self._as_array(observations, "observations", self._shape)
         self._check(observations)
-        return observations, info
+        return observations, {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all sub-environments.
 
         Raises:
             EnvFailedError: One raised an error, or its reward or observation is not finite.
+            EnvError: The vectorised version returned something else than rows of numbers.
         """
         try:
-            observations, rewards, terminated, truncated, info = self.env.step(actions)
+            observations, rewards, terminated, truncated, _ = self.env.step(actions)
         except BaseException as error:
             raise env_failed(f"{self._env_id} raised an error in step()", error) from error
+        row = self._shape[:1]
+        observations = self._as_array(observations, "observations", self._shape)
+        rewards = self._as_array(rewards, "rewards", row).reshape(row)
+        terminated, truncated = (
+            self._as_array(values, what, row).reshape(row).astype(np.bool_, copy=False)
+            for values, what in ((terminated, "terminated"), (truncated, "truncated"))
+        )
         self._lengths += 1
         self._lengths[self._ended] = 0
         if not is_sound(rewards):
@@ -159,7 +170,21 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         if (tally := only_tally()) is not None:
             tally.add(int(np.count_nonzero(~self._ended)), int(np.count_nonzero(ended)))
         self._ended = ended
-        return observations, rewards, terminated, truncated, info
+        return observations, rewards, terminated, truncated, {}
+
+    def _as_array(self, values: Any, what: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """What a vectorised version returned, of this shape; one of one dimension may have further ones of length 1."""
+        try:
+            array = np.asarray(values)
+        except Exception:  # noqa: BLE001 (ragged lists, say)
+            array = np.empty(0, dtype=object)
+        if array.dtype.kind in "biuf" and (array.shape == shape or (len(shape) == 1 and array.size == shape[0])):
+            return array
+        raise EnvError(
+            f"The vectorised {self._env_id} returned {what} of shape {array.shape} and dtype {array.dtype}, not "
+            f"numbers of shape {shape}.",
+            "Mend its vector_entry_point, or register the env without one.",
+        )
 
     def _check(self, observations: NDArray[Any]) -> None:
         if not is_sound(observations):

@@ -230,7 +230,9 @@ class FailurePenalty(gym.vector.VectorWrapper):
         """Step all sub-environments."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         self.unpenalized_rewards = rewards
-        penalized = np.where(self.rule.failed(rewards, terminated), self.penalty, rewards).astype(rewards.dtype)
+        # Whole numbers of a vectorised version would cut off the penalty's fraction.
+        dtype = np.result_type(rewards.dtype, np.float32)
+        penalized = np.where(self.rule.failed(rewards, terminated), self.penalty, rewards).astype(dtype)
         return observations, penalized, terminated, truncated, info
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from fake_engine import make_task
@@ -17,9 +18,11 @@ from test_packed_envs import assert_equal_bits, make, own_modules, seen_by
 
 from policies import env_faults
 from policies.checked_envs import CheckedEnvs, is_sound
+from policies.env_wrappers import FailurePenalty
 from policies.envs import make_env, make_vector_env
 from policies.errors import EnvError
 from policies.evaluate import Evaluator, evaluate_policy
+from policies.failures import FailureRule
 from policies.packed.evaluation import evaluate_many
 from policies.policy import RandomPolicy
 from tune_jobs.engines.baseline import BaselineEngine
@@ -154,6 +157,64 @@ def step_vector(envs, num_steps):
         envs.step(np.zeros(2, dtype=np.int64))
 
 
+class Vectorised(gym.vector.VectorEnv):
+    """Its steps return what it is given."""
+
+    def __init__(self, num_envs, returned):
+        self.num_envs, self.returned = num_envs, returned
+        self.single_observation_space = gym.spaces.Box(-1, 1, (3,))
+        self.single_action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return [[0, 0, 0]] * self.num_envs, {"x": 5}
+
+    def step(self, actions):
+        return self.returned
+
+
+ROWS = np.zeros((2, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    "returned",
+    [
+        ([[0, 0, 0]] * 2, [1, 2], [False, True], (False, False), {"x": 5}),
+        (ROWS, np.array([[1], [2]]), np.array([[0], [1]]), np.zeros((2, 1)), None),
+    ],
+)
+def test_what_a_vectorised_version_returns_is_arrays(returned):
+    envs = CheckedEnvs(Vectorised(2, returned), "Mine-v0")
+    observations, _ = envs.reset()
+    assert observations.shape == (2, 3)
+    observations, rewards, terminated, truncated, infos = envs.step([0, 0])
+    assert (observations.shape, rewards.tolist(), infos) == ((2, 3), [1, 2], {})
+    assert (terminated.tolist(), truncated.tolist()) == ([False, True], [False, False])
+    assert (terminated.dtype, truncated.dtype) == (np.bool_, np.bool_)
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        ((ROWS[:, :2], [1, 2], [0, 0], [0, 0], {}), r"observations of shape \(2, 2\).* not numbers of shape \(2, 3\)"),
+        ((ROWS, 1.0, [0, 0], [0, 0], {}), r"rewards of shape \(\).* not numbers of shape \(2,\)"),
+        ((ROWS, [1, None], [0, 0], [0, 0], {}), "rewards of shape .* and dtype object"),
+        ((ROWS, [1, 2], [[0], [0, 0]], [0, 0], {}), "terminated of shape .* and dtype object"),
+        ((ROWS, [1, 2], [0, 0], "no", {}), "truncated of shape .* and dtype <U2"),
+    ],
+)
+def test_what_a_vectorised_version_returns_wrong_is_told(returned, told):
+    envs = CheckedEnvs(Vectorised(2, returned), "Mine-v0")
+    envs.reset()
+    with pytest.raises(EnvError, match=f"The vectorised Mine-v0 returned {told}"):
+        envs.step([0, 0])
+
+
+def test_whole_rewards_do_not_cut_off_a_penalty():
+    returned = (ROWS, np.array([1, 2]), np.array([False, True]), np.array([False, False]), {})
+    envs = FailurePenalty(Vectorised(2, returned), FailureRule(), -0.5)
+    assert envs.step([0, 0])[1].tolist() == [1.0, -0.5]
+
+
 # -- greedy episodes
 
 
@@ -199,6 +260,7 @@ import os, signal, sys
 import gymnasium as gym, numpy as np
 from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
+from policies.env_wrappers import FailurePenalty
 from policies.errors import EnvError
 from policies.packed.sub_envs import SubEnvs
 
