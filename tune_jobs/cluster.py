@@ -33,7 +33,7 @@ from tune_jobs.interruption import current
 from tune_jobs.live import quiet
 from tune_jobs.machine import Machine
 from tune_jobs.places import within
-from tune_jobs.ray_environment import prepare_environment
+from tune_jobs.ray_environment import prepare_environment, provide_token
 from tune_jobs.ray_processes import ending_if_it_fails
 from tune_jobs.ray_reaper import reaping
 
@@ -134,6 +134,7 @@ def _deaf_to_hangups() -> Iterator[None]:
 def _start(machine: Machine | None) -> None:
     # A local sweep sends nothing anywhere; who wants Ray's usage statistics sets the variable.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    provide_token()
     resources: dict[str, Any] = {}
     if machine is not None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}

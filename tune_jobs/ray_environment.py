@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
+import secrets
+from pathlib import Path
 
 _TRIAL_CLEANUP_S = 5
 _ENVIRONMENT = {
@@ -21,3 +24,29 @@ _ENVIRONMENT = {
 def prepare_environment() -> None:
     """Set what Ray Tune reads from the environment; before Ray starts, so that its workers inherit it."""
     os.environ.update(_ENVIRONMENT)
+
+
+def provide_token() -> None:
+    """Let a Ray that is started here have a token where it could keep none; before Ray starts.
+
+    Ray 2.60 makes one in `~/.ray` for all that it starts, and fails where the home folder can't be written, or the
+    user has none, as in many containers.
+    """
+    if any(os.environ.get(name) for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
+        return
+    try:
+        folder = Path.home() / ".ray"
+        if os.access(folder / "auth_token", os.R_OK):
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        can_write = os.access(folder, os.W_OK)
+    except (OSError, RuntimeError):
+        can_write = False
+    if not can_write:
+        os.environ["RAY_AUTH_TOKEN"] = _own_token()
+
+
+@functools.cache
+def _own_token() -> str:
+    """One for all sweeps of this process: Ray reads a token once."""
+    return secrets.token_hex(32)

@@ -1,0 +1,57 @@
+"""What Ray finds in the environment, where a home folder is missing or can't be written."""
+
+import os
+
+import pytest
+
+from tune_jobs import ray_environment
+from tune_jobs.ray_environment import provide_token
+
+NAMES = ["RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"]
+
+
+@pytest.fixture(autouse=True)
+def no_token(monkeypatch):
+    for name in NAMES:
+        # As pytest puts back what was there.
+        monkeypatch.setenv(name, "")
+
+
+def token():
+    return os.environ["RAY_AUTH_TOKEN"]
+
+
+def test_a_home_that_cannot_be_written_needs_no_file(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    provide_token()
+    first = token()
+    assert len(first) == 64
+    # The next sweep of this process has the same: Ray has read it.
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "")
+    provide_token()
+    assert token() == first
+
+
+def test_a_user_without_a_home_needs_none(monkeypatch):
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(ray_environment.Path, "home", home)
+    provide_token()
+    assert token()
+
+
+def test_elsewhere_it_is_rays(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    provide_token()
+    assert not token()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_the_user_has_set_holds(tmp_path, monkeypatch, name):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    monkeypatch.setenv(name, "mine")
+    provide_token()
+    assert {key: os.environ[key] for key in NAMES} == {key: "mine" if key == name else "" for key in NAMES}
