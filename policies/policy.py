@@ -44,6 +44,9 @@ class ObservationError(TuneJobsError):
     """An observation is not of the shape that the policy takes."""
 
 
+NON_FINITE_HINT = "Lower the learning rate, or set grad_clip; scale rewards and observations down if they are large."
+
+
 class NonFiniteWeightsError(TuneJobsError):
     """A network holds NaN or infinite weights: its training went wrong, and what it does means nothing."""
 
@@ -292,7 +295,7 @@ def check_finite_tensors(network: PolicyNetwork, description: str) -> None:
         if count:
             raise NonFiniteWeightsError(
                 f"The policy {description!r} has {count} weights that are NaN or infinite in {place}.",
-                "Lower the learning rate, or set grad_clip.",
+                NON_FINITE_HINT,
             )
 
 

@@ -11,9 +11,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from policies.policy import NonFiniteWeightsError
-
-HINT = "Lower the learning rate, or set grad_clip."
+from policies.policy import NON_FINITE_HINT, NonFiniteWeightsError
 
 
 def check_gradients(gradients: Iterable[Tensor | None], module: nn.Module) -> None:
@@ -55,4 +53,4 @@ def _error(what: str, module: nn.Module) -> NonFiniteWeightsError:
     else:
         largest = max((float(value.abs().max()) for value in tensors.values() if value.numel()), default=0.0)
         where = f"its weights are finite, the largest {largest:.4g}"
-    return NonFiniteWeightsError(f"{what}: {where}.", HINT)
+    return NonFiniteWeightsError(f"{what}: {where}.", NON_FINITE_HINT)

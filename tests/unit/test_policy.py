@@ -215,6 +215,8 @@ def test_weights_that_are_not_finite_are_named(value):
     with pytest.raises(NonFiniteWeightsError, match=r"1 weights .* in layer 1") as caught:
         NetworkPolicy(portable).check_finite()
     assert pickle.loads(pickle.dumps(caught.value)).message == caught.value.message
+    # Not the learning rate alone: sums of large rewards are infinite in 32 bits.
+    assert "scale rewards and observations down" in caught.value.hint
 
 
 @pytest.mark.parametrize(
