@@ -12,6 +12,7 @@ is no reason to run it.
 
 from __future__ import annotations
 
+import glob
 import importlib
 import os
 import pkgutil
@@ -136,6 +137,19 @@ def _modules_in(folder: str) -> dict[str, str]:
     return {**modules, **packages}
 
 
+def _folders_of_code(folder: str) -> dict[str, str]:
+    """Folders in a folder that are packages without an `__init__.py`: name -> path."""
+    try:
+        entries = [entry for entry in os.scandir(folder) if entry.is_dir() and entry.name.isidentifier()]
+        return {
+            entry.name: entry.path
+            for entry in entries
+            if any(glob.iglob(f"{glob.escape(entry.path)}/*.py"))  # noqa: PTH207 (as above)
+        }
+    except OSError:
+        return {}
+
+
 def _add_fallback(module: ModuleType) -> None:
     name = module.__name__
 
@@ -207,7 +221,12 @@ def _warn_of_hidden(name: str) -> None:
         return
     ours = _modules_in(_folder(name))
     places = dict.fromkeys(place for spec in _their_specs(name) for place in _places(spec))
-    hidden = {module: path for place in places for module, path in _modules_in(place).items() if module in ours}
+    hidden = {
+        module: path
+        for place in places
+        for module, path in {**_folders_of_code(place), **_modules_in(place)}.items()
+        if module in ours
+    }
     if hidden:
         warnings.warn(
             f"tune-jobs has a package {name} too, with modules of the same names as {', '.join(hidden.values())}: "

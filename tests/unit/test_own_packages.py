@@ -3,6 +3,7 @@
 Each case is a script in a process of its own, since what counts is the state of the import system.
 """
 
+import os
 import subprocess
 import sys
 
@@ -117,6 +118,19 @@ def test_a_hidden_module_is_warned_of_once(project):
         2,
     ]
     assert "nets.py" not in stderr
+
+
+def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(project):
+    files = {
+        "policies/envs/cart.py": "",
+        "policies/packed/notes.txt": "",
+        "analysis/plots/figure.png": "",
+        "envs/a.py": "",
+    }
+    _, stderr = project("import tune_jobs\nimport policies.spaces\n", files)
+    warnings = [line for line in stderr.splitlines() if "UserWarning" in line]
+    assert len(warnings) == 1
+    assert f"policies{os.sep}envs: `import policies.envs` gives tune-jobs' own" in warnings[0]
 
 
 def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(project):
