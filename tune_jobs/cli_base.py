@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 import tempfile
@@ -12,12 +13,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from policies.errors import TuneJobsError, said_by
+from policies.errors import CannotRunError, TuneJobsError, said_by
 
 if TYPE_CHECKING:
     from tune_jobs.driving import SweepResult
 
-_INTERRUPTED = 130
+_INTERRUPTED, _CANNOT_PRINT = 130, CannotRunError.exit_code
+_NOBODY_READS = (errno.EPIPE, errno.EIO)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UNCHANGED = {
     "launch": "No trial had begun, and nothing was kept.",
     "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` goes on with it.",
@@ -51,6 +54,12 @@ class CommandGroup(click.Group):
             _print_error(ctx, error.message, error.hint, error.exit_code)
             ctx.exit(error.exit_code)
         except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback on a user's terminal
+            # Of a file of ours it would be a CannotRunError, with the file's name.
+            if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
+                _write_nowhere(1)
+                said = f"The output of this command cannot be written: {error.strerror}."
+                _print_error(ctx, said, "Free space where it goes, or send it elsewhere.", _CANNOT_PRINT)
+                ctx.exit(_CANNOT_PRINT)
             message = f"Unexpected {type(error).__name__}: {said_by(error)}"
             if ctx.meta.get(DEBUG):
                 traceback.print_exc()
@@ -196,16 +205,23 @@ def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> Sw
 
 @contextlib.contextmanager
 def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT001
-    """Of an interrupted command: its terminal may be what went away, which is no error then."""
+    """Of what may go away: who read a command's output from a pipe, its terminal, and if it was interrupted anything.
+
+    A sweep that was run is not told as failed for that.
+    """
     try:
         yield
         sys.stdout.flush()
         sys.stderr.flush()
-    except OSError:
-        if not interrupted:
+    except OSError as error:
+        if not interrupted and error.errno not in _NOBODY_READS:
             raise
-        # Python flushes both once more when it ends.
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        for number in (1, 2):
-            os.dup2(nowhere, number)
-        os.close(nowhere)
+        _write_nowhere(1, 2)
+
+
+def _write_nowhere(*numbers: int) -> None:
+    """From now on: Python flushes standard output and error once more when it ends."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for number in numbers:
+        os.dup2(nowhere, number)
+    os.close(nowhere)

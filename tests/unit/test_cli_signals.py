@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -75,3 +76,44 @@ def test_two_hangups_are_one(tmp_path):
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (130, "error: Interrupted.\n")
     assert list(tmp_path.iterdir()) == []
+
+
+# A command that runs a sweep, whose output goes to a pipe that nobody reads or to a full disk.
+RUNS = """
+import sys
+sys.path.insert(0, sys.argv.pop(1))
+from fake_sweeps import Result
+from tune_jobs import cli, cli_output, sweeps
+
+def show(*_, **__):
+    print("x" * 100_000)
+
+sweeps.launch = lambda *_, **__: Result
+Result.interrupted, Result.exit_code = False, 3
+cli_output.show_result = show
+cli_output.show_presets = show
+cli.main()
+"""
+
+
+def run_script(*arguments, stdout):
+    command = [sys.executable, "-c", RUNS, str(Path(__file__).parent), *arguments]
+    return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
+
+
+def test_a_sweep_whose_result_nobody_reads_has_not_failed_for_that():
+    ours, theirs = os.pipe()
+    os.close(ours)
+    with os.fdopen(theirs, "w") as nobody:
+        done = run_script("launch", "cartpole-ppo", stdout=nobody)
+    assert (done.returncode, done.stderr) == (3, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
+@pytest.mark.parametrize("command", [["presets"], ["presets", "--json"], ["launch", "cartpole-ppo"]])
+def test_output_that_cannot_be_written_is_said(command):
+    with Path("/dev/full").open("w") as full:
+        done = run_script(*command, stdout=full)
+    assert done.returncode == 5
+    assert done.stderr.startswith("error: The output of this command cannot be written: No space left on device.\n")
+    assert "Traceback" not in done.stderr
