@@ -16,7 +16,7 @@ import numpy as np
 
 from policies.checked_envs import is_sound, reward_as_number
 from policies.env_faults import env_failed
-from policies.errors import EnvError
+from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
     "Mend its step(): Gymnasium's API wants (observation, reward, terminated, truncated, info), with an observation of "
@@ -121,7 +121,7 @@ def _step_problem(returned: Any, space: gym.Space[Any]) -> str | None:
         return problem
     for name, value in (("terminated", terminated), ("truncated", truncated)):
         if not _is_bool(value):
-            return f"{value!r} ({type(value).__name__}) as {name}, not a bool"
+            return f"{shortened(value)} ({type(value).__name__}) as {name}, not a bool"
     if not isinstance(info, Mapping):
         return f"{_kind(info)} as info, not a dict"
     return _observation_problem(observation, space)
@@ -129,7 +129,7 @@ def _step_problem(returned: Any, space: gym.Space[Any]) -> str | None:
 
 def _reward_problem(reward: Any) -> str | None:
     if isinstance(reward, str | bytes):
-        return f"{reward!r} as reward, not a number"
+        return f"{shortened(reward)} as reward, not a number"
     try:
         array = np.asarray(reward)
         number = reward_as_number(reward)
@@ -177,5 +177,5 @@ def _kind(value: Any) -> str:
         return "None"
     if isinstance(value, tuple | list):
         return f"a {type(value).__name__} of {len(value)}"
-    shown = repr(value)
+    shown = shortened(value)
     return f"{shown} ({type(value).__name__})" if len(shown) <= 60 else f"a {type(value).__name__}"

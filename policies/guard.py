@@ -145,14 +145,16 @@ class _Child:
 
     def close(self, *, patience_s: float) -> None:
         self.connection.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(patience_s)
-        # The group: what the env started too.
-        with contextlib.suppress(OSError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
-        self._page_file.close()
-        self._dump.close()
+        try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(patience_s)
+        finally:
+            # Also where somebody is out of patience. The group: what the env started too.
+            with contextlib.suppress(OSError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+            self._page_file.close()
+            self._dump.close()
 
 
 class EnvGuard:

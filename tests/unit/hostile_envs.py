@@ -40,6 +40,11 @@ class MuteError(Exception):
         raise RuntimeError("no words")
 
 
+class Unshowable:
+    def __repr__(self):
+        raise RuntimeError("no words")
+
+
 def say(error):
     raise error
 
@@ -143,6 +148,8 @@ class Malformed(gym.Env):
         "two rewards": (GOOD, np.zeros(2), False, False, {}),
         "number terminated": (GOOD, 1.0, 0, False, {}),
         "no truncated": (GOOD, 1.0, False, None, {}),
+        "unshowable truncated": (GOOD, 1.0, False, Unshowable(), {}),
+        "long text as reward": (GOOD, "x" * 1_000_000, False, False, {}),
         "shape": (np.zeros((2, 1), np.float32), 1.0, False, False, {}),
         "complex": (np.zeros(2, np.complex64), 1.0, False, False, {}),
         "infinite": (np.array([np.inf, 0.0], np.float32), 1.0, False, False, {}),

@@ -247,6 +247,8 @@ def test_a_malformed_reset_is_refused_with_what_it_returns(fault, words, limit):
         ("huge observation", r"are not finite: 1e\+39 at \[1\], which is infinite in 32 bits"),
         ("two rewards", "as reward, not a number"),
         ("number terminated", r"0 \(int\) as terminated, not a bool"),
+        ("unshowable truncated", r"a value \(Unshowable\) as truncated, not a bool"),
+        ("long text as reward", r"'x+\.\.\. as reward, not a number"),
         ("no truncated", r"None \(NoneType\) as truncated, not a bool"),
         ("shape", r"observations of shape \(2, 1\) but declares \(2,\)"),
         ("complex", "observations of dtype complex64 but declares float32"),
@@ -260,6 +262,7 @@ def test_a_malformed_first_step_is_refused_with_what_it_returns(fault, words, li
     args = {"step": fault} | ({} if limit is None else {"max_episode_steps": limit})
     with pytest.raises(EnvError, match=words) as caught:
         check_env("hostile_envs:Malformed", args, "ppo")
+    assert len(caught.value.message) < 300
     assert "(observation, reward, terminated, truncated, info)" in caught.value.hint
 
 

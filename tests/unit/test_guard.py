@@ -297,6 +297,22 @@ def test_an_interrupted_parent_ends_its_child(tmp_path):
     assert not is_running(child)
 
 
+def test_a_child_is_ended_though_its_closing_is_interrupted(monkeypatch):
+    guard = EnvGuard()
+    guard.start()
+    process = guard._child.process
+    wait = process.wait
+
+    def interrupt(timeout=None):
+        monkeypatch.setattr(process, "wait", wait)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(process, "wait", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        guard.close()
+    assert not is_running(process.pid)
+
+
 def test_a_child_that_cannot_begin_is_told_as_that(monkeypatch):
     monkeypatch.setattr("policies.guard._BOOTSTRAP", "raise SystemExit(9)")
     with EnvGuard() as guard:
