@@ -27,6 +27,7 @@ from tune_jobs.own_code import check_rl_module
 from tune_jobs.pack_sizes import Member, plan_packs
 from tune_jobs.packs import Engine, PackPlan, choose_engines, pack_key
 from tune_jobs.points import largest_hyperparams, planned_points
+from tune_jobs.search_checks import idle_settings
 from tune_jobs.search_space import num_points
 from tune_jobs.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec import SweepSpec
@@ -177,7 +178,7 @@ def make_plan(
         + spec.seeds_per_point * sum(_largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
         env=env,
         machine=machine,
-        notes=(*_notes(spec, env, concurrent if packs is None else None), *idle, *engine_notes),
+        notes=(*_notes(spec, env, concurrent if packs is None else None), *idle_settings(spec), *idle, *engine_notes),
         packs=packs,
     )
 

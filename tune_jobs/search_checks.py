@@ -35,6 +35,29 @@ def search_problems(spec: SweepSpec) -> Found:
     return found
 
 
+_USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
+    "scheduler": {
+        "grace_env_steps": ("asha", "hyperband", "median"),
+        "reduction_factor": ("asha", "hyperband"),
+        "quantile_fraction": ("pbt",),
+        "resample_probability": ("pbt",),
+    },
+    "search": {"num_startup_trials": ("tpe",)},
+}
+"""Which types of search and scheduler a field is for; `perturb_every_env_steps` is refused with others than pbt."""
+
+
+def idle_settings(spec: SweepSpec) -> list[str]:
+    """What to say of settings of search and scheduler that were changed and can't act, for the plan."""
+    notes = []
+    for section, fields in _USED_BY.items():
+        given = getattr(spec, section)
+        for name, types in fields.items():
+            if given.type not in types and getattr(given, name) != type(given).model_fields[name].default:
+                notes.append(f"{section}.{name} can't act: {section}.type is {given.type}, not {' or '.join(types)}.")
+    return notes
+
+
 def check_extendable(spec: SweepSpec) -> None:
     """Check that more samples are other points than those there are.
 

@@ -24,6 +24,29 @@ def grid(**values):
     return {name: {"grid": list(listed)} for name, listed in values.items()}
 
 
+# -- settings of search and scheduler
+
+
+@pytest.mark.parametrize(
+    ("section", "told"),
+    [
+        ({"scheduler": {"grace_env_steps": 100}}, ["scheduler.grace_env_steps can't act: scheduler.type is none"]),
+        ({"scheduler": {"type": "median", "reduction_factor": 4}}, ["scheduler.reduction_factor can't act"]),
+        ({"scheduler": {"type": "asha", "quantile_fraction": 0.5}}, ["scheduler.quantile_fraction can't act"]),
+        (
+            {"search": {"num_startup_trials": 3}},
+            ["search.num_startup_trials can't act: search.type is random, not tpe."],
+        ),
+        ({"scheduler": {"type": "asha", "reduction_factor": 4, "grace_env_steps": 100}}, []),
+        ({"scheduler": {"type": "asha", "quantile_fraction": 0.25}}, []),
+    ],
+)
+def test_settings_that_cannot_act_are_told(section, told):
+    found = notes(**{**PPO, **section})
+    assert len(found) == len(told)
+    assert all(note.startswith(words) for note, words in zip(found, told, strict=True))
+
+
 # -- searched, and idle in all points: refused
 
 NEVER = {
