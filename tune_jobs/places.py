@@ -63,9 +63,13 @@ def refuse_link(path: Path) -> None:
     """Check that a part of a sweep folder is no symbolic link.
 
     Raises:
-        CheckpointError: It is one.
+        CheckpointError: It is one, or cannot be looked at.
     """
-    if path.is_symlink():
+    try:
+        is_link = path.is_symlink()
+    except OSError as error:
+        raise _unseen(path, error) from error
+    if is_link:
         raise CheckpointError(
             f"{path} is a symbolic link; links in a sweep folder are not followed.",
             "Remove the link, or replace it with what it points to.",
@@ -82,6 +86,24 @@ def refuse_links_in(folder: Path) -> Path:
     for path in folder.rglob("*"):
         refuse_link(path)
     return folder
+
+
+def parts_of(folder: Path) -> list[Path]:
+    """What lies in a folder; nothing if it is none.
+
+    Raises:
+        CheckpointError: It cannot be looked into.
+    """
+    try:
+        return list(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise _unseen(folder, error) from error
+
+
+def _unseen(path: Path, error: OSError) -> CheckpointError:
+    return CheckpointError(
+        f"{path} cannot be looked at: {error.strerror or error}.", "Check the permissions of the folders it lies in."
+    )
 
 
 def remove_folder(folder: Path) -> None:

@@ -23,6 +23,8 @@ _RecordT = TypeVar("_RecordT", bound=BaseModel)
 _SEAL = "sha256"
 _FIRST_SEALED_VERSION = 2
 _BACKUP = "Restore the file from a backup."
+_MAX_DEPTH = 256
+"""Of lists and mappings in each other; of what a sweep file gives fewer are read, and no record adds many."""
 
 
 def dump(record: BaseModel, indent: int | None = 1) -> str:
@@ -64,6 +66,7 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
         data = json.loads(read_regular(path), object_pairs_hook=_once_each, parse_constant=_refuse_constant)
         # Half a pair of surrogates is JSON, but no text that could be shown or written again.
         json.dumps(data, ensure_ascii=False).encode()
+        _refuse_depth(data)
     except FileNotFoundError as error:
         raise NotFoundError(f"No {what} at {path}.", "List the sweeps here with `tune-jobs list`.") from error
     except (OSError, ValueError, RecursionError) as error:
@@ -97,6 +100,18 @@ def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(name for name in data if names.count(name) > 1)
         raise ValueError(f"{twice[:80]!r} is there twice")
     return data
+
+
+def _refuse_depth(data: Any) -> None:
+    layer = [data]
+    for _ in range(_MAX_DEPTH):
+        layer = [
+            inner for value in layer if isinstance(value, dict | list)
+            for inner in (value.values() if isinstance(value, dict) else value)
+        ]  # fmt: skip
+        if not layer:
+            return
+    raise ValueError(f"it is nested more than {_MAX_DEPTH} deep")
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -27,6 +27,7 @@ from tune_jobs.places import (
     checkpoint_iteration,
     is_trial_id,
     make_folder,
+    parts_of,
     refuse_link,
     refuse_links_in,
     remove_file,
@@ -136,9 +137,7 @@ class TrialStore(OwnedFolder):
 
     def checkpoint_iterations(self) -> list[int]:
         """Those that have a checkpoint, damaged or not, in order."""
-        if not self.checkpoints_folder.is_dir():
-            return []
-        numbers = (checkpoint_iteration(path.name) for path in self.checkpoints_folder.iterdir())
+        numbers = (checkpoint_iteration(path.name) for path in parts_of(self.checkpoints_folder))
         return sorted(number for number in numbers if number is not None)
 
     def checkpoint(self, iteration: int) -> CheckpointRecord:
@@ -245,8 +244,11 @@ class SweepStore:
         return self.folder.name
 
     def exists(self) -> bool:
-        """Whether a sweep lies here."""
-        return self.record_path.is_file()
+        """Whether a sweep lies here; one that this user may not look at does, and is refused when it is read."""
+        try:
+            return self.record_path.is_file()
+        except PermissionError:
+            return True
 
     def create(self) -> None:
         """Make the folder; of several processes that want the same name, one gets it.
@@ -310,10 +312,8 @@ class SweepStore:
 
     def read_trials(self) -> list[TrialRecord]:
         """Every trial's record, by index."""
-        trials_folder = within(self.folder, "trials")
-        if not trials_folder.is_dir():
-            return []
-        stores = [self.trial(path.name) for path in trials_folder.iterdir() if is_trial_id(path.name)]
+        folders = parts_of(within(self.folder, "trials"))
+        stores = [self.trial(path.name) for path in folders if is_trial_id(path.name)]
         records = [store.read_record() for store in stores if store.record_path.is_file()]
         return sorted(records, key=lambda record: record.index)
 
@@ -390,8 +390,9 @@ def name_taken(folder: Path) -> SpecError:
 
 
 def list_sweep_stores(storage: Path) -> list[SweepStore]:
-    """The sweeps in a storage folder, by name; empty if there is no such folder."""
-    if not storage.is_dir():
-        return []
-    stores = [SweepStore(folder) for folder in sorted(storage.iterdir()) if folder.is_dir()]
-    return [store for store in stores if store.exists()]
+    """The sweeps in a storage folder, by name; empty if there is no such folder.
+
+    Raises:
+        CheckpointError: It cannot be looked into.
+    """
+    return [store for store in map(SweepStore, sorted(parts_of(storage))) if store.exists()]

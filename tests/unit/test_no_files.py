@@ -1,6 +1,7 @@
 """Named pipes, folders and sockets where a sweep has files: nobody waits for them, and our words refuse them."""
 
 import contextlib
+import json
 import os
 import shutil
 import signal
@@ -213,3 +214,12 @@ def test_json_that_readers_take_differently_is_refused(folder, text, why):
     (folder / "sweep.json").write_text(text)
     with pytest.raises(CheckpointError, match=f"sweep.json cannot be read as sweep: {why}"):
         sweeps.status(folder)
+
+
+@pytest.mark.parametrize("number", [300, 900, 100_000])
+def test_json_that_is_nested_deeply_is_refused_before_anybody_is_stuck_in_it(folder, number):
+    data = odd_files.put(odd_files.read(folder / "sweep.json"), ("spec", "more"), "here")
+    (folder / "sweep.json").write_text(json.dumps(data).replace('"here"', "[" * number + "]" * number))
+    for use in (sweeps.status, sweeps.report, sweeps.resume):
+        with pytest.raises(CheckpointError, match=r"sweep\.json cannot be read as sweep: "):
+            use(folder)

@@ -1,0 +1,61 @@
+"""Parts of a storage folder that this user may not look at: said in our words, and the others are shown."""
+
+import os
+from pathlib import Path
+
+import pytest
+from sweep_folders import make_sweep_folder
+
+from policies.errors import CheckpointError
+from tune_jobs import sweeps
+
+
+@pytest.fixture
+def closed(monkeypatch):
+    """Close a folder, to root as well: nothing below it can be looked at, nor what lies in it."""
+    folders = []
+
+    def closing(name):
+        real = getattr(os, name)
+
+        def call(path, *arguments, **options):
+            text = os.fspath(path) if isinstance(path, (str, os.PathLike)) else ""
+            listed = f"{text}/" if name in ("listdir", "scandir") else text
+            if any(listed.startswith(f"{folder}/") for folder in folders):
+                raise PermissionError(13, "Permission denied", text)
+            return real(path, *arguments, **options)
+
+        return call
+
+    for name in ("stat", "lstat", "open", "listdir", "scandir"):
+        monkeypatch.setattr(os, name, closing(name))
+    return folders.append
+
+
+@pytest.fixture
+def storage(tmp_path):
+    for name in ("mine", "other"):
+        make_sweep_folder(tmp_path / name, iterations=1)
+    return tmp_path
+
+
+def test_a_sweep_that_may_not_be_looked_at_does_not_hide_the_others(storage, closed, caplog):
+    closed(storage / "other")
+    assert [status.sweep.name for status in sweeps.list_sweeps(storage)] == ["mine"]
+    assert f"{storage}/other/sweep.json cannot be looked at: Permission denied" in caplog.text
+    assert sweeps.status("mine", storage=storage).counts == {"completed": 4}
+    with pytest.raises(CheckpointError, match=r"other/sweep.json cannot be looked at: Permission denied"):
+        sweeps.status("other", storage=storage)
+
+
+@pytest.mark.parametrize("part", ["trials", "trials/t0001", "trials/t0001/checkpoints"])
+def test_a_part_of_a_sweep_that_may_not_be_looked_at_is_named(storage, closed, part):
+    closed(storage / "mine" / Path(part))
+    with pytest.raises(CheckpointError, match=f"mine/{part}.* cannot be looked at: Permission denied"):
+        sweeps.trials("mine", storage=storage)
+
+
+def test_a_storage_folder_that_may_not_be_looked_into_is_named(storage, closed):
+    closed(storage)
+    with pytest.raises(CheckpointError, match=f"{storage} cannot be looked at: Permission denied"):
+        sweeps.list_sweeps(storage)
