@@ -383,10 +383,10 @@ class SweepStore:
 
 def name_taken(folder: Path) -> SpecError:
     """The error for a new sweep whose folder is there already."""
-    return SpecError(
-        f"A sweep {folder.name!r} is already in {folder.parent}.",
-        f"Choose another name with --name, or go on with it: `tune-jobs resume {folder.name}`.",
-    )
+    go_on = f"go on with it: `tune-jobs resume {folder.name}`"
+    other = go_on if SweepStore(folder).exists() else "remove that folder: it has no sweep.json"
+    hint = f"Choose another name with --name, or {other}."
+    return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 
 
 def list_sweep_stores(storage: Path) -> list[SweepStore]:

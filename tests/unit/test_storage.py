@@ -48,6 +48,14 @@ def test_an_automatic_name_that_is_taken_meanwhile_gives_way_to_the_next(tmp_pat
         create_store("mine", "x", tmp_path)
 
 
+def test_what_a_killed_launch_left_is_not_to_be_resumed(tmp_path):
+    """It has no sweep.json yet."""
+    create_store("mine", "x", tmp_path)
+    with pytest.raises(SpecError, match=r"remove that folder: it has no sweep\.json") as caught:
+        create_store("mine", "x", tmp_path)
+    assert "resume" not in str(caught.value)
+
+
 def test_storage_is_what_is_given_else_the_environments_else_here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
