@@ -6,6 +6,7 @@ Hierarchy: every error below is a `TuneJobsError`; the subclass decides the exit
 from __future__ import annotations
 
 import re
+import traceback
 from typing import Any, ClassVar
 
 # Halves of surrogate pairs, which no file takes, and what moves a terminal's cursor; not the ends of lines, nor tabs.
@@ -93,6 +94,18 @@ def said_by(error: BaseException) -> str:
     except Exception:  # noqa: BLE001 (its own `__str__` fails)
         return "it cannot be shown"
     return fit(text.strip(), _MAX_SAID).rstrip(".")
+
+
+def tellable(error: Exception) -> Exception:
+    """The exception, or one that says the same, if its traceback holds what is no text: Ray 2.60 can't carry that."""
+    try:
+        "".join(traceback.format_exception(error)).encode()
+    except UnicodeEncodeError:
+        if isinstance(error, TuneJobsError):
+            # Its words are fit; those of what it was raised for are not.
+            return type(error)(error.message, error.hint)
+        return TuneJobsError(f"{type(error).__name__}: {said_by(error)}")
+    return error
 
 
 def shortened(value: Any) -> str:

@@ -24,7 +24,7 @@ from ray import tune
 from policies.baselines import BASELINES
 from policies.env_faults import note_signals
 from policies.env_modules import allow_modules
-from policies.errors import CheckpointError
+from policies.errors import CheckpointError, fit, tellable
 from policies.evaluate import Evaluator
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
@@ -220,11 +220,14 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             if self._loop is None:
                 self._loop = self._open(folder, trial_id)
             progress = self._watched(self._loop)
-        except Exception:
-            traceback.print_exc()
+        except Exception as error:
+            # Not by print_exc: standard error of Ray's processes fails at what is no text.
+            print(fit(traceback.format_exc()), file=sys.stderr, flush=True)
             if self._loop is not None:
                 # Files that are gone under its hands are no failure of a trial that another process has.
                 self._loop.check_owned()
+            if (told := tellable(error)) is not error:
+                raise told from None
             raise
         if progress.status != "running":
             self._log.close()

@@ -2,10 +2,11 @@
 
 import json
 import pickle
+import traceback
 
 import pytest
 
-from policies.errors import EnvFailedError, TuneJobsError, fit, said_by
+from policies.errors import EnvFailedError, TuneJobsError, fit, said_by, tellable
 
 
 class MuteError(Exception):
@@ -50,3 +51,41 @@ def test_an_envs_error_can_be_told(error):
     assert isinstance(failed, EnvFailedError)
     assert len(failed.message) < 3_000
     json.dumps(failed.message, ensure_ascii=False).encode()
+
+
+def caught(raise_it):
+    try:
+        raise_it()
+    except Exception as error:  # noqa: BLE001
+        return error
+    return None
+
+
+def raise_for_another():
+    try:
+        raise_alone()
+    except ValueError as error:
+        raise EnvFailedError(f"It failed: {error}.", "Mend it.") from error
+
+
+def raise_alone():
+    raise ValueError("\udcff")
+
+
+@pytest.mark.parametrize(
+    ("raise_it", "kind", "words"),
+    [
+        (raise_for_another, EnvFailedError, "It failed: \\udcff.\nMend it."),
+        (raise_alone, TuneJobsError, "ValueError: \\udcff"),
+    ],
+)
+def test_an_error_can_be_carried_to_another_process_whatever_it_was_raised_for(raise_it, kind, words):
+    """As Ray does it: with its traceback, that of its cause included, in UTF-8."""
+    told = tellable(caught(raise_it))
+    assert (type(told), str(told)) == (kind, words)
+    "".join(traceback.format_exception(told)).encode()
+
+
+def test_other_errors_are_carried_as_they_are():
+    error = caught(lambda: {}["a key"])
+    assert tellable(error) is error
