@@ -21,7 +21,7 @@ from analysis.tables import (
     trials_frame,
 )
 from analysis.wording import NONE, duration, moment, number, seed_range, shown_path
-from policies.portable import BASELINE_KINDS
+from policies.portable.file import BASELINE_KINDS
 
 _MAX_AVERAGED = 1e150
 _MAX_ERROR_CHARS = 4_000

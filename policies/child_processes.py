@@ -1,7 +1,7 @@
 """Where child processes begin, so that they find this package and not a user's folder of the same name.
 
 A spawned process imports the module of its function first, by a path that a user's own `policies` may come first on;
-`tune_jobs` settles whose that name is (see `tune_jobs/own_packages.py`). It is named by text here, as all that it may
+`tune_jobs` settles whose that name is (see `tune_jobs/process/own_packages.py`). It is named by text here, as all that it may
 be in this package.
 """
 
@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable
 from typing import Any
 
-_BEGIN = "tune_jobs.own_packages:run"
+_BEGIN = "tune_jobs.process.own_packages:run"
 
 
 class _ByName:

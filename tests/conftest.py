@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 @pytest.fixture(scope="session", autouse=True)
 def guard():
     """One guard's child for all tests here: each plan would start one of its own."""
-    from policies.guard import guarding
+    from policies.guard.guard import guarding
 
     with guarding():
         yield
@@ -56,7 +56,7 @@ def ray_session(env_plugin):
     """A Ray of two CPUs, started as a sweep starts its own; RLlib would start one without these settings."""
     import ray
 
-    from tune_jobs.runner import prepare_environment
+    from tune_jobs.ray_tune.run_trials import prepare_environment
 
     prepare_environment()
     ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")

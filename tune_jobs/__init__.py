@@ -9,31 +9,31 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tune_jobs import own_packages as _own_packages
+from tune_jobs.process import own_packages as _own_packages
 
 if TYPE_CHECKING:
-    from policies.env_modules import allow_modules as allow_modules
+    from policies.acting.policy import load_policy as load_policy
+    from policies.envs.modules import allow_modules as allow_modules
     from policies.errors import TuneJobsError as TuneJobsError
-    from policies.policy import load_policy as load_policy
-    from tune_jobs.interruption import SweepInterrupted as SweepInterrupted
-    from tune_jobs.spec import SweepSpec as SweepSpec
-    from tune_jobs.spec_file import list_presets as list_presets
-    from tune_jobs.spec_file import load_spec as load_spec
-    from tune_jobs.sweeps import SweepResult as SweepResult
-    from tune_jobs.sweeps import SweepStatus as SweepStatus
-    from tune_jobs.sweeps import best as best
-    from tune_jobs.sweeps import dataframe as dataframe
-    from tune_jobs.sweeps import evaluate as evaluate
-    from tune_jobs.sweeps import extend as extend
-    from tune_jobs.sweeps import launch as launch
-    from tune_jobs.sweeps import list_sweeps as list_sweeps
-    from tune_jobs.sweeps import report as report
-    from tune_jobs.sweeps import restore as restore
-    from tune_jobs.sweeps import resume as resume
-    from tune_jobs.sweeps import status as status
-    from tune_jobs.sweeps import stop as stop
-    from tune_jobs.sweeps import trials as trials
-    from tune_jobs.sweeps import video as video
+    from tune_jobs.process.interruption import SweepInterrupted as SweepInterrupted
+    from tune_jobs.spec.file import list_presets as list_presets
+    from tune_jobs.spec.file import load_spec as load_spec
+    from tune_jobs.spec.sweep_spec import SweepSpec as SweepSpec
+    from tune_jobs.sweeps.verbs import SweepResult as SweepResult
+    from tune_jobs.sweeps.verbs import SweepStatus as SweepStatus
+    from tune_jobs.sweeps.verbs import best as best
+    from tune_jobs.sweeps.verbs import dataframe as dataframe
+    from tune_jobs.sweeps.verbs import evaluate as evaluate
+    from tune_jobs.sweeps.verbs import extend as extend
+    from tune_jobs.sweeps.verbs import launch as launch
+    from tune_jobs.sweeps.verbs import list_sweeps as list_sweeps
+    from tune_jobs.sweeps.verbs import report as report
+    from tune_jobs.sweeps.verbs import restore as restore
+    from tune_jobs.sweeps.verbs import resume as resume
+    from tune_jobs.sweeps.verbs import status as status
+    from tune_jobs.sweeps.verbs import stop as stop
+    from tune_jobs.sweeps.verbs import trials as trials
+    from tune_jobs.sweeps.verbs import video as video
 
 _SWEEPS = (
     "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "report",
@@ -41,13 +41,13 @@ _SWEEPS = (
 )  # fmt: skip
 _HOME = {
     "TuneJobsError": "policies.errors",
-    "allow_modules": "policies.env_modules",
-    "load_policy": "policies.policy",
-    "SweepInterrupted": "tune_jobs.interruption",
-    "SweepSpec": "tune_jobs.spec",
-    "list_presets": "tune_jobs.spec_file",
-    "load_spec": "tune_jobs.spec_file",
-    **dict.fromkeys(_SWEEPS, "tune_jobs.sweeps"),
+    "allow_modules": "policies.envs.modules",
+    "load_policy": "policies.acting.policy",
+    "SweepInterrupted": "tune_jobs.process.interruption",
+    "SweepSpec": "tune_jobs.spec.sweep_spec",
+    "list_presets": "tune_jobs.spec.file",
+    "load_spec": "tune_jobs.spec.file",
+    **dict.fromkeys(_SWEEPS, "tune_jobs.sweeps.verbs"),
 }
 
 # Before anything of policies or analysis is imported.

@@ -12,11 +12,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.acting.evaluate import Episodes, Evaluator
+from policies.acting.policy import ActionSpace, NetworkPolicy, Policy, action_function
 from policies.errors import TuneJobsError
-from policies.evaluate import Episodes, Evaluator
-from policies.forward import ForwardPass, ForwardPasses
-from policies.packed.cartpole_envs import CartPoleRows
-from policies.policy import ActionSpace, NetworkPolicy, Policy, action_function
+from policies.packed.envs.cartpole import CartPoleRows
+from policies.portable.forward import ForwardPass, ForwardPasses
 
 _MAX_ROWS = 4096
 """Episodes at once; more would take memory and save nothing."""

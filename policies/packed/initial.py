@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
-from policies.network_parts import DQNNetworks, PPONetworks, model_config
+from policies.networks.parts import DQNNetworks, PPONetworks, model_config
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
 
 

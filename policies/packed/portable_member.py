@@ -7,11 +7,11 @@ from typing import Any
 
 import gymnasium as gym
 
+from policies.acting.policy import action_transform
 from policies.hyperparams import PPOHyperparams
+from policies.networks.portable_weights import network_from_weights
 from policies.packed.member import Member
-from policies.policy import action_transform
-from policies.portable import PortablePolicy, describe_space
-from policies.portable_weights import network_from_weights
+from policies.portable.file import PortablePolicy, describe_space
 
 
 def portable_policy(

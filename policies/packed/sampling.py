@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.network_layers import OBSERVATION_CLIP, VARIANCE_EPSILON
+from policies.networks.layers import OBSERVATION_CLIP, VARIANCE_EPSILON
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, Member
 
 Floats = NDArray[np.float32]

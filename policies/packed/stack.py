@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Protocol
 
 from policies.hyperparams import DQNHyperparams, TrainedHyperparams
-from policies.packed.envs import PackedEnvs
+from policies.packed.envs.make import PackedEnvs
 from policies.packed.member import Member, MemberStats
 
 
 class Stack(Protocol):
     """Trains its members together. They may come and go between iterations; the others do not notice.
 
-    They are equal in `tune_jobs.packs.pack_key` and in the environment.
+    They are equal in `tune_jobs.plan.engine_choice.pack_key` and in the environment.
     """
 
     envs: PackedEnvs
@@ -54,9 +54,9 @@ class Stack(Protocol):
 def make_stack(hyperparams: TrainedHyperparams, envs: PackedEnvs, device: str = "cpu") -> Stack:
     """A stack without members, for such hyperparameters."""
     if isinstance(hyperparams, DQNHyperparams):
-        from policies.packed.dqn_stack import DQNStack
+        from policies.packed.dqn.stack import DQNStack
 
         return DQNStack(envs, device)
-    from policies.packed.ppo_stack import PPOStack
+    from policies.packed.ppo.stack import PPOStack
 
     return PPOStack(envs, device)

@@ -12,14 +12,14 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
-from policies.dqn_algorithm import ReplayDQN
 from policies.errors import CheckpointError
 from policies.packed.member import Member
 from policies.packed.state import STATE_FOLDER, load_member
-from policies.policy_network import PolicyNetwork
-from policies.portable import read_policy
-from policies.restore import check_weights
-from policies.rllib_config import build_algorithm_config
+from policies.portable.file import read_policy
+from policies.portable.network import PolicyNetwork
+from policies.rllib.config import build_algorithm_config
+from policies.rllib.dqn_algorithm import ReplayDQN
+from policies.rllib.restore import check_weights
 
 
 def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num_gpus: float = 0.0) -> Algorithm:

@@ -12,8 +12,8 @@ from typing import Any
 from policies.hyperparams import DQNHyperparams, make_hyperparams
 from tests.benchmarks.measure import run
 from tests.benchmarks.ppo import pack_rows, pack_speed, speeds
-from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import list_presets, load_spec
+from tune_jobs.spec.file import list_presets, load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 PRESET = "cartpole-dqn-tuned"
 NUM_ENV_STEPS = 10_000

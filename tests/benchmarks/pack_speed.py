@@ -19,9 +19,9 @@ import torch
 
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams, make_hyperparams
 from tests.benchmarks import dqn, workload
-from tune_jobs.engines.packed import PackedEngine
-from tune_jobs.engines.protocol import TrialTask
-from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.training.packed import PackedEngine
+from tune_jobs.training.protocol import TrialTask
 
 # Where a profile's functions belong: the first that is in "file:function" counts.
 _PARTS = {

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 from policies.errors import TuneJobsError
-from tune_jobs.store import SweepStore, verify_checkpoint
+from tune_jobs.store.sweep_store import SweepStore, verify_checkpoint
 
 # All that may lie in a sweep's folder; of a checkpoint what its manifest names.
 _ALLOWED = [

@@ -16,7 +16,7 @@ from policies.errors import EnvError
 from tests.learning.measure import measure, to_json, verdict
 from tests.learning.table import markdown, row, show
 from tests.learning.targets import tasks
-from tune_jobs.spec_file import list_presets
+from tune_jobs.spec.file import list_presets
 
 
 def _arguments(arguments: list[str] | None) -> argparse.Namespace:

@@ -13,10 +13,10 @@ from analysis.records import EvaluationRecord, TrialRecord
 from analysis.statistics import median_steps
 from analysis.tables import env_steps_to
 from tests.learning.targets import NUM_EPISODES, Target, Task
-from tune_jobs import sweeps
-from tune_jobs.finish import find_sweep, read_results
-from tune_jobs.seeds import confirmation_seeds
-from tune_jobs.spec_file import Preset, find_preset
+from tune_jobs.spec.file import Preset, find_preset
+from tune_jobs.spec.seeds import confirmation_seeds
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.conclude import find_sweep, read_results
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tune_jobs import sweeps
+from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.learning]
 

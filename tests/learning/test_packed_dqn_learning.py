@@ -18,12 +18,12 @@ from pathlib import Path
 
 import pytest
 
-from policies.evaluate import Episodes, Evaluator
+from policies.acting.evaluate import Episodes, Evaluator
+from policies.acting.policy import NetworkPolicy
 from policies.packed.evaluation import evaluate_many
-from policies.policy import NetworkPolicy
-from tune_jobs.engines.protocol import IterationStats, TrialTask
-from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import load_spec
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.training.protocol import IterationStats, TrialTask
 
 pytestmark = [pytest.mark.ray, pytest.mark.learning]
 
@@ -49,7 +49,7 @@ def task_of(spec: SweepSpec, index: int, folder: Path) -> TrialTask:
 
 
 def test_a_pack_of_dqn_trials_solves_cartpole(ray_session: None, tmp_path: Path) -> None:
-    from tune_jobs.engines.packed import PackedEngine
+    from tune_jobs.training.packed import PackedEngine
 
     spec = load_spec("cartpole-dqn-tuned")
     engine, reached = PackedEngine(), {}

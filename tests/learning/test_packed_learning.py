@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from analysis.statistics import Estimate, paired_difference
-from policies.evaluate import Evaluator
-from policies.policy import NetworkPolicy
-from policies.portable import PortablePolicy
-from tune_jobs.engines.packed import PackedEngine
-from tune_jobs.engines.protocol import IterationStats, TrialTask
-from tune_jobs.engines.rllib import RLlibEngine
-from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+from policies.acting.evaluate import Evaluator
+from policies.acting.policy import NetworkPolicy
+from policies.portable.file import PortablePolicy
+from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.training.packed import PackedEngine
+from tune_jobs.training.protocol import IterationStats, TrialTask
+from tune_jobs.training.rllib import RLlibEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.learning]
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import tune_jobs
-from policies.env_modules import allowed_modules
+from policies.envs.modules import allowed_modules
 
 SPEC = {
     "env": "CartPole-v1",

@@ -15,7 +15,7 @@ SMALL = {
 @pytest.fixture
 def build():
     """(algorithm, env id, env arguments, rl_module, hyperparameters) -> (Algorithm, hyperparameters)"""
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     built = []
 
@@ -32,7 +32,7 @@ def build():
 
 
 def portable(algo, hyperparams, env_args=None):
-    from policies.restore import portable_policy
+    from policies.rllib.restore import portable_policy
 
     return portable_policy(algo, hyperparams, env_id=algo.config.env, env_args=env_args or {})
 

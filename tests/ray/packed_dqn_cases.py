@@ -157,7 +157,7 @@ def check_prioritized_beta():
 
 def check_first_q_values(**values):
     """A member's first Q-values are those of RLlib's module with the seed."""
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     stack = make_stack(**values)
     member = add(stack, "m", 1234, **values)
@@ -202,8 +202,8 @@ def check_initializer():
 
 @arrives("conv_filters")
 def check_conv_filters():
-    from tune_jobs.packs import why_not_packed
-    from tune_jobs.spec import SweepSpec
+    from tune_jobs.plan.engine_choice import why_not_packed
+    from tune_jobs.spec.sweep_spec import SweepSpec
 
     spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "dqn"})
     assert why_not_packed(spec, DQNHyperparams()) is None

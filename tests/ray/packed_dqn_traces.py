@@ -12,9 +12,9 @@ import torch
 from packed_dqn import SMALL, add, compare, make_stack
 from packed_dqn_cases import arrives
 
-from policies.epsilon import EpsilonSchedule
 from policies.hyperparams import DQNHyperparams
-from policies.packed.dqn_group import DQNGroup
+from policies.networks.epsilon import EpsilonSchedule
+from policies.packed.dqn.group import DQNGroup
 
 
 @dataclass
@@ -89,7 +89,7 @@ def pack_trace(num_iterations, values):
 
 
 def rllib_trace(num_iterations, values):
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     hyperparams = DQNHyperparams(**{**SMALL, **values})
     algorithm = build_algorithm_config(hyperparams, seed=5, **ENV).build_algo()

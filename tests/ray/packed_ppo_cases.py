@@ -85,8 +85,8 @@ def check_initializer():
 @arrives
 def check_conv_filters():
     """Packs have none: the plan leaves such trials to RLlib."""
-    from tune_jobs.packs import why_not_packed
-    from tune_jobs.spec import SweepSpec
+    from tune_jobs.plan.engine_choice import why_not_packed
+    from tune_jobs.spec.sweep_spec import SweepSpec
 
     spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "ppo"})
     assert why_not_packed(spec, PPOHyperparams()) is None

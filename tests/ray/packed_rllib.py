@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from policies.envs import make_env
+from policies.envs.make import make_env
 from policies.hyperparams import PPOHyperparams
 
 MODULE = "default_policy"
@@ -22,7 +22,7 @@ SMALL = {"hidden_sizes": (8,), "train_batch_size": ROWS, "minibatch_size": ROWS,
 
 def make_stack(env_id, members, env_args=None, seeds=None):
     """A stack of PPO members from a few hyperparameters each, fresh."""
-    from policies.packed.envs import make_packed_envs
+    from policies.packed.envs.make import make_packed_envs
     from policies.packed.initial import new_member
     from policies.packed.stack import make_stack as make
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from unittest import mock
 
 from analysis.records import SweepRecord, TrialRecord
-from tune_jobs.packs import PackPlan
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
 
 STEPS = 100
 
@@ -53,10 +53,10 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
     import gymnasium as gym
     import numpy as np
 
-    from policies.evaluate import Episodes
-    from policies.portable import Layer, PolicyNetwork, PortablePolicy, describe_space
-    from tune_jobs.engines.protocol import IterationStats
-    from tune_jobs.pack_trainable import PackTrainable
+    from policies.acting.evaluate import Episodes
+    from policies.portable.file import Layer, PolicyNetwork, PortablePolicy, describe_space
+    from tune_jobs.ray_tune.pack_trainable import PackTrainable
+    from tune_jobs.training.protocol import IterationStats
 
     steps, kill = STEPS, signal.SIGKILL
     observation_space = describe_space(gym.make("CartPole-v1").observation_space)
@@ -131,7 +131,7 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
 
 def run_packs(store: SweepStore, scripts=None, *, num_packs=2, slots=2, pause_s=0.0, listener=None, trial_ids=None):
     """Run the trials of a sweep that have not ended, in packs; returns their records."""
-    from tune_jobs.runner import RunJob, run_trials
+    from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
     todo = tuple(record.trial_id for record in store.read_trials() if record.status in ("pending", "paused", "running"))
     packs = PackPlan(
@@ -139,6 +139,6 @@ def run_packs(store: SweepStore, scripts=None, *, num_packs=2, slots=2, pause_s=
         env_kind="scalar", env_step_us=None, num_env_processes=0,
     )  # fmt: skip
     job = RunJob(store.folder, todo, 1.0, 0.0, 2, packs=packs)
-    with mock.patch("tune_jobs.runner.PackTrainable", scripted_trainable(scripts or {}, pause_s)):
+    with mock.patch("tune_jobs.ray_tune.run_trials.PackTrainable", scripted_trainable(scripts or {}, pause_s)):
         run_trials(job, listener or (lambda record: None))
     return store.read_trials()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ray import tune
 
-from tune_jobs.schedulers import build_scheduler, waits_for_others
+from tune_jobs.ray_tune.early_stopping import build_scheduler, waits_for_others
 
 STEPS = 100
 
@@ -20,9 +20,9 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
         evaluate_every: Reports between two evaluations.
     """
     # Defined in here, or the worker processes would look for a module that only this one has.
-    from tune_jobs.progress import Progress
-    from tune_jobs.schedulers import grace_env_steps
-    from tune_jobs.trainable import TrialTrainable
+    from tune_jobs.ray_tune.early_stopping import grace_env_steps
+    from tune_jobs.ray_tune.trainable import TrialTrainable
+    from tune_jobs.store.progress import Progress
 
     grace, steps = grace_env_steps(scheduler, max_env_steps), STEPS
 

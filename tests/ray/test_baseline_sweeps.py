@@ -2,10 +2,10 @@
 
 import pytest
 
-from policies.policy import RandomPolicy, load_policy
+from policies.acting.policy import RandomPolicy, load_policy
 from tests.learning.measure import measure, verdict
 from tests.learning.targets import Target, Task
-from tune_jobs import sweeps
+from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

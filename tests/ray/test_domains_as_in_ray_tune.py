@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from tune_jobs.search_space import Domain
+from tune_jobs.spec.domains import Domain
 
 pytestmark = pytest.mark.ray
 

@@ -11,7 +11,7 @@ MODULE = "default_policy"
 
 
 def make(**values):
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     hyperparams = DQNHyperparams(hidden_sizes=(8,), gamma=0.9, **values)
     return build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=3).build_algo()

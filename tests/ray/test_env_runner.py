@@ -25,7 +25,7 @@ CASES = [pytest.param("ppo", env, id=env) for env in ENVS]
 
 
 def make_config(algorithm, env):
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     env_id, env_args, num_envs, _ = ENVS[env]
     kwargs = {"hidden_sizes": (16,), "activation": "tanh", "num_envs": num_envs}
@@ -41,7 +41,7 @@ def make_runners(algorithm, env):
     """(ours, RLlib's), with the same weights and seeds."""
     from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
-    from policies.env_runner import ArrayEnvRunner
+    from policies.rllib.env_runner import ArrayEnvRunner
 
     config = make_config(algorithm, env)
     ours = ArrayEnvRunner(config=config, worker_index=0)
@@ -310,7 +310,7 @@ def test_seeds_make_the_episodes():
 
 def test_neighbouring_env_runners_share_no_environment_seed():
     """RLlib gives worker w, sub-environment i the seed s + w + i: worker 2's first is worker 1's second."""
-    from policies.env_runner import ArrayEnvRunner
+    from policies.rllib.env_runner import ArrayEnvRunner
 
     config = make_config("ppo", "ticks").env_runners(num_env_runners=2)
     streams = []
@@ -323,8 +323,8 @@ def test_neighbouring_env_runners_share_no_environment_seed():
 
 
 def test_what_the_environment_raises_is_raised():
-    from policies.env_runner import ArrayEnvRunner
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
+    from policies.rllib.env_runner import ArrayEnvRunner
 
     env_args = {"troubles": {str(SEED): {"how": "raise", "at": 5}}}
     config = build_algorithm_config(PPOHyperparams(num_envs=2), env_id="TestTrouble-v0", env_args=env_args, seed=SEED)

@@ -3,9 +3,9 @@
 import pandas as pd
 import pytest
 
-from tune_jobs import sweeps
-from tune_jobs.seeds import trial_seeds
-from tune_jobs.store import SweepStore
+from tune_jobs.spec.seeds import trial_seeds
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

@@ -1,11 +1,11 @@
-"""What `policies.acting` says to be idle is on RLlib's engine too; that of packs is in `tests/unit/test_acting.py`."""
+"""What `policies.idle.find` says to be idle is on RLlib's engine too; that of packs is in `tests/unit/test_acting.py`."""
 
 import numpy as np
 import pytest
 from trials import make_task
 
-from policies.acting import Limits, idle_rule
 from policies.hyperparams import make_hyperparams
+from policies.idle.find import Limits, idle_rule
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -27,7 +27,7 @@ CASES = [
 
 @pytest.mark.parametrize(("algorithm", "name", "values", "further"), CASES, ids=[f"{one[0]}-{one[1]}" for one in CASES])
 def test_what_is_said_to_be_idle_is_on_rllib(tmp_path, algorithm, name, values, further):
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     engine, found = RLlibEngine(), []
     for value in values:

@@ -1,4 +1,4 @@
-"""What `tune_jobs.cluster` and `tune_jobs.address` take for granted about Ray, and work around."""
+"""What `tune_jobs.ray_tune.cluster` and `tune_jobs.ray_tune.address` take for granted about Ray, and work around."""
 
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ FORK_FAILURE = "Initialization failure from server:\nRuntimeError: Starting Ray 
 def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path, monkeypatch):
     import ray._common.utils
 
-    from tune_jobs.address import recorded_cluster
+    from tune_jobs.ray_tune.address import recorded_cluster
 
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
     path = Path(ray._common.utils.get_ray_address_file(None))
@@ -24,7 +24,7 @@ def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path, monkeypatch
 
 @pytest.mark.parametrize(("error", "attempts"), [(FORK_FAILURE, 3), ("ray client connection timeout", 1)])
 def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(monkeypatch, error, attempts):
-    from tune_jobs import cluster
+    from tune_jobs.ray_tune import cluster
 
     asked = []
 
@@ -44,7 +44,7 @@ def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(monkeypat
 
 def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch):
     from policies.errors import CannotRunError
-    from tune_jobs import cluster
+    from tune_jobs.ray_tune import cluster
 
     def init(address, **_):
         raise ConnectionAbortedError(FORK_FAILURE)
@@ -56,7 +56,7 @@ def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch):
 
 def test_a_refused_token_is_named(monkeypatch):
     from policies.errors import CannotRunError
-    from tune_jobs import cluster
+    from tune_jobs.ray_tune import cluster
 
     def init(address, **_):
         os.write(2, b"W gcs_client.cc:210: Failed to get cluster ID: InvalidAuthToken: token is missing or incorrect\n")

@@ -9,11 +9,11 @@ from ray.exceptions import RayTaskError
 from scripted_packs import make_sweep
 
 from policies.errors import CheckpointError
-from tune_jobs.ownership import OWNER_FILE, Owner, OwnershipLostError
-from tune_jobs.ray_processes import RayWatch
-from tune_jobs.record_keeper import RecordKeeper
-from tune_jobs.runner import RunJob, _TrialEvents, run_trials
-from tune_jobs.trainable import TrialTrainable, watchdog
+from tune_jobs.ray_tune.processes import RayWatch
+from tune_jobs.ray_tune.run_trials import RunJob, _TrialEvents, run_trials
+from tune_jobs.ray_tune.trainable import TrialTrainable, watchdog
+from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.store.record_keeper import RecordKeeper
 
 pytestmark = pytest.mark.ray
 

@@ -8,10 +8,10 @@ from network_builds import build, observations_of, portable, rllib_outputs
 from rllib_cases import MODULE, learner_of, module_of
 from rounding import assert_greedy, assert_network
 
+from policies.acting.policy import NetworkPolicy, load_policy
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import make_hyperparams
-from policies.policy import NetworkPolicy, load_policy
-from policies.portable import ConvLayer, save_policy
+from policies.portable.file import ConvLayer, save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -112,8 +112,8 @@ def test_pixels_of_cartpole_train(build):
     ],
 )
 def test_networks_that_do_not_go_with_the_observations_are_refused(env_id, values, words):
-    from policies.network_parts import make_encoder
-    from policies.networks import module_spec
+    from policies.networks.parts import make_encoder
+    from policies.networks.rl_modules import module_spec
 
     env = gym.make(env_id)
     config = module_spec(make_hyperparams("ppo", values)).model_config
@@ -204,7 +204,7 @@ def test_a_batch_is_trained_with_the_statistics_it_was_sampled_with(build):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_statistics_are_in_checkpoints(build, algorithm, tmp_path):
-    from policies.restore import check_weights, restore_algorithm
+    from policies.rllib.restore import check_weights, restore_algorithm
 
     algo, hyperparams = build(algorithm, normalize_observations=True)
     algo.train()
@@ -229,7 +229,7 @@ def test_statistics_are_in_checkpoints(build, algorithm, tmp_path):
 def test_convolutions_of_a_checkpoint_are_checked(build, tmp_path):
     from dataclasses import replace
 
-    from policies.restore import check_weights
+    from policies.rllib.restore import check_weights
 
     algo, hyperparams = build("ppo", "TestShades-v0", conv_filters=FILTERS)
     network = portable(algo, hyperparams).network

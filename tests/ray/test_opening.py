@@ -7,26 +7,26 @@ from pathlib import Path
 
 import pytest
 
-from policies import env_modules
-from policies.env_modules import allow_modules
-from tune_jobs.driving import write_new
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from policies.envs import modules as env_modules
+from policies.envs.modules import allow_modules
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drive import write_new
 
 pytestmark = pytest.mark.ray
 
 ROOT = Path(__file__).parents[2]
 OPENED = {
     "trial": """
-from tune_jobs.trainable import TrialLog, TrialTrainable
+from tune_jobs.ray_tune.trainable import TrialLog, TrialTrainable
 trial = TrialTrainable.__new__(TrialTrainable)
 trial._log, trial._evaluators, trial._engine, trial._run = TrialLog(), {}, None, None
 trial._open(Path(folder), "t0000")
 """,
     "pack": """
-from tune_jobs.pack_trainable import PackTrainable
+from tune_jobs.ray_tune.pack_trainable import PackTrainable
 pack = PackTrainable.__new__(PackTrainable)
 pack._config = {"sweep_folder": folder, "env_kind": "scalar", "num_env_processes": 0}
 pack._owner, pack._file = None, open(Path(folder) / "trials/t0000/log.txt", "ab")

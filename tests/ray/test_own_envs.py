@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from trials import make_task, run_trial
 
-from policies import env_modules
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.policy import load_policy
+from policies.envs import modules as env_modules
 from policies.errors import EnvError
-from policies.evaluate import evaluate_policy
-from policies.policy import load_policy
-from policies.portable import read_policy
-from tune_jobs import sweeps
-from tune_jobs.store import SweepStore
+from policies.portable.file import read_policy
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -33,7 +33,7 @@ def _nothing_is_allowed(monkeypatch):
 
 @pytest.fixture
 def engine():
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     engine = RLlibEngine()
     yield engine
@@ -176,7 +176,7 @@ def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path):
         f"hyperparams: {json.dumps(FAST)}\nstop: {{num_env_steps: 200}}\nresources: {{num_env_runners: 1}}\n"
     )
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    command = [sys.executable, "-P", "-m", "tune_jobs.cli", "launch", "sweep.yaml", "--json", "--no-finish"]
+    command = [sys.executable, "-P", "-m", "tune_jobs.cli.commands", "launch", "sweep.yaml", "--json", "--no-finish"]
 
     def run(*options):
         return subprocess.run(
@@ -192,7 +192,7 @@ def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path):
 
 
 def test_own_modules_that_only_this_processs_path_has_are_found_by_the_ray_it_starts(tmp_path, monkeypatch):
-    from tune_jobs import cluster
+    from tune_jobs.ray_tune import cluster
 
     (tmp_path / "hidden_own.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)

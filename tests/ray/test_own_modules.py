@@ -10,10 +10,10 @@ from network_builds import build, observations_of, portable, rllib_outputs
 from rllib_cases import module_of
 from rounding import assert_greedy, assert_network
 
+from policies.acting.policy import load_policy
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import make_hyperparams
-from policies.policy import load_policy
-from policies.portable import read_policy, save_policy
+from policies.portable.file import read_policy, save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -27,7 +27,7 @@ NUM_TERMS = 200
 @pytest.fixture
 def allowed(monkeypatch):
     """The module of test classes may be imported, in this test alone."""
-    monkeypatch.setattr("policies.env_modules._allowed", {MODULES})
+    monkeypatch.setattr("policies.envs.modules._allowed", {MODULES})
 
 
 OWN = {
@@ -44,7 +44,7 @@ def test_a_module_of_ones_own_trains_restores_and_acts(build, kind, tmp_path):
     import tune_jobs_test_modules
     from ray.rllib.utils.spaces.space_utils import unsquash_action
 
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     algorithm, env_id, name = OWN[kind]
     own_class = getattr(tune_jobs_test_modules, name)
@@ -80,12 +80,12 @@ def test_a_module_of_ones_own_trains_restores_and_acts(build, kind, tmp_path):
 
 
 def test_a_module_that_was_not_allowed_is_never_imported(build, allowed, monkeypatch, tmp_path):
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     algo, hyperparams = build("ppo", rl_module=f"{MODULES}:OwnPPO")
     save_policy(portable(algo, hyperparams), tmp_path / "policy")
     algo.save_to_path(str(tmp_path / "rllib"))
-    monkeypatch.setattr("policies.env_modules._allowed", set())
+    monkeypatch.setattr("policies.envs.modules._allowed", set())
     monkeypatch.delitem(sys.modules, MODULES)
     with pytest.raises(SpecError, match="not allowed"):
         build("ppo", rl_module=f"{MODULES}:OwnPPO")
@@ -101,7 +101,7 @@ def test_a_module_that_is_gone_is_an_error(build, allowed, monkeypatch, tmp_path
     """RLlib itself only warns, and goes on with another class."""
     import tune_jobs_test_modules
 
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     algo, _ = build("ppo", rl_module=f"{MODULES}:OwnPPO")
     algo.save_to_path(str(tmp_path))
@@ -123,7 +123,7 @@ def test_a_module_that_is_gone_is_an_error(build, allowed, monkeypatch, tmp_path
 )
 @pytest.mark.usefixtures("allowed")
 def test_classes_that_cannot_be_trained_are_refused(algorithm, values, name, words):
-    from policies.networks import module_spec
+    from policies.networks.rl_modules import module_spec
 
     with pytest.raises(SpecError, match=words):
         module_spec(make_hyperparams(algorithm, values), f"{MODULES}:{name}")

@@ -4,14 +4,14 @@ import pytest
 from scripted_packs import make_sweep
 
 from analysis.records import CheckpointRecord
-from tune_jobs.pack_driver import PackDriver
-from tune_jobs.pack_files import PackFiles
-from tune_jobs.pack_loop import MemberReport
-from tune_jobs.packs import PackPlan
-from tune_jobs.progress import Progress
-from tune_jobs.record_keeper import RecordKeeper
-from tune_jobs.schedulers import build_scheduler
-from tune_jobs.spec import SweepSpec
+from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.ray_tune.early_stopping import build_scheduler
+from tune_jobs.ray_tune.pack_scheduler import PackDriver
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.pack_files import PackFiles
+from tune_jobs.store.progress import Progress
+from tune_jobs.store.record_keeper import RecordKeeper
+from tune_jobs.training.pack_loop import MemberReport
 
 pytestmark = pytest.mark.ray
 

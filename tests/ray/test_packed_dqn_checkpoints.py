@@ -6,8 +6,8 @@ from packed_dqn import SMALL, q_values_of
 from packed_rllib import MODULE, learner_of, state_of
 from trials import make_task
 
-from policies.policy import NetworkPolicy
-from policies.portable import save_policy
+from policies.acting.policy import NetworkPolicy
+from policies.portable.file import save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -32,7 +32,7 @@ def task_of(folder, trial_id="t0000", **values):
 
 @pytest.fixture
 def engine():
-    from tune_jobs.engines.packed import PackedEngine
+    from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine()
     yield engine

@@ -5,13 +5,13 @@ import pytest
 from trials import make_task
 
 from policies.errors import EnvError
-from policies.portable import save_policy
+from policies.portable.file import save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 
 def engine_of(folder, tasks, **settings):
-    from tune_jobs.engines.packed import PackedEngine
+    from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine(**settings)
     for index, values in enumerate(tasks):
@@ -72,7 +72,7 @@ def test_a_trial_whose_environment_cannot_be_made_is_no_member(tmp_path):
 
 
 def test_a_restored_algorithm_trains_with_the_failure_penalty_of_its_trial(tmp_path):
-    from policies.envs import FAILURE_PENALTY
+    from policies.envs.make import FAILURE_PENALTY
     from policies.packed.to_rllib import algorithm_from_checkpoint
 
     penalties = {}

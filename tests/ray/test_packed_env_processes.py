@@ -2,13 +2,13 @@
 
 import pytest
 
-from policies import env_modules
-from policies.env_modules import allow_modules
-from tune_jobs.driving import write_new
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from policies.envs import modules as env_modules
+from policies.envs.modules import allow_modules
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drive import write_new
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -16,7 +16,7 @@ NUM_ENVS = 4
 
 
 def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(tmp_path, monkeypatch):
-    from tune_jobs.runner import RunJob, run_trials
+    from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["tune_jobs_test_own"])

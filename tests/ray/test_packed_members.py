@@ -10,10 +10,10 @@ import torch
 from packed_rllib import MODULE, assert_same_stats, learner_of, state_of
 from trials import make_task
 
+from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError
 from policies.hyperparams import PPOHyperparams
-from policies.policy import NetworkPolicy
-from policies.portable import save_policy
+from policies.portable.file import save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -21,7 +21,7 @@ SHARED = {"train_batch_size": 256, "minibatch_size": 64, "num_epochs": 4, "num_e
 
 
 def make_stack(env_id, **shared):
-    from policies.packed.envs import make_packed_envs
+    from policies.packed.envs.make import make_packed_envs
     from policies.packed.stack import make_stack as make
 
     hyperparams = PPOHyperparams(**{**SHARED, **shared})
@@ -166,7 +166,7 @@ LR = 3e-3
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory, ray_session):
     """(a checkpoint of a trial of the packed engine, its task, its policy)."""
-    from tune_jobs.engines.packed import PackedEngine
+    from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine()
     task = make_task(
@@ -187,7 +187,7 @@ def checkpoint(tmp_path_factory, ray_session):
 
 @pytest.fixture
 def engine():
-    from tune_jobs.engines.packed import PackedEngine
+    from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine()
     yield engine

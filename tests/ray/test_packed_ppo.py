@@ -11,7 +11,7 @@ import torch
 from packed_rllib import MODULE, ROUNDING, compare, differences, episodes_of, learner_of, make_stack, sample
 
 from policies.hyperparams import ACTIVATIONS
-from policies.packed import ppo_stack
+from policies.packed.ppo import stack as ppo_stack
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -146,7 +146,7 @@ def test_advantages_and_value_targets_are_rllibs(monkeypatch, env_id):
 ])  # fmt: skip
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 def test_first_weights_are_those_of_rllibs_learner_with_the_seed(env_id, values):
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     stack = make_stack(env_id, [values], seeds=[1234])
     algorithm = build_algorithm_config(stack.members[0].hyperparams, env_id=env_id, seed=1234).build_algo()

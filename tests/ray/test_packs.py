@@ -8,9 +8,9 @@ import pytest
 from scripted_packs import STEPS, make_sweep, run_packs
 from test_schedulers import MIXED
 
-from tune_jobs.pack_files import PackFiles
-from tune_jobs.schedulers import build_scheduler
-from tune_jobs.spec import SchedulerSpec
+from tune_jobs.ray_tune.early_stopping import build_scheduler
+from tune_jobs.spec.sweep_spec import SchedulerSpec
+from tune_jobs.store.pack_files import PackFiles
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -267,8 +267,8 @@ def test_points_are_chosen_when_trials_are_handed_to_packs(tmp_path):
     records = run_packs(store, slots=2)
     assert [record.status for record in records] == ["completed"] * 8
     assert all(record.has_point and record.hyperparams["lr"] == record.point["lr"] for record in records)
-    from tune_jobs.search_space import draw_point
-    from tune_jobs.spec import SweepSpec
+    from tune_jobs.spec.domains import draw_point
+    from tune_jobs.spec.sweep_spec import SweepSpec
 
     spec = SweepSpec.model_validate(store.read_record().spec)
     random = [draw_point(spec.space, index, spec.seed) for index in range(8)]

@@ -16,7 +16,7 @@ class Clock:
 
 
 def test_a_part_is_dead_when_it_has_been_silent_for_long():
-    from tune_jobs.ray_processes import RayDiedError, RayWatch
+    from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
 
     clock, answers = Clock(), {"this": True, "that": True}
     watch = RayWatch({name: lambda name=name: answers[name] for name in answers}, 10.0, clock)
@@ -43,7 +43,7 @@ def test_a_part_is_dead_when_it_has_been_silent_for_long():
 def test_what_a_trial_raised_is_not_waited_for():
     from ray.exceptions import RayTaskError
 
-    from tune_jobs.ray_processes import RayDiedError, RayWatch
+    from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
 
     watch = RayWatch({"it": lambda: False}, 0.2)
     watch.check_after(RayTaskError("step", "Traceback", ValueError("of the env")))
@@ -53,7 +53,7 @@ def test_what_a_trial_raised_is_not_waited_for():
 
 
 def test_a_block_that_goes_on_is_stuck():
-    from tune_jobs.ray_processes import RayWatch
+    from tune_jobs.ray_tune.processes import RayWatch
 
     told, deaths = threading.Event(), []
     with RayWatch({"it": lambda: False}, 0.05, stuck_s=0.05) as watch:
@@ -67,7 +67,7 @@ def test_a_block_that_goes_on_is_stuck():
 
 
 def test_it_looks_by_itself_and_ends_with_its_block():
-    from tune_jobs.ray_processes import RayDiedError, RayWatch, _answers
+    from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, _answers
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()

@@ -10,10 +10,10 @@ import torch
 from rounding import assert_greedy, assert_network
 from trials import make_task, run_trial
 
+from policies.acting.policy import NetworkPolicy, load_policy
 from policies.errors import CheckpointError, NotFoundError
 from policies.hyperparams import ACTIVATIONS, make_hyperparams
-from policies.policy import NetworkPolicy, load_policy
-from policies.portable import Layer, PolicyNetwork, read_policy, save_policy
+from policies.portable.file import Layer, PolicyNetwork, read_policy, save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -25,7 +25,7 @@ NUM_TERMS = 170
 @pytest.fixture(scope="module", params=["ppo", "dqn"])
 def trained(request, ray_session, tmp_path_factory):
     """(checkpoint folder, its Algorithm as it was when it was saved)."""
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     task = make_task(tmp_path_factory.mktemp("sweep"), request.param)
     engine = RLlibEngine()
@@ -57,7 +57,7 @@ def assert_equal_arrays(ours, theirs):
 
 
 def test_a_checkpoint_restores_as_the_algorithm_that_was_saved_and_trains_on(trained):
-    from tune_jobs import sweeps
+    from tune_jobs.sweeps import verbs as sweeps
 
     folder, saved = trained
     algo = sweeps.restore(folder)
@@ -85,7 +85,7 @@ def test_a_checkpoint_restores_as_the_algorithm_that_was_saved_and_trains_on(tra
 
 
 def test_any_altered_or_missing_file_is_an_error_that_names_it(checkpoint):
-    from tune_jobs import sweeps
+    from tune_jobs.sweeps import verbs as sweeps
 
     files = json.loads((checkpoint / "manifest.json").read_text())["files"]
     on_disk = {path.relative_to(checkpoint).as_posix() for path in checkpoint.rglob("*") if path.is_file()}
@@ -108,7 +108,7 @@ def test_any_altered_or_missing_file_is_an_error_that_names_it(checkpoint):
 
 
 def test_a_folder_that_is_no_checkpoint_is_an_error(checkpoint, tmp_path):
-    from tune_jobs import sweeps
+    from tune_jobs.sweeps import verbs as sweeps
 
     with pytest.raises(NotFoundError, match="nowhere"):
         sweeps.restore(tmp_path / "nowhere")
@@ -122,7 +122,7 @@ def test_a_folder_that_is_no_checkpoint_is_an_error(checkpoint, tmp_path):
 
 def test_what_rllib_cannot_restore_is_an_error(checkpoint):
     """Also where nobody looked at the hashes."""
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     state = next((checkpoint / "rllib" / "learner_group").rglob("module_state.pkl"))
     state.write_bytes(b"\x80\x04N.")  # the pickle of None
@@ -131,7 +131,7 @@ def test_what_rllib_cannot_restore_is_an_error(checkpoint):
 
 
 def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint):
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     (checkpoint / "rllib" / "class_and_ctor_args.pkl").unlink()
     with pytest.raises(CheckpointError, match="RLlib cannot restore"):
@@ -142,7 +142,7 @@ def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint
 @pytest.mark.parametrize("number", [0, 1])
 def test_weights_other_than_the_saved_ones_are_an_error(checkpoint, number, part):
     """One number of one layer, in the last bit."""
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     network = read_policy(checkpoint).network
     restore_algorithm(checkpoint / "rllib", network).stop()
@@ -155,7 +155,7 @@ def test_weights_other_than_the_saved_ones_are_an_error(checkpoint, number, part
 
 
 def test_an_env_runner_with_other_weights_than_the_learner_is_an_error(trained):
-    from policies.restore import check_weights, restore_algorithm
+    from policies.rllib.restore import check_weights, restore_algorithm
 
     folder, _ = trained
     network = read_policy(folder).network
@@ -217,8 +217,8 @@ NETWORKS = {
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("network", NETWORKS)
 def test_greedy_actions_of_the_policy_file_are_rllibs(network, activation, tmp_path):
-    from policies.restore import portable_policy
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
+    from policies.rllib.restore import portable_policy
 
     algorithm, env_id, values = NETWORKS[network]
     hyperparams = make_hyperparams(algorithm, {"hidden_sizes": (24, 16), "activation": activation, **values})
@@ -254,7 +254,7 @@ def test_trained_policies_act_as_their_checkpoints(trained):
 
 
 def test_a_network_other_than_the_hyperparameters_say_is_an_error(trained):
-    from policies.restore import portable_policy
+    from policies.rllib.restore import portable_policy
 
     _, saved = trained
     algorithm = "dqn" if "DQN" in type(saved).__name__ else "ppo"

@@ -34,7 +34,7 @@ TRAINED = {name: HYPERPARAMS_BY_ALGORITHM[name] for name in ("ppo", "dqn")}
 @pytest.fixture
 def build():
     """Make an Algorithm from a few hyperparameters; all are stopped at the end."""
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     built = []
 
@@ -80,7 +80,7 @@ def test_the_seed_reaches_environment_and_runner(build):
 @pytest.mark.parametrize("num_env_runners", [0, 2])
 def test_resources_are_what_the_plan_counts(num_env_runners):
     """Trap: RLlib's default of two env runners makes three CPUs a trial, which a laptop of two never has."""
-    from policies.rllib_config import build_algorithm_config
+    from policies.rllib.config import build_algorithm_config
 
     for hyperparams in (PPOHyperparams(), DQNHyperparams()):
         config = build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=0, num_env_runners=num_env_runners)

@@ -7,16 +7,16 @@ import pytest
 import torch
 from trials import TRIAL_SEED, make_task, run_trial
 
+from policies.acting.policy import NonFiniteWeightsError
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
-from policies.policy import NonFiniteWeightsError
-from tune_jobs.spec import StopSpec
+from tune_jobs.spec.sweep_spec import StopSpec
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 
 @pytest.fixture
 def engine():
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     engine = RLlibEngine()
     yield engine
@@ -25,7 +25,7 @@ def engine():
 
 def weights_after(engine, task, num_iterations=2):
     """The learner's weights of a fresh trial, and what its iterations gave."""
-    from policies.restore import learner_weights
+    from policies.rllib.restore import learner_weights
 
     engine.build(task, None)
     stats = [engine.train_iteration() for _ in range(num_iterations)]
@@ -39,7 +39,7 @@ def same(ours, theirs):
 
 def save(engine, folder):
     """A checkpoint as a trial saves it, but without a manifest."""
-    from policies.portable import save_policy
+    from policies.portable.file import save_policy
 
     folder.mkdir(parents=True)
     engine.save(folder)
@@ -88,8 +88,8 @@ def test_iterations_tell_whole_episodes_and_all_env_steps(engine, tmp_path):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
-    from policies.restore import learner_weights
-    from tune_jobs.engines.rllib import RLlibEngine
+    from policies.rllib.restore import learner_weights
+    from tune_jobs.training.rllib import RLlibEngine
 
     task = make_task(tmp_path, algorithm)
     weights, stats = weights_after(engine, task, 3)
@@ -112,7 +112,7 @@ def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path, algorithm):
     """A trial that is retried from a checkpoint goes the same way again; and other ways from other checkpoints."""
-    from policies.restore import learner_weights
+    from policies.rllib.restore import learner_weights
 
     task = make_task(tmp_path, algorithm)
     weights_after(engine, task, 1)
@@ -202,7 +202,7 @@ def test_nothing_is_left_of_a_closed_trial(engine, tmp_path):
 
 
 def test_the_policy_is_the_one_that_trains(engine, tmp_path):
-    from policies.restore import learner_weights
+    from policies.rllib.restore import learner_weights
 
     task = make_task(tmp_path)
     weights_after(engine, task, 1)

@@ -5,11 +5,11 @@ import threading
 import pytest
 from test_sweeps import FAST, assert_results_without_gaps, eventually
 
-from policies.portable import read_policy
-from tune_jobs import sweeps
-from tune_jobs.search_space import draw_point
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from policies.portable.file import read_policy
+from tune_jobs.spec.domains import draw_point
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -73,7 +73,7 @@ def test_a_mutated_learning_rate_is_the_one_in_the_trials_optimizer(population):
 
 
 def test_all_trials_of_a_population_train_to_the_end_and_their_history_is_shown(population):
-    from tune_jobs.cli_output import show_trials
+    from tune_jobs.cli.output import show_trials
 
     trials = population.trials
     assert [trial.status for trial in trials] == ["completed"] * 4

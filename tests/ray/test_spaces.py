@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from trials import make_task, run_trial
 
-from policies.evaluate import Evaluator
-from policies.policy import load_policy
+from policies.acting.evaluate import Evaluator
+from policies.acting.policy import load_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -25,15 +25,15 @@ BOUNDS = [[0, None], [None, 0.5], [-2, 3], [None, None]]
 
 
 def engines():
-    from tune_jobs.engines.packed import PackedEngine
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.packed import PackedEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     return RLlibEngine(), PackedEngine()
 
 
 def train_packed(engine, task):
     """Two iterations and a checkpoint, as a pack saves them; returns its folder."""
-    from policies.portable import save_policy
+    from policies.portable.file import save_policy
 
     engine.add(task, None)
     for _ in range(2):
@@ -65,7 +65,7 @@ def checkpoints(request, tmp_path):
 def train_on(folder):
     """Restore, train an iteration, and return the Algorithm."""
     from policies.packed.to_rllib import algorithm_from_checkpoint
-    from policies.restore import restore_algorithm
+    from policies.rllib.restore import restore_algorithm
 
     is_packed = (folder / "packed").is_dir()
     algorithm = algorithm_from_checkpoint(folder) if is_packed else restore_algorithm(folder / "rllib")

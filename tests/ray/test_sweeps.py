@@ -14,13 +14,13 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from policies.acting.policy import load_policy
 from policies.errors import CannotRunError, NotFoundError, SpecError
-from policies.policy import load_policy
-from policies.portable import read_policy
-from tune_jobs import sweeps
-from tune_jobs.record_keeper import RecordKeeper
-from tune_jobs.seeds import trial_seeds
-from tune_jobs.store import SweepStore, verify_checkpoint
+from policies.portable.file import read_policy
+from tune_jobs.spec.seeds import trial_seeds
+from tune_jobs.store.record_keeper import RecordKeeper
+from tune_jobs.store.sweep_store import SweepStore, verify_checkpoint
+from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -148,7 +148,7 @@ def test_the_best_is_chosen_by_evaluation_and_confirmed_on_other_seeds(cartpole)
 
 
 def test_the_best_restores_as_an_algorithm_by_the_sweeps_name(cartpole):
-    from policies.restore import learner_weights
+    from policies.rllib.restore import learner_weights
 
     storage, result = cartpole
     algo = sweeps.restore("cartpole", storage=storage)

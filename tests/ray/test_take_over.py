@@ -8,7 +8,7 @@ from trials import make_task
 
 from analysis.records import ChangeRecord
 from policies.errors import CheckpointError
-from policies.portable import save_policy
+from policies.portable.file import save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -50,7 +50,7 @@ def assert_same(first, second):
 
 def trained(tmp_path, algorithm, **values):
     """(engine, its checkpoint, its task) after three iterations as trial t0009."""
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     task = make_task(tmp_path, algorithm, trial_id="t0009", **values)
     engine = RLlibEngine()
@@ -66,7 +66,7 @@ def trained(tmp_path, algorithm, **values):
 
 def taken_over(folder, task, **values):
     """(engine, its task) of another trial, two iterations and 200 env steps far, that takes the checkpoint over."""
-    from tune_jobs.engines.rllib import RLlibEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
     task = dataclasses.replace(
         task,

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from policies.evaluate import Evaluator
-from tune_jobs.engines.protocol import TrialTask
-from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+from policies.acting.evaluate import Evaluator
+from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.training.protocol import TrialTask
 
 TRIAL_SEED = 9 * 1024
 SMALL = {
@@ -43,7 +43,7 @@ def make_task(folder: Path, algorithm="ppo", **changes):
 
 def run_trial(task, engine):
     """Run a trial to its end; the engine keeps the Algorithm."""
-    from tune_jobs.trial import TrialLoop
+    from tune_jobs.training.trial_loop import TrialLoop
 
     with Evaluator(task.env_id, task.env_args, task.evaluation_seeds) as evaluator:
         loop = TrialLoop(task, engine, evaluator)

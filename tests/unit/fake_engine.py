@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from policy_factory import make_portable
 
+from policies.acting.evaluate import Episodes
 from policies.errors import CheckpointError
-from policies.evaluate import Episodes
-from policies.portable import Layer, PolicyNetwork, read_policy
-from tune_jobs.engines.protocol import IterationStats, TrialTask
-from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
+from policies.portable.file import Layer, PolicyNetwork, read_policy
+from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.training.protocol import IterationStats, TrialTask
 
 
 class FakeEngine:

@@ -4,8 +4,8 @@ import dataclasses
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
-from tune_jobs.pack_loop import PackLoop
-from tune_jobs.store import TrialStore
+from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.training.pack_loop import PackLoop
 
 
 class FakePackEngine:

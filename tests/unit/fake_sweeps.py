@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, SweepRecord, TrialRecord
-from tune_jobs.cli import cli
+from tune_jobs.cli.commands import cli
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
@@ -31,7 +31,7 @@ def run(tmp_path, monkeypatch):
     return invoke
 
 
-# -- a stand-in for tune_jobs.sweeps, whose trials take minutes
+# -- a stand-in for tune_jobs.sweeps.verbs, whose trials take minutes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +120,7 @@ BEST = BestRecord(
 @pytest.fixture
 def sweeps(monkeypatch, tmp_path):
     """Calls are kept in `.calls`; what they return or raise can be replaced in `.answers`."""
-    fake = types.ModuleType("tune_jobs.sweeps")
+    fake = types.ModuleType("tune_jobs.sweeps.verbs")
     folder = tmp_path / "sweeps" / "mine"
     result = Result(folder, SWEEP, TRIALS, BEST, None, {"report": folder / "report" / "index.html"}, exit_code=3)
     status = Status(SWEEP, {"completed": 1, "failed": 1, "running": 0}, alive=False)
@@ -152,7 +152,7 @@ def sweeps(monkeypatch, tmp_path):
 
     for name in fake.answers:
         setattr(fake, name, make(name))
-    monkeypatch.setitem(sys.modules, "tune_jobs.sweeps", fake)
+    monkeypatch.setitem(sys.modules, "tune_jobs.sweeps.verbs", fake)
     import tune_jobs
 
     monkeypatch.setattr(tune_jobs, "sweeps", fake, raising=False)

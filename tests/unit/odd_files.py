@@ -11,9 +11,9 @@ from sweep_folders import make_sweep_folder
 
 from analysis.records import ChangeRecord
 from policies.packed.state import save_member
-from tune_jobs import sweeps
-from tune_jobs.pack_files import Assignment, PackFiles
-from tune_jobs.record_files import seal
+from tune_jobs.store.pack_files import Assignment, PackFiles
+from tune_jobs.store.record_files import seal
+from tune_jobs.sweeps import verbs as sweeps
 
 CHECKPOINT = "trials/t0001/checkpoints/000006"
 FILES = (

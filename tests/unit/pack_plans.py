@@ -2,9 +2,9 @@
 
 from spec_errors import MINIMAL
 
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
 
 LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
 DQN = {"algorithm": "dqn"}
@@ -23,4 +23,4 @@ def fake_reasons(monkeypatch, wide):
     def why(spec, hyperparams, env):
         return "its lr is odd" if hyperparams.lr in wide else None
 
-    monkeypatch.setattr("tune_jobs.packs.why_not_packed", why)
+    monkeypatch.setattr("tune_jobs.plan.engine_choice.why_not_packed", why)

@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from policies.envs import check_env
-from policies.policy import NetworkPolicy
-from policies.portable import (
+from policies.acting.policy import NetworkPolicy
+from policies.envs.make import check_env
+from policies.portable.file import (
     ConvLayer,
     Layer,
     ModuleWeights,

@@ -3,7 +3,7 @@
 import pytest
 
 from policies.errors import SpecError
-from tune_jobs.spec_file import load_spec
+from tune_jobs.spec.file import load_spec
 
 MINIMAL = {"env": "CartPole-v1", "algorithm": "ppo"}
 

@@ -4,12 +4,12 @@ import dataclasses
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
-from tune_jobs.driving import write_new
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec import SweepSpec
-from tune_jobs.store import SweepStore
-from tune_jobs.trial import TrialLoop
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drive import write_new
+from tune_jobs.training.trial_loop import TrialLoop
 
 MACHINE = Machine(num_cpus=4, source="this machine")
 SPEC = {

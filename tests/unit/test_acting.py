@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from policies.acting import NO_UPDATE, RULES, Limits, idle_rule
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, make_hyperparams
-from policies.packed.envs import make_packed_envs
+from policies.idle.find import NO_UPDATE, RULES, Limits, idle_rule
+from policies.packed.envs.make import make_packed_envs
 from policies.packed.initial import new_member
 from policies.packed.stack import make_stack
 

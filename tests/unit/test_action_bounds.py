@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from policies.action_bounds import ToBounds
-from policies.policy import action_transform
+from policies.acting.policy import action_transform
+from policies.envs.action_bounds import ToBounds
 
 INF = np.inf
 

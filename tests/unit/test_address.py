@@ -4,8 +4,8 @@ import pytest
 from click.testing import CliRunner
 
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.address import check_address, recorded_cluster
-from tune_jobs.cli import cli
+from tune_jobs.cli.commands import cli
+from tune_jobs.ray_tune.address import check_address, recorded_cluster
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from trial_runs import Trial
 
 from analysis.report import build_report
 from analysis.tables import groups_frame, iterations_frame, steps_to_solve_frame, trials_frame
-from tune_jobs.cli_output import show_best, show_evaluation, show_result, show_status, show_sweeps, show_trials
-from tune_jobs.live import summary_line
-from tune_jobs.monitor import SweepMonitor
-from tune_jobs.tensorboard import ScalarWriter
+from tune_jobs.cli.output import show_best, show_evaluation, show_result, show_status, show_sweeps, show_trials
+from tune_jobs.store.event_files import ScalarWriter
+from tune_jobs.sweeps.live_table import summary_line
+from tune_jobs.sweeps.monitor import SweepMonitor
 
 VALUES = [math.nan, math.inf, -math.inf, 1.7e308]
 

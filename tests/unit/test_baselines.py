@@ -10,23 +10,24 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from policies.baselines import ConstantPolicy, baseline_policy
-from policies.envs import check_env
+from policies.acting.baselines import ConstantPolicy, baseline_policy
+from policies.acting.evaluate import Evaluator, evaluate_policy
+from policies.acting.policy import RandomPolicy, load_policy, policy_from_portable
+from policies.envs.make import check_env
 from policies.errors import CheckpointError, SpecError
-from policies.evaluate import Evaluator, evaluate_policy
 from policies.hyperparams import ConstantHyperparams, RandomHyperparams
-from policies.policy import RandomPolicy, load_policy, policy_from_portable
-from policies.portable import PolicyNetwork, read_policy, save_policy
-from tune_jobs import finish, sweeps
-from tune_jobs.driving import write_new
-from tune_jobs.engines.baseline import BaselineEngine
-from tune_jobs.engines.protocol import TrialTask
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec import CheckpointSpec, EvaluationSpec, StopSpec
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
-from tune_jobs.trial import TrialLoop
+from policies.portable.file import PolicyNetwork, read_policy, save_policy
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude as finish
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.drive import write_new
+from tune_jobs.training.baseline import BaselineEngine
+from tune_jobs.training.protocol import TrialTask
+from tune_jobs.training.trial_loop import TrialLoop
 
 
 def portable(env_id, hyperparams=None):
@@ -348,8 +349,8 @@ def test_the_action_can_be_set_and_searched():
 def test_playing_a_baseline_needs_neither_ray_nor_torch(tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
-        "import tune_jobs.engines.baseline, tune_jobs.trial, policies.baselines\n"
-        "from policies.policy import RandomPolicy\n"
+        "import tune_jobs.training.baseline, tune_jobs.training.trial_loop, policies.acting.baselines\n"
+        "from policies.acting.policy import RandomPolicy\n"
         "RandomPolicy.for_env('CartPole-v1').act([0, 0, 0, 0])\n"
         "assert not {'ray', 'torch'} & set(sys.modules)\n"
     )

@@ -10,10 +10,11 @@ from sweep_folders import make_sweep_folder
 
 from analysis.selection import NoUsableTrialError
 from policies.errors import CheckpointError
-from tune_jobs import finish, sweeps
-from tune_jobs.candidates import read_trials
-from tune_jobs.record_files import seal
-from tune_jobs.store import SweepStore
+from tune_jobs.store.candidates import read_trials
+from tune_jobs.store.record_files import seal
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude as finish
+from tune_jobs.sweeps import verbs as sweeps
 
 SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1"
 

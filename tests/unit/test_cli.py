@@ -9,9 +9,9 @@ from click.testing import CliRunner
 from fake_sweeps import SWEEP, TRIALS, Status, evaluation
 
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
-from tune_jobs.cli import cli
-from tune_jobs.cli_output import to_json
-from tune_jobs.interruption import SweepInterrupted
+from tune_jobs.cli.commands import cli
+from tune_jobs.cli.output import to_json
+from tune_jobs.process.interruption import SweepInterrupted
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"

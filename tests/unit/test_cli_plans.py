@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tune_jobs.cli import cli
-from tune_jobs.machine import Machine
+from tune_jobs.cli.commands import cli
+from tune_jobs.plan.machine import Machine
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
@@ -86,8 +86,8 @@ def cluster(monkeypatch):
     """A stand-in for a cluster, whose machine is `.machine`; `.checked` are the folders its nodes were asked for."""
     found = types.SimpleNamespace(machine=None, checked=[])
     joined = contextlib.nullcontext(found)
-    monkeypatch.setattr("tune_jobs.dry_run.connected", lambda address, here: joined)
-    monkeypatch.setattr("tune_jobs.dry_run._check_nodes", lambda folder: found.checked.append(folder.is_dir()))
+    monkeypatch.setattr("tune_jobs.sweeps.dry_run.connected", lambda address, here: joined)
+    monkeypatch.setattr("tune_jobs.sweeps.dry_run._check_nodes", lambda folder: found.checked.append(folder.is_dir()))
     return found
 
 
@@ -264,9 +264,9 @@ def test_version_and_help(run):
 )
 def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     code = (
-        "import sys, tune_jobs.cli\n"
+        "import sys, tune_jobs.cli.commands\n"
         "try:\n"
-        f"    tune_jobs.cli.cli({arguments!r})\n"
+        f"    tune_jobs.cli.commands.cli({arguments!r})\n"
         "except SystemExit:\n"
         "    pass\n"
         f"print('HEAVY', [name for name in {HEAVY!r} if name in sys.modules])\n"

@@ -13,7 +13,8 @@ SCRIPT = """
 import os, sys
 from pathlib import Path
 from policies.files import atomic_path
-from tune_jobs import cli, sweeps
+from tune_jobs.cli import commands as cli
+from tune_jobs.sweeps import verbs as sweeps
 
 def video(*_, **__):
     with atomic_path(Path(sys.argv[-1], "film.mp4")) as half:
@@ -52,7 +53,8 @@ def test_nohup_means_it(tmp_path):
 TWICE = """
 import os, signal, sys
 from pathlib import Path
-from tune_jobs import cli, sweeps
+from tune_jobs.cli import commands as cli
+from tune_jobs.sweeps import verbs as sweeps
 
 def video(*_, **__):
     path = Path(sys.argv[-1], "half.mp4")
@@ -83,7 +85,9 @@ RUNS = """
 import sys
 sys.path.insert(0, sys.argv.pop(1))
 from fake_sweeps import Result
-from tune_jobs import cli, cli_output, sweeps
+from tune_jobs.cli import commands as cli
+from tune_jobs.cli import output as cli_output
+from tune_jobs.sweeps import verbs as sweeps
 
 def show(*_, **__):
     print("x" * 100_000)

@@ -11,9 +11,9 @@ from analysis.records import ChangeRecord, CheckpointRecord, TrialRecord
 from analysis.selection import rank_points
 from analysis.tables import trials_frame
 from policies.errors import CheckpointError
-from tune_jobs.copies import copied_folder, copy_latest_checkpoint, remove_uncounted_copies
-from tune_jobs.store import TrialStore
-from tune_jobs.trial import TrialLoop
+from tune_jobs.store.copies import copied_folder, copy_latest_checkpoint, remove_uncounted_copies
+from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.training.trial_loop import TrialLoop
 
 
 def change(iteration, **fields):

@@ -11,10 +11,10 @@ from trial_runs import Trial
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError
-from tune_jobs import record_files
-from tune_jobs.record_files import seal
-from tune_jobs.recovery import latest_damaged
-from tune_jobs.store import TrialStore
+from tune_jobs.store import record_files
+from tune_jobs.store.record_files import seal
+from tune_jobs.store.recovery import latest_damaged
+from tune_jobs.store.sweep_store import TrialStore
 
 
 def flip_a_bit(path):

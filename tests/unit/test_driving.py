@@ -9,14 +9,17 @@ from pathlib import Path
 import pytest
 
 from policies.errors import CannotRunError
-from tune_jobs import driving, finish, resuming, sweeps
-from tune_jobs import store as store_module
-from tune_jobs.driving import write_new
-from tune_jobs.interruption import SweepInterrupted, current
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.process.interruption import SweepInterrupted, current
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store import sweep_store as store_module
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude as finish
+from tune_jobs.sweeps import drive as driving
+from tune_jobs.sweeps import resume as resuming
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.drive import write_new
 
 SPEC = {"env": "CartPole-v1", "algorithm": "ppo", "space": {"lr": {"uniform": [1e-4, 1e-2]}}, "num_samples": 2}
 
@@ -152,7 +155,7 @@ def test_a_run_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch, 
 
 def test_a_plan_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch):
     pend(store)
-    monkeypatch.setattr("tune_jobs.resuming.machine_here", lambda: Machine(0))
+    monkeypatch.setattr("tune_jobs.sweeps.resume.machine_here", lambda: Machine(0))
     with pytest.raises(CannotRunError, match="has 0"):
         sweeps.resume(store.folder, progress="none")
     assert store.read_record().state == "interrupted"
@@ -189,7 +192,7 @@ def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp
         os.kill(os.getpid(), number)
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(f"tune_jobs.driving.{where}", interrupt)
+    monkeypatch.setattr(f"tune_jobs.sweeps.drive.{where}", interrupt)
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.launch(SPEC, name="new", storage=tmp_path, progress="none")
     result = caught.value.result
@@ -200,7 +203,7 @@ def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp
 
 def test_a_signal_while_a_sweeps_new_trials_are_written_is_not_forgotten(store, monkeypatch):
     pend(store)
-    monkeypatch.setattr("tune_jobs.resuming._add_trials", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr("tune_jobs.sweeps.resume._add_trials", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(driving, "connected", lambda *_: pytest.fail("the trials must not begin"))
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.resume(store.folder, progress="none")
@@ -250,9 +253,9 @@ def test_the_plan_asks_the_ray_that_is_there(monkeypatch):
     ray.is_initialized = lambda: False
     assert driving.machine_here().source == "this machine"
     ray.is_initialized = lambda: True
-    connected_ray = type(sys)("tune_jobs.connected_ray")
+    connected_ray = type(sys)("tune_jobs.ray_tune.connected_ray")
     connected_ray.connected_machine = lambda: Machine(1, source="the connected one")
-    monkeypatch.setitem(sys.modules, "tune_jobs.connected_ray", connected_ray)
+    monkeypatch.setitem(sys.modules, "tune_jobs.ray_tune.connected_ray", connected_ray)
     assert driving.machine_here().source == "the connected one"
 
 
@@ -270,7 +273,7 @@ def test_modules_of_a_sweep_are_not_allowed_to_the_next(tmp_path, monkeypatch):
     """A class that was given to a launch is of that sweep alone."""
     import odd_envs
 
-    from policies import env_modules
+    from policies.envs import modules as env_modules
 
     monkeypatch.setattr(env_modules, "_allowed", set())
 

@@ -16,16 +16,16 @@ from policy_factory import make_policy
 from test_packed_env_failures import go_on
 from test_packed_envs import assert_equal_bits, make, own_modules, seen_by
 
-from policies import env_faults
-from policies.checked_envs import CheckedEnvs, is_sound
-from policies.env_wrappers import FailurePenalty
-from policies.envs import make_env, make_vector_env
+from policies.acting.evaluate import Evaluator, evaluate_policy
+from policies.acting.policy import RandomPolicy
+from policies.envs import faults as env_faults
+from policies.envs.checked import CheckedEnvs, is_sound
+from policies.envs.failures import FailureRule
+from policies.envs.make import make_env, make_vector_env
+from policies.envs.wrappers import FailurePenalty
 from policies.errors import EnvError
-from policies.evaluate import Evaluator, evaluate_policy
-from policies.failures import FailureRule
 from policies.packed.evaluation import evaluate_many
-from policies.policy import RandomPolicy
-from tune_jobs.engines.baseline import BaselineEngine
+from tune_jobs.training.baseline import BaselineEngine
 
 __all__ = ["make", "own_modules"]
 
@@ -258,11 +258,11 @@ def test_a_baseline_s_trial_says_what_the_env_did(tmp_path, fault):
 CHILD = """
 import os, signal, sys
 import gymnasium as gym, numpy as np
-from policies.env_faults import note_signals
-from policies.env_modules import allow_modules
-from policies.env_wrappers import FailurePenalty
+from policies.envs.faults import note_signals
+from policies.envs.modules import allow_modules
+from policies.envs.wrappers import FailurePenalty
 from policies.errors import EnvError
-from policies.packed.sub_envs import SubEnvs
+from policies.packed.envs.sub_envs import SubEnvs
 
 signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(5))
 note_signals()

@@ -8,8 +8,9 @@ import gymnasium as gym
 import pytest
 
 from analysis.records import SweepRecord
-from policies import env_modules
-from policies.env_modules import (
+from policies.envs import modules as env_modules
+from policies.envs.make import check_env, make_env, make_vector_env, normalize_env_id
+from policies.envs.modules import (
     ENVIRONMENT_VARIABLE,
     allow_modules,
     allowed_modules,
@@ -17,10 +18,9 @@ from policies.env_modules import (
     module_folders,
     path_of,
 )
-from policies.envs import check_env, make_env, make_vector_env, normalize_env_id
 from policies.errors import EnvError, SpecError
-from tune_jobs.own_code import load_source, modules_of
-from tune_jobs.spec import SweepSpec
+from tune_jobs.plan.user_code import load_source, modules_of
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 SOURCE = """
 import gymnasium as gym

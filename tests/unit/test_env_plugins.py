@@ -45,7 +45,7 @@ def run_python(tmp_path):
 
 def test_an_env_of_an_installed_package_is_found(run_python):
     assert run_python(
-        "from policies.envs import check_env, make_vector_env\n"
+        "from policies.envs.make import check_env, make_vector_env\n"
         "print(check_env('FromAPackage-v0', {}, 'dqn').max_episode_steps)\n"
         "print(check_env('FromAPackage', {}).env_id)\n"
         "print(make_vector_env('mine/Spaced-v1', {}, 3).num_envs)\n"
@@ -54,7 +54,7 @@ def test_an_env_of_an_installed_package_is_found(run_python):
 
 def test_nothing_of_a_package_is_imported_for_an_env_that_is_known(run_python):
     assert run_python(
-        "from policies.envs import check_env\n"
+        "from policies.envs.make import check_env\n"
         "check_env('CartPole-v1', {}); check_env('CartPole', {})\n"
         "print('my_envs' in sys.modules)\n"
     ) == ["False"]
@@ -63,7 +63,7 @@ def test_nothing_of_a_package_is_imported_for_an_env_that_is_known(run_python):
 def test_a_package_that_fails_is_named_where_an_env_is_missing(run_python):
     text = " ".join(
         run_python(
-            "from policies.envs import check_env\n"
+            "from policies.envs.make import check_env\n"
             "from policies.errors import EnvError\n"
             "check_env('mine/Spaced-v1', {})\n"
             "try:\n    check_env('FromAPackag-v0', {})\nexcept EnvError as error:\n    print(error)\n"

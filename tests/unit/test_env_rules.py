@@ -2,12 +2,12 @@
 
 import pytest
 
-from policies import env_modules
-from policies.env_modules import allow_modules
+from policies.envs import modules as env_modules
+from policies.envs.modules import allow_modules
 from policies.errors import EnvError, SpecError
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
 
 IMAGES = "odd_envs:Images"
 

@@ -9,12 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from policies.env_wrappers import FailurePenalty, StackFrames, shrink_to_grey
-from policies.envs import check_env, make_env, make_vector_env
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.policy import RandomPolicy
+from policies.envs.failures import FailureRule, failure_rule
+from policies.envs.make import check_env, make_env, make_vector_env
+from policies.envs.wrappers import FailurePenalty, StackFrames, shrink_to_grey
 from policies.errors import EnvError
-from policies.evaluate import evaluate_policy
-from policies.failures import FailureRule, failure_rule
-from policies.policy import RandomPolicy
 
 ROOT = Path(__file__).parents[2]
 
@@ -176,7 +176,7 @@ def test_pixels_show_what_the_env_renders_and_a_video_shows_all_of_it():
 def test_cartpole_can_be_seen_in_its_pixels_without_a_display():
     code = (
         "import numpy as np\n"
-        "from policies.envs import check_env, make_env, make_vector_env\n"
+        "from policies.envs.make import check_env, make_env, make_vector_env\n"
         "info = check_env('CartPole-v1', {'pixels': True}, 'ppo')\n"
         "assert info.observes_images and info.observation_space.shape == (40, 60, 1), info\n"
         "assert not info.has_vector_entry_point\n"

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from policy_factory import register_test_envs
 
-from policies import env_modules
-from policies.baselines import ConstantPolicy
-from policies.checked_envs import CheckedEnvs
-from policies.env_modules import allow_modules
-from policies.envs import check_env, make_env, make_vector_env, normalize_env_id
+from policies.acting.baselines import ConstantPolicy
+from policies.acting.evaluate import evaluate_policy
+from policies.envs import modules as env_modules
+from policies.envs.checked import CheckedEnvs
+from policies.envs.make import check_env, make_env, make_vector_env, normalize_env_id
+from policies.envs.modules import allow_modules
 from policies.errors import EnvError
-from policies.evaluate import evaluate_policy
-from policies.packed.envs import make_packed_envs
+from policies.packed.envs.make import make_packed_envs
 
 register_test_envs()
 
@@ -97,7 +97,7 @@ def test_what_is_no_id_is_refused(env_id):
 def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp_path):
     (tmp_path / "evil_module.py").write_text("print('ran')")
     code = (
-        "from policies.envs import *\n"
+        "from policies.envs.make import *\n"
         "from policies.errors import EnvError\n"
         "for use in (check_env, make_env, lambda i, a: make_vector_env(i, a, 2)):\n"
         "    try: use('evil_module:CartPole-v1', None)\n"

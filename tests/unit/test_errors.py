@@ -45,7 +45,7 @@ def test_of_a_long_message_the_middle_is_left_out():
 
 @pytest.mark.parametrize("error", [ValueError("\udcff"), ValueError("y" * 1_000_000), MuteError(), WordlessError()])
 def test_an_envs_error_can_be_told(error):
-    from policies.env_faults import env_failed
+    from policies.envs.faults import env_failed
 
     failed = env_failed("It raised an error in step()", error)
     assert isinstance(failed, EnvFailedError)

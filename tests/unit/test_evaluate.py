@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
-import policies.evaluate
-from policies.envs import make_env
+import policies.acting.evaluate
+from policies.acting.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
+from policies.acting.policy import NetworkPolicy, NonFiniteWeightsError, Policy, RandomPolicy
+from policies.envs.make import make_env
 from policies.errors import EnvError, SpecError
-from policies.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
-from policies.policy import NetworkPolicy, NonFiniteWeightsError, Policy, RandomPolicy
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
@@ -92,7 +92,7 @@ def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit(
 
 @pytest.mark.parametrize("env_id", ["CartPole-v0", "Pendulum-v1", "TestWalk-v0"])
 def test_an_episode_depends_on_its_seed_alone(env_id, monkeypatch):
-    monkeypatch.setattr(policies.evaluate, "_MAX_CARTPOLES", 8)
+    monkeypatch.setattr(policies.acting.evaluate, "_MAX_CARTPOLES", 8)
     policy = balancing_policy(env_id, "poor") if env_id == "CartPole-v0" else make_policy(env_id, seed=1)
     seeds = tuple(int(seed) for seed in np.random.default_rng(0).permutation(40)[:21])
     whole = evaluate_policy(policy, env_id=env_id, seeds=seeds, max_episode_steps=60)
@@ -113,7 +113,7 @@ def test_an_evaluator_can_be_used_again_and_again():
 
 
 def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed(monkeypatch):
-    monkeypatch.setattr(policies.evaluate, "_MAX_ENVS", 3)
+    monkeypatch.setattr(policies.acting.evaluate, "_MAX_ENVS", 3)
     policy, seeds = make_policy("TestWalk-v0", seed=1), tuple(range(17))
     with Evaluator("TestWalk-v0", {"end": 2.0}, seeds, max_episode_steps=300) as evaluator:
         result = evaluator.run(policy)

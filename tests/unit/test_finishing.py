@@ -10,15 +10,16 @@ from pathlib import Path
 import pytest
 from test_baselines import make_task, run_trial
 
-from policies import env_modules
-from policies.env_modules import allow_modules
+from policies.envs import modules as env_modules
+from policies.envs.modules import allow_modules
 from policies.errors import EnvFailedError
-from tune_jobs import finish, sweeps
-from tune_jobs.driving import SweepResult, _finished, write_new
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude as finish
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.drive import SweepResult, _finished, write_new
 
 HOSTILE = "hostile_envs:Hostile"
 
@@ -145,7 +146,7 @@ def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path, arguments, wo
     )
     paths = [str(Path(__file__).parent), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
-        [sys.executable, "-m", "tune_jobs.cli", *arguments],
+        [sys.executable, "-m", "tune_jobs.cli.commands", *arguments],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},
         capture_output=True, text=True, check=False, timeout=600,

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 from policy_factory import make_policy, register_test_envs
 
-from policies import env_modules, guarded
-from policies.env_modules import allow_modules
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.policy import RandomPolicy
+from policies.envs import modules as env_modules
+from policies.envs.modules import allow_modules
 from policies.errors import EnvError, EnvFailedError
-from policies.evaluate import evaluate_policy
-from policies.guard import EnvGuard, guarding
-from policies.policy import RandomPolicy
+from policies.guard import guarded
+from policies.guard.guard import EnvGuard, guarding
 
 register_test_envs()
 
@@ -126,7 +127,7 @@ def test_what_the_child_finds_wrong_is_raised_as_here():
     assert not isinstance(caught.value, EnvFailedError)
     assert caught.value.hint
     here = guarded.check_env("Pendulum-v1", {"g": 9.0}, "ppo")
-    from policies.envs import check_env
+    from policies.envs.make import check_env
 
     assert here == check_env("Pendulum-v1", {"g": 9.0}, "ppo")
     assert guarded.check_env("CartPole-v1", {}).failure == check_env("CartPole-v1", {}).failure
@@ -199,7 +200,7 @@ def test_what_an_env_prints_is_not_on_standard_output(tmp_path):
         "        os.write(1, b'by the system\\n')\n"
         "        return super().reset(**kwargs)\n"
     )
-    code = "from policies import guarded; print(guarded.check_env('loud_envs:Loud', {}).env_id)"
+    code = "from policies.guard import guarded; print(guarded.check_env('loud_envs:Loud', {}).env_id)"
     paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parent), str(ROOT)])
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -253,7 +254,7 @@ def test_modules_that_are_allowed_no_more_are_seen_no_more(tmp_path, monkeypatch
 def test_a_child_does_not_outlive_a_killed_parent(tmp_path):
     pids = tmp_path / "pids"
     code = (
-        "from policies import guarded\n"
+        "from policies.guard import guarded\n"
         f"guarded.check_env({HOSTILE!r}, {{'how': 'hang_without_python', 'where': 'step', 'pids': {str(pids)!r}}})\n"
     )
     paths = os.pathsep.join([str(Path(__file__).parent), str(ROOT)])
@@ -274,7 +275,7 @@ def test_a_child_does_not_outlive_a_killed_parent(tmp_path):
 def test_an_interrupted_parent_ends_its_child(tmp_path):
     pids = tmp_path / "pids"
     code = (
-        "from policies import guarded\n"
+        "from policies.guard import guarded\n"
         "try:\n"
         f"    guarded.check_env({HOSTILE!r}, {{'how': 'hang', 'where': 'step', 'pids': {str(pids)!r}}})\n"
         "except KeyboardInterrupt:\n"
@@ -314,7 +315,7 @@ def test_a_child_is_ended_though_its_closing_is_interrupted(monkeypatch):
 
 
 def test_a_child_that_cannot_begin_is_told_as_that(monkeypatch):
-    monkeypatch.setattr("policies.guard._BOOTSTRAP", "raise SystemExit(9)")
+    monkeypatch.setattr("policies.guard.guard._BOOTSTRAP", "raise SystemExit(9)")
     with EnvGuard() as guard:
         guard.start()
         guard._child.process.wait()

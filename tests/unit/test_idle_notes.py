@@ -5,9 +5,9 @@ from spec_errors import MINIMAL
 
 from analysis.records import TrialRecord
 from policies.errors import SpecError
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
 
 PPO = {"algorithm": "ppo"}
 DQN = {"algorithm": "dqn", "stop": {"num_env_steps": 5000}}
@@ -207,6 +207,6 @@ def test_trials_that_never_learn_are_told():
 
 
 def test_the_exploration_of_a_users_own_module_is_its_own_affair(monkeypatch):
-    monkeypatch.setattr("tune_jobs.plan.check_rl_module", lambda spec: None)
+    monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_rl_module", lambda spec: None)
     flat = {"epsilon_initial": 0.1, "epsilon_final": 0.1}
     assert notes(**DQN, rl_module="own:Module", hyperparams=flat, space=grid(epsilon_decay=[10, 100])) == []

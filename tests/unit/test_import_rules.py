@@ -9,7 +9,7 @@ import pytest
 HEAVY = {"ray", "torch", "pandas", "matplotlib"}
 PROGRAM = "import json, sys\n{code}\nprint(json.dumps(sorted(sys.modules)))"
 # All packages load these two, which settle whose the names of packages are.
-NAMES = {"tune_jobs", "tune_jobs.own_packages"}
+NAMES = {"tune_jobs", "tune_jobs.process.own_packages"}
 
 
 def modules_after(code):
@@ -21,18 +21,24 @@ def modules_after(code):
     ("code", "absent"),
     [
         # Help, validation and dry runs are instant.
-        ("import tune_jobs.cli", HEAVY | {"numpy", "pydantic"}),
+        ("import tune_jobs.cli.commands", HEAVY | {"numpy", "pydantic"}),
         # What the guard's child begins with, beside its parent, which imports the rest.
-        ("import policies.packed.envs", HEAVY | {"pydantic", "PIL"}),
-        ("from tune_jobs.spec_file import load_spec; load_spec('cartpole-ppo')", HEAVY),
-        ("import tune_jobs.sweeps", HEAVY),
+        ("import policies.packed.envs.make", HEAVY | {"pydantic", "PIL"}),
+        ("from tune_jobs.spec.file import load_spec; load_spec('cartpole-ppo')", HEAVY),
+        ("import tune_jobs.sweeps.verbs", HEAVY),
         # A policy file acts, is evaluated and filmed without Ray and without torch.
-        ("import policies.policy, policies.evaluate, policies.video, policies.portable", {"ray", "torch"}),
-        ("import tune_jobs.finish", {"ray", "torch"}),
+        (
+            "import policies.acting.policy, policies.acting.evaluate, policies.acting.video, policies.portable.file",
+            {"ray", "torch"},
+        ),
+        ("import tune_jobs.sweeps.conclude", {"ray", "torch"}),
         # The seam between trials and engines.
-        ("import tune_jobs.trial, tune_jobs.engines.protocol, tune_jobs.store, tune_jobs.monitor", {"ray", "torch"}),
+        (
+            "import tune_jobs.training.trial_loop, tune_jobs.training.protocol, tune_jobs.store.sweep_store, tune_jobs.sweeps.monitor",
+            {"ray", "torch"},
+        ),
         ("import analysis.records, analysis.selection, analysis.report", {"ray", "torch", "tune_jobs"}),
-        ("import policies.envs, policies.hyperparams, policies.errors, policies.files", {"analysis", "tune_jobs"}),
+        ("import policies.envs.make, policies.hyperparams, policies.errors, policies.files", {"analysis", "tune_jobs"}),
     ],
 )
 def test_importing_imports_no_more_than_it_may(code, absent):

@@ -10,7 +10,7 @@ from tests.learning import __main__ as command
 from tests.learning.measure import Measurement, SeedResult, misses, owns_up, verdict
 from tests.learning.table import HEADINGS, markdown, row
 from tests.learning.targets import TARGETS, Target, Task, tasks
-from tune_jobs.spec_file import read_preset
+from tune_jobs.spec.file import read_preset
 
 
 def seed(score, *, steps=50_000, solve=20_000, returns=(), random=20.0):

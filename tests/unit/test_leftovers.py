@@ -10,8 +10,8 @@ import pytest
 
 from analysis.records import SweepRecord, TrialRecord
 from policies.files import atomic_path, is_abandoned, write_atomic
-from tune_jobs.leftovers import remove_leftovers
-from tune_jobs.store import SweepStore
+from tune_jobs.store.leftovers import remove_leftovers
+from tune_jobs.store.sweep_store import SweepStore
 
 # Begins a file of each folder, and is killed in the middle.
 KILLED = """

@@ -10,7 +10,7 @@ from fake_engine import FakeClock
 from rich.console import Console
 from test_monitor import make_monitor, make_trial
 
-from tune_jobs import live
+from tune_jobs.sweeps import live_table as live
 
 
 def screen(monitor, width=120):
@@ -118,7 +118,7 @@ import os, sys
 sys.path.insert(0, {here!r})
 from pathlib import Path
 from test_monitor import make_monitor, make_trial
-from tune_jobs.live import shown
+from tune_jobs.sweeps.live_table import shown
 with shown(make_monitor(make_trial(0)), {progress!r}, Path({log!r})):
     print("printed by a library")
     print("a library's warning", file=sys.stderr)

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from policies.errors import CannotRunError, SpecError
-from tune_jobs import locks
-from tune_jobs.locks import held, is_held
-from tune_jobs.store import SweepStore
+from tune_jobs.store import locks
+from tune_jobs.store.locks import held, is_held
+from tune_jobs.store.sweep_store import SweepStore
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_a_driver_that_outlived_its_client_keeps_others_away(store):
 
 def test_a_killed_process_frees_its_lock(tmp_path):
     script = (
-        "import sys, time\nfrom pathlib import Path\nfrom tune_jobs.locks import held\n"
+        "import sys, time\nfrom pathlib import Path\nfrom tune_jobs.store.locks import held\n"
         "with held(Path(sys.argv[1]), 'taken', ''):\n    print('held', flush=True)\n    time.sleep(600)\n"
     )
     path = tmp_path / "lock"
@@ -96,7 +96,7 @@ def test_a_storage_that_is_a_file_is_refused(tmp_path):
 ASKER = """
 import sys
 from pathlib import Path
-from tune_jobs.store import SweepStore
+from tune_jobs.store.sweep_store import SweepStore
 store = SweepStore(Path(sys.argv[1]))
 print("asking", flush=True)
 while not (store.folder / "enough").exists():

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from tune_jobs.logs import begin_log, died_by, hang_in, log_tail
+from tune_jobs.store.logs import begin_log, died_by, hang_in, log_tail
 
 ROOT = Path(__file__).parents[2]
 HANG = """
 import faulthandler, sys, threading, time
 from pathlib import Path
 import numpy as np
-from policies import env_modules
-from policies.checked_envs import CheckedEnvs
-from policies.envs import make_env, make_vector_env
-from policies.evaluate import Evaluator
-from policies.policy import RandomPolicy
-from policies.packed.envs import make_packed_envs
-from tune_jobs.logs import begin_log
+from policies.envs import modules as env_modules
+from policies.envs.checked import CheckedEnvs
+from policies.envs.make import make_env, make_vector_env
+from policies.acting.evaluate import Evaluator
+from policies.acting.policy import RandomPolicy
+from policies.packed.envs.make import make_packed_envs
+from tune_jobs.store.logs import begin_log
 
 env_modules.allow_modules(["hanging"])
 for number in range(12):

@@ -8,8 +8,8 @@ import pytest
 from trial_runs import Trial
 
 from policies.errors import CheckpointError
-from tune_jobs.manifests import read_manifest, verify_checkpoint
-from tune_jobs.record_files import seal
+from tune_jobs.store.manifests import read_manifest, verify_checkpoint
+from tune_jobs.store.record_files import seal
 
 SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1" / "trials" / "t0001" / "checkpoints" / "000002"
 

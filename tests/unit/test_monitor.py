@@ -4,7 +4,7 @@ import pytest
 from fake_engine import FakeClock
 
 from analysis.records import CheckpointRecord, TrialRecord
-from tune_jobs.monitor import SweepMonitor
+from tune_jobs.sweeps.monitor import SweepMonitor
 
 
 def make_trial(index, status="pending", *, steps=0, score=None, time_s=0.0, point_index=None):

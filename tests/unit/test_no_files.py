@@ -11,23 +11,24 @@ import odd_files
 import pytest
 from sweep_folders import train
 
-from policies import env_modules
+from policies.acting.policy import load_policy
+from policies.envs import modules as env_modules
+from policies.envs.tallies import read_tally
 from policies.errors import CannotRunError, CheckpointError, TuneJobsError
 from policies.files import MAX_RECORD_BYTES, open_to_append, read_regular, sha256_file
-from policies.policy import load_policy
-from policies.tallies import read_tally
-from tune_jobs import resuming, sweeps
-from tune_jobs.candidates import candidates
-from tune_jobs.driving import settled
-from tune_jobs.live import quiet
-from tune_jobs.locks import held
-from tune_jobs.manifests import verify_checkpoint
-from tune_jobs.ownership import Owner
-from tune_jobs.pack_files import PackFiles
-from tune_jobs.record_keeper import RecordKeeper
-from tune_jobs.recovery import write_log
-from tune_jobs.store import SweepStore
-from tune_jobs.tensorboard import ScalarWriter
+from tune_jobs.store.candidates import candidates
+from tune_jobs.store.event_files import ScalarWriter
+from tune_jobs.store.locks import held
+from tune_jobs.store.manifests import verify_checkpoint
+from tune_jobs.store.ownership import Owner
+from tune_jobs.store.pack_files import PackFiles
+from tune_jobs.store.record_keeper import RecordKeeper
+from tune_jobs.store.recovery import write_log
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import resume as resuming
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.drive import settled
+from tune_jobs.sweeps.live_table import quiet
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,17 @@ import numpy as np
 import odd_files
 import pytest
 
-from policies import env_modules
+from policies.acting.policy import load_policy
+from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
 from policies.packed.state import load_member
-from policies.policy import load_policy
-from tune_jobs import finish, sweeps
-from tune_jobs.candidates import candidates
-from tune_jobs.manifests import verify_checkpoint
-from tune_jobs.pack_files import PackFiles
-from tune_jobs.spec_file import stored_spec
-from tune_jobs.store import SweepStore
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.store.candidates import candidates
+from tune_jobs.store.manifests import verify_checkpoint
+from tune_jobs.store.pack_files import PackFiles
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude as finish
+from tune_jobs.sweeps import verbs as sweeps
 
 
 @pytest.fixture(scope="module")

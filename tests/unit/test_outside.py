@@ -13,17 +13,18 @@ import pytest
 from sweep_folders import train
 
 from analysis import records
-from policies import env_modules
+from policies.acting.policy import load_policy
+from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
-from policies.policy import load_policy
-from tune_jobs import finish, sweeps
-from tune_jobs.candidates import choose, read_trials
-from tune_jobs.locks import held
-from tune_jobs.ownership import Owner
-from tune_jobs.pack_files import Assignment, PackFiles
-from tune_jobs.places import refuse_links_in, remove_folder
-from tune_jobs.store import SweepStore
-from tune_jobs.tensorboard import ScalarWriter
+from tune_jobs.store.candidates import choose, read_trials
+from tune_jobs.store.event_files import ScalarWriter
+from tune_jobs.store.locks import held
+from tune_jobs.store.ownership import Owner
+from tune_jobs.store.pack_files import Assignment, PackFiles
+from tune_jobs.store.places import refuse_links_in, remove_folder
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude as finish
+from tune_jobs.sweeps import verbs as sweeps
 
 
 class Watch:

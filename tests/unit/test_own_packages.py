@@ -11,7 +11,7 @@ import pytest
 
 import tune_jobs
 
-OURS = "import analysis.report, policies.policy, policies.packed.replay; import tune_jobs.sweeps\n"
+OURS = "import analysis.report, policies.acting.policy, policies.packed.dqn.replay; import tune_jobs.sweeps.verbs\n"
 
 
 @pytest.fixture
@@ -104,15 +104,18 @@ def test_an_error_in_the_users_package_reaches_them(project):
 
 
 def test_a_hidden_module_is_warned_of_once(project):
-    files = {"policies/__init__.py": "", "policies/networks.py": "", "policies/nets.py": "", "analysis/plots.py": ""}
-    script = (
-        "import tune_jobs\nimport policies.spaces, analysis.plots\nprint(policies.__file__, analysis.plots.__file__)\n"
-    )
+    files = {
+        "policies/__init__.py": "",
+        "policies/networks/rl_modules.py": "",
+        "policies/nets.py": "",
+        "analysis/plots.py": "",
+    }
+    script = "import tune_jobs\nimport policies.envs.spaces, analysis.plots\nprint(policies.__file__, analysis.plots.__file__)\n"
     stdout, stderr = project(script, files)
     root = str(tune_jobs.__path__[0]).removesuffix("tune_jobs")
     assert stdout == f"{root}policies/__init__.py {root}analysis/plots.py"
     warnings = [line for line in stderr.splitlines() if "UserWarning" in line]
-    assert ["policies/networks.py:" in warnings[0], "analysis/plots.py:" in warnings[1], len(warnings)] == [
+    assert ["policies/networks/rl_modules.py:" in warnings[0], "analysis/plots.py:" in warnings[1], len(warnings)] == [
         True,
         True,
         2,
@@ -127,18 +130,20 @@ def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(project):
         "analysis/plots/figure.png": "",
         "envs/a.py": "",
     }
-    _, stderr = project("import tune_jobs\nimport policies.spaces\n", files)
+    _, stderr = project("import tune_jobs\nimport policies.envs.spaces\n", files)
     warnings = [line for line in stderr.splitlines() if "UserWarning" in line]
     assert len(warnings) == 1
-    assert f"policies{os.sep}envs: `import policies.envs` gives tune-jobs' own" in warnings[0]
+    assert f"policies{os.sep}envs: `import policies.envs.make` gives tune-jobs' own" in warnings[0]
 
 
 def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(project):
-    files = {"policies/__init__.py": "", "policies/networks.py": ""}
-    script = "import policies.networks\nimport tune_jobs\n"
+    files = {"policies/__init__.py": "", "policies/networks/rl_modules.py": ""}
+    script = "import policies.networks.rl_modules\nimport tune_jobs\n"
     error = project(script, files, fails=True)[1].splitlines()[-1]
-    assert error.startswith("ImportError: tune_jobs cannot be imported: it has a module policies.networks, and ")
-    assert "policies/networks.py, which is imported already" in error
+    assert error.startswith(
+        "ImportError: tune_jobs cannot be imported: it has a module policies.networks.rl_modules, and "
+    )
+    assert "policies/networks/rl_modules.py, which is imported already" in error
     assert "Rename" in error
 
 
@@ -146,7 +151,7 @@ def test_a_spawned_process_of_environments_finds_ours(project):
     script = (
         "if __name__ == '__main__':\n"
         "    import tune_jobs\n"
-        "    from policies.packed.process_envs import ProcessHost\n"
+        "    from policies.packed.envs.process import ProcessHost\n"
         "    host = ProcessHost('CartPole-v1', None)\n"
         "    host.send('add', 'a', [1, 2])\n"
         "    print(len(host.receive()))\n"
@@ -163,7 +168,7 @@ def test_environments_in_the_users_packages_are_found_by_id_and_for_other_proces
     # As the command has it: without the current folder on the path.
     script = (
         "import os, sys\nsys.path.pop(0)\nimport tune_jobs\n"
-        "from policies.env_ids import find_env\nfrom policies.env_modules import module_folders\n"
+        "from policies.envs.ids import find_env\nfrom policies.envs.modules import module_folders\n"
         "tune_jobs.allow_modules(['policies', 'analysis.envs.walks'])\n"
         "print([find_env(env_id)[0] for env_id in ('policies:Walk', 'analysis.envs.walks:Walk')])\n"
         "print(os.getcwd() in module_folders())\n"

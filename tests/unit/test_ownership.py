@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from policies.errors import CannotRunError
-from tune_jobs import ownership
-from tune_jobs.ownership import Owner, OwnershipLostError
+from tune_jobs.store import ownership
+from tune_jobs.store.ownership import Owner, OwnershipLostError
 
 
 @pytest.fixture

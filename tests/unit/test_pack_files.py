@@ -3,7 +3,7 @@
 import pytest
 
 from policies.errors import CheckpointError
-from tune_jobs.pack_files import Assignment, PackFiles
+from tune_jobs.store.pack_files import Assignment, PackFiles
 
 
 def test_an_assignment_is_read_as_it_was_written(tmp_path):

@@ -12,8 +12,8 @@ from fake_pack import Pack
 from trial_runs import Trial
 
 from policies.errors import CheckpointError, EnvError
-from tune_jobs.ownership import Owner
-from tune_jobs.store import TrialStore
+from tune_jobs.store.ownership import Owner
+from tune_jobs.store.sweep_store import TrialStore
 
 
 def statuses(pack):

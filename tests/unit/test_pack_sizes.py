@@ -3,9 +3,9 @@
 import pytest
 from pack_plans import DQN, TPE, fake_reasons, plan
 
-from policies import guarded
-from policies.packed.envs import StepTime
-from tune_jobs.machine import Machine
+from policies.guard import guarded
+from policies.packed.envs.make import StepTime
+from tune_jobs.plan.machine import Machine
 
 
 @pytest.fixture

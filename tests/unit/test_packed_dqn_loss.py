@@ -6,7 +6,7 @@ from rounding import close
 from torch import nn
 
 from policies.hyperparams import DQNHyperparams
-from policies.packed import dqn
+from policies.packed.dqn import loss as dqn
 
 M, B = 3, 50
 

@@ -5,7 +5,7 @@ from policy_factory import register_test_envs
 from test_packed_envs import own_modules
 
 from policies.errors import EnvError
-from policies.packed.envs import StepTime, check_seedable, choose_kind, measure_step
+from policies.packed.envs.make import StepTime, check_seedable, choose_kind, measure_step
 
 __all__ = ["own_modules"]
 

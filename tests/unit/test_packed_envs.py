@@ -8,11 +8,11 @@ import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
 from policy_factory import register_test_envs
 
-from policies import env_modules
-from policies.env_modules import allow_modules
-from policies.envs import make_env
+from policies.envs import modules as env_modules
+from policies.envs.make import make_env
+from policies.envs.modules import allow_modules
 from policies.errors import EnvError
-from policies.packed.envs import make_packed_envs
+from policies.packed.envs.make import make_packed_envs
 
 register_test_envs()
 

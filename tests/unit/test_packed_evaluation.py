@@ -8,15 +8,15 @@ import pytest
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
 import policies.packed.evaluation
-from policies import env_modules
-from policies.env_modules import allow_modules
+from policies.acting.evaluate import Evaluator
+from policies.acting.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
+from policies.envs import modules as env_modules
+from policies.envs.modules import allow_modules
 from policies.errors import EnvError
-from policies.evaluate import Evaluator
-from policies.forward import ForwardPass, ForwardPasses
 from policies.hyperparams import ACTIVATIONS
 from policies.packed.evaluation import evaluate_many
-from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
-from policies.portable import Layer, Normalization
+from policies.portable.file import Layer, Normalization
+from policies.portable.forward import ForwardPass, ForwardPasses
 
 register_test_envs()
 

@@ -10,11 +10,11 @@ from packed_members import random_member
 from rounding import assert_rounded, close
 from torch import nn
 
-from policies.network_layers import ObservationStatistics
-from policies.packed import ppo
-from policies.packed.gae import advantages_and_targets, standardise
+from policies.networks.layers import ObservationStatistics
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR
-from policies.packed.ppo_group import scheduled
+from policies.packed.ppo import loss as ppo
+from policies.packed.ppo.gae import advantages_and_targets, standardise
+from policies.packed.ppo.group import scheduled
 from policies.packed.sampling import EpisodeTracker, Observations, one_hot
 
 M, B = 4, 200

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from policies.hyperparams import DQNHyperparams
-from policies.packed.envs import Step
-from policies.packed.n_step import StackedNStep
-from policies.packed.replay import StackedPrioritizedReplay, StackedReplay, make_stacked_replay
+from policies.packed.dqn.n_step import StackedNStep
+from policies.packed.dqn.replay import StackedPrioritizedReplay, StackedReplay, make_stacked_replay
+from policies.packed.envs.make import Step
 from policies.replay import LastTransitions, NStep, PrioritizedReplayBuffer, ReplayBuffer, Transitions, make_replay
 
 D = 2

@@ -6,16 +6,16 @@ import pytest
 from pack_plans import DQN, LR, TPE, fake_reasons, plan
 from spec_errors import MINIMAL, errors
 
-from policies import guarded
 from policies.errors import EnvError, SpecError
+from policies.guard import guarded
 from policies.hyperparams import make_hyperparams
-from tune_jobs.driving import pending_record, write_new
-from tune_jobs.machine import Machine
-from tune_jobs.packs import pack_key, why_not_packed
-from tune_jobs.plan import make_plan
-from tune_jobs.resuming import check_same_trials
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from tune_jobs.plan.engine_choice import pack_key, why_not_packed
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drive import pending_record, write_new
+from tune_jobs.sweeps.resume import check_same_trials
 
 IMAGES = {"env": {"id": "CartPole-v1", "pixels": True}, "hyperparams": {"conv_filters": [[4, 8, 4]]}}
 
@@ -49,7 +49,7 @@ def test_what_can_be_packed_is_packed():
     ],
 )
 def test_what_cannot_be_packed_is_left_to_rllib_with_the_reason(monkeypatch, fields, reason):
-    monkeypatch.setattr("tune_jobs.plan.check_rl_module", lambda spec: None)
+    monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_rl_module", lambda spec: None)
     made = plan(**fields)
     assert (made.engines, made.packs) == ({"rllib": 10}, None)
     assert made.notes == (f"No trial is packed, RLlib trains them all: {reason}.",)
@@ -72,7 +72,7 @@ def test_a_baseline_has_an_engine_of_its_own():
 
 def test_trials_with_convolutions_are_not_packed(monkeypatch):
     # Whether observations are images is known of the environment alone: here none of them is looked at.
-    monkeypatch.setattr("tune_jobs.plan.check_env_rules", lambda *arguments: None)
+    monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_env_rules", lambda *arguments: None)
     fields = {"space": {"conv_filters": {"grid": [None, [[4, 8, 4]]]}}, "num_samples": 3}
     space = load_spec({**MINIMAL, **fields})
     values = make_hyperparams("ppo", {"conv_filters": [[4, 8, 4]]})
@@ -112,7 +112,7 @@ def test_environments_without_seeds_are_left_to_rllib(unseedable_env):
 
 
 def test_a_dry_run_shows_the_engine_of_each_trial_if_they_differ(monkeypatch, capsys):
-    from tune_jobs.cli_plan import show_plan
+    from tune_jobs.cli.plan_view import show_plan
 
     fake_reasons(monkeypatch, [0.2])
     fields = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1}
@@ -229,7 +229,7 @@ def test_two_kinds_of_target_updates_are_not_stacked():
 
 
 def test_trials_are_listed_with_their_engines_if_they_differ(capsys):
-    from tune_jobs.cli_output import show_trials
+    from tune_jobs.cli.output import show_trials
 
     records = [pending_record(trial) for trial in plan(num_samples=2).trials]
     show_trials(records, as_json=False)

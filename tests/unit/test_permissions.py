@@ -7,7 +7,7 @@ import pytest
 from sweep_folders import make_sweep_folder
 
 from policies.errors import CheckpointError
-from tune_jobs import sweeps
+from tune_jobs.sweeps import verbs as sweeps
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ import pytest
 from spec_errors import MINIMAL
 
 from policies.errors import SpecError
-from tune_jobs.plain_data import MAX_VALUES, to_plain
-from tune_jobs.search_space import Uniform
-from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import load_spec
+from tune_jobs.spec.domains import Uniform
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.plain_data import MAX_VALUES, to_plain
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 
 class Colour(enum.StrEnum):

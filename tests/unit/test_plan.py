@@ -7,11 +7,11 @@ import os
 import pytest
 
 from policies.errors import CannotRunError, EnvError, SpecError
-from tune_jobs import machine as machine_module
-from tune_jobs.machine import Machine, local_machine
-from tune_jobs.plan import make_plan, trial_id
-from tune_jobs.seeds import SEEDS_PER_TRIAL
-from tune_jobs.spec_file import load_spec
+from tune_jobs.plan import machine as machine_module
+from tune_jobs.plan.machine import Machine, local_machine
+from tune_jobs.plan.sweep_plan import make_plan, trial_id
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 
 TWO_CORES = Machine(num_cpus=2)
 

@@ -10,16 +10,16 @@ import pytest
 from policy_factory import IMAGES, make_image_policy, make_policy, make_portable, register_test_envs
 from rounding import assert_rounded, dense
 
-from policies.errors import TuneJobsError
-from policies.hyperparams import ACTIVATIONS
-from policies.policy import (
+from policies.acting.policy import (
     NetworkPolicy,
     NonFiniteWeightsError,
     ObservationError,
     RandomPolicy,
     load_policy,
 )
-from policies.portable import save_policy
+from policies.errors import TuneJobsError
+from policies.hyperparams import ACTIVATIONS
+from policies.portable.file import save_policy
 
 register_test_envs()
 ENVS = ["CartPole-v1", "Pendulum-v1", "TestPushes-v0", "TestWalk-v0", "MountainCarContinuous-v0"]

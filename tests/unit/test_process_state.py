@@ -13,8 +13,8 @@ import warnings
 import numpy as np
 import pytest
 
-from policies.env_modules import allow_modules, allowed_modules
-from tune_jobs.process_state import given_back
+from policies.envs.modules import allow_modules, allowed_modules
+from tune_jobs.process.state import given_back
 
 
 def state():
@@ -88,7 +88,7 @@ def test_what_a_users_module_sets_as_it_is_imported_stays(monkeypatch):
 
 
 def test_modules_that_the_user_allowed_stay_allowed(monkeypatch):
-    from policies import env_modules
+    from policies.envs import modules as env_modules
 
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["of_the_user"])

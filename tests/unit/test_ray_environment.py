@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from tune_jobs import ray_environment
-from tune_jobs.ray_environment import provide_token
+from tune_jobs.ray_tune import environment as ray_environment
+from tune_jobs.ray_tune.environment import provide_token
 
 NAMES = ["RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"]
 

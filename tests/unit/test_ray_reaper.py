@@ -22,7 +22,7 @@ time.sleep(3600)
 # The other child is the user's own.
 DRIVER = """
 import subprocess, sys, time
-from tune_jobs.ray_reaper import reaping
+from tune_jobs.ray_tune.reaper import reaping
 with reaping():
     subprocess.Popen([sys.executable, "-c", sys.argv[1]])
     subprocess.Popen([sys.executable, "-c", "print(1, flush=True); input(); print('mine')"], stdin=sys.stdin)

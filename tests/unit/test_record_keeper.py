@@ -4,10 +4,10 @@ import pytest
 from fake_engine import FakeClock
 
 from analysis.records import CheckpointRecord, TrialRecord
-from tune_jobs.ownership import Owner, OwnershipLostError
-from tune_jobs.progress import Progress
-from tune_jobs.record_keeper import RecordKeeper
-from tune_jobs.store import SweepStore
+from tune_jobs.store.ownership import Owner, OwnershipLostError
+from tune_jobs.store.progress import Progress
+from tune_jobs.store.record_keeper import RecordKeeper
+from tune_jobs.store.sweep_store import SweepStore
 
 
 @pytest.fixture

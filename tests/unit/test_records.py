@@ -19,7 +19,7 @@ from analysis.records import (
     SweepRecord,
     TrialRecord,
 )
-from tune_jobs.store import SweepStore, read_manifest
+from tune_jobs.store.sweep_store import SweepStore, read_manifest
 
 SYNTHETIC = make_sweep(points=[{"lr": 0.1}])
 CHANGE = ChangeRecord(

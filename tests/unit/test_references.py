@@ -13,9 +13,9 @@ from click.testing import CliRunner
 from pydantic import BaseModel
 
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tune_jobs.cli import cli
-from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import json_schema
+from tune_jobs.cli.commands import cli
+from tune_jobs.spec.file import json_schema
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("policies", "analysis", "tune_jobs")

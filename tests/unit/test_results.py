@@ -7,7 +7,7 @@ import pytest
 from synthetic_sweep import make_sweep
 
 import tune_jobs
-from tune_jobs.store import SweepStore
+from tune_jobs.store.sweep_store import SweepStore
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_a_film_goes_where_output_says(tmp_path, monkeypatch, output, expected):
     monkeypatch.chdir(tmp_path)
     Path("there").mkdir()
     asked = []
-    monkeypatch.setattr("tune_jobs.finish.make_video", lambda policy, path, *more: asked.append(path) or {})
+    monkeypatch.setattr("tune_jobs.sweeps.conclude.make_video", lambda policy, path, *more: asked.append(path) or {})
     tune_jobs.video("random", env_id="CartPole-v1", output=output)
     # Either ending gives both files.
     assert [path.with_suffix("") for path in asked] == [Path(expected)]

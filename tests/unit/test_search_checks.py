@@ -5,12 +5,12 @@ from spec_errors import MINIMAL, errors
 
 from analysis.records import ChangeRecord
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.driving import pending_record, write_new
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.resuming import check_same_trials
-from tune_jobs.spec_file import load_spec
-from tune_jobs.store import SweepStore
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drive import pending_record, write_new
+from tune_jobs.sweeps.resume import check_same_trials
 
 LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
 TPE = {"space": LR, "num_samples": 20, "search": "tpe"}
@@ -125,7 +125,7 @@ def test_a_population_counts_with_the_largest_values_it_may_mutate_to():
 def test_a_dry_run_shows_points_that_are_not_known_yet(tmp_path, monkeypatch):
     from click.testing import CliRunner
 
-    from tune_jobs.cli import cli
+    from tune_jobs.cli.commands import cli
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.yaml").write_text(
@@ -190,7 +190,7 @@ def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused():
 
 
 def test_a_list_of_sizes_is_measured_once_however_many_points_it_stands_for(monkeypatch):
-    from tune_jobs import plan
+    from tune_jobs.plan import sweep_plan as plan
 
     measured = []
     real = plan.max_env_steps

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from tune_jobs.search_space import DOMAIN_KINDS, Domain, draw_points
+from tune_jobs.spec.domains import DOMAIN_KINDS, Domain, draw_points
 
 ADAPTER = TypeAdapter(Domain)
 

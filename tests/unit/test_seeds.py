@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tune_jobs.seeds import MAX_EPISODES, SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
+from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 
 
 @pytest.mark.parametrize("sweep_seed", [0, 1, 2**40])

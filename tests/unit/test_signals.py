@@ -9,8 +9,8 @@ import pytest
 
 from analysis.records import SweepRecord
 from policies.errors import CannotRunError
-from tune_jobs.driving import SweepResult
-from tune_jobs.interruption import SweepInterrupted, current, run_alone, taking_signals
+from tune_jobs.process.interruption import SweepInterrupted, current, run_alone, taking_signals
+from tune_jobs.sweeps.drive import SweepResult
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

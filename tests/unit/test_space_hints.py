@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from policies import env_modules
-from policies.env_modules import allow_modules
-from policies.envs import check_env
+from policies.envs import modules as env_modules
+from policies.envs.make import check_env
+from policies.envs.modules import allow_modules
 from policies.errors import EnvError
 
 NUMBERS = spaces.Box(-1, 1, (3,), np.float32)
@@ -140,7 +140,7 @@ def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind, refusal)
 
 
 def test_a_class_of_a_module_is_made_as_such(monkeypatch):
-    from policies.space_hints import observation_hint
+    from policies.envs.space_hints import observation_hint
 
     assert "wrappers.FlattenObservation(my_envs.Walk())" in observation_hint("my_envs:Walk", spaces.Discrete(2))
 

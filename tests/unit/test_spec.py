@@ -10,9 +10,9 @@ from spec_errors import MINIMAL, errors, write
 
 from policies.errors import SpecError
 from policies.hyperparams import ACTIVATIONS
-from tune_jobs.search_space import Grid, Uniform
-from tune_jobs.spec import SweepSpec, check_sweep_name
-from tune_jobs.spec_file import find_preset, list_presets, load_spec, read_preset
+from tune_jobs.spec.domains import Grid, Uniform
+from tune_jobs.spec.file import find_preset, list_presets, load_spec, read_preset
+from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name
 
 # -- what is read
 

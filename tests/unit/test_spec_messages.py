@@ -9,11 +9,11 @@ from spec_errors import MINIMAL, write
 
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.search_space import DOMAIN_KINDS
-from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import load_spec
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.domains import DOMAIN_KINDS
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 FOREIGN = re.compile(
     r"should be a valid|instance of|input should|field required|extra inputs|type=|value error|pydantic|dictionary|"

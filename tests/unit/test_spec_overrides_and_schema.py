@@ -6,9 +6,9 @@ from spec_errors import MINIMAL, errors
 
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tune_jobs.search_space import DOMAIN_KINDS
-from tune_jobs.spec import SweepSpec
-from tune_jobs.spec_file import json_schema, list_presets, load_spec
+from tune_jobs.spec.domains import DOMAIN_KINDS
+from tune_jobs.spec.file import json_schema, list_presets, load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 # -- --set
 

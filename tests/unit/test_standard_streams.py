@@ -18,9 +18,9 @@ for number in json.loads(sys.argv[1]):
     os.close(number)
 sys.stdout = None
 
-from policies.guarded import check_env
-from tune_jobs.live import quiet
-from tune_jobs.process_state import given_back
+from policies.guard.guarded import check_env
+from tune_jobs.sweeps.live_table import quiet
+from tune_jobs.process.state import given_back
 
 said = {"env": check_env("CartPole-v1", {}).env_id}
 with given_back(), Path("mine.txt").open("w") as mine:
@@ -49,7 +49,7 @@ def test_a_process_without_standard_streams_works_and_stays_without(tmp_path, cl
 @pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
 def test_commands_run_where_nobody_listens(tmp_path, closed):
     done = subprocess.run(
-        [sys.executable, "-m", "tune_jobs.cli", "list", "--storage", str(tmp_path)],
+        [sys.executable, "-m", "tune_jobs.cli.commands", "list", "--storage", str(tmp_path)],
         preexec_fn=lambda: [os.close(number) for number in closed],
         stderr=subprocess.PIPE, text=True, check=False,
     )  # fmt: skip

@@ -9,14 +9,14 @@ from spec_errors import MINIMAL
 
 from analysis.wording import shown_path
 from policies.errors import CannotRunError, CheckpointError, SpecError
-from policies.guard import EnvGuard
-from tune_jobs import sweeps
-from tune_jobs.driving import write_new
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.spec_file import load_spec
-from tune_jobs.storage import create_store, storage_folder
-from tune_jobs.store import SweepStore
+from policies.guard.guard import EnvGuard
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.drive import write_new
+from tune_jobs.sweeps.storage import create_store, storage_folder
 
 
 def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path):
@@ -33,7 +33,7 @@ def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path):
 
 
 def test_an_automatic_name_that_is_taken_meanwhile_gives_way_to_the_next(tmp_path, monkeypatch):
-    from tune_jobs import storage
+    from tune_jobs.sweeps import storage
 
     def choose(name, stem, folder, real=storage.choose_store):
         store = real(name, stem, folder)

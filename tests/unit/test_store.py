@@ -17,7 +17,7 @@ from analysis.records import (
     TrialRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from tune_jobs.store import SweepStore, TrialStore, list_sweep_stores, read_manifest, verify_checkpoint
+from tune_jobs.store.sweep_store import SweepStore, TrialStore, list_sweep_stores, read_manifest, verify_checkpoint
 
 
 def make_sweep(**changes):
@@ -351,7 +351,7 @@ def test_a_stop_is_asked_for_and_forgotten(store):
 HOLDER = """
 import sys
 from pathlib import Path
-from tune_jobs.store import SweepStore
+from tune_jobs.store.sweep_store import SweepStore
 with SweepStore(Path(sys.argv[1])).lock():
     print("held", flush=True)
     sys.stdin.read()

@@ -6,9 +6,9 @@ import tracemalloc
 import pytest
 
 from policies.errors import SpecError
-from tune_jobs.plain_data import MAX_CHARACTERS, MAX_DEPTH
-from tune_jobs.spec_file import load_spec
-from tune_jobs.sweep_yaml import parse_yaml
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.plain_data import MAX_CHARACTERS, MAX_DEPTH
+from tune_jobs.spec.yaml import parse_yaml
 
 LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)

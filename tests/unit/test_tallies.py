@@ -14,11 +14,12 @@ from test_packed_envs import make, own_modules
 from test_record_keeper import kept, progress
 from trial_runs import Trial
 
-from policies import env_faults, tallies
-from policies.checked_envs import CheckedEnvs
-from policies.envs import make_vector_env
+from policies.envs import faults as env_faults
+from policies.envs import tallies
+from policies.envs.checked import CheckedEnvs
+from policies.envs.make import make_vector_env
+from policies.envs.tallies import Reached, begin_tally, only_tally, read_tally, tally_of
 from policies.errors import EnvError
-from policies.tallies import Reached, begin_tally, only_tally, read_tally, tally_of
 
 __all__ = ["kept", "make", "own_modules"]
 
@@ -34,7 +35,7 @@ def no_tallies(monkeypatch):
 
 def test_a_tally_outlives_a_process_that_is_killed(tmp_path):
     code = (
-        "import os, signal, sys\nfrom pathlib import Path\nfrom policies.tallies import Reached, begin_tally\n"
+        "import os, signal, sys\nfrom pathlib import Path\nfrom policies.envs.tallies import Reached, begin_tally\n"
         "tally = begin_tally('a', Path(sys.argv[1]), Reached(2, 200, 3, 7.0))\n"
         "for _ in range(5): tally.add(8, 1)\nos.kill(os.getpid(), signal.SIGKILL)"
     )

@@ -6,7 +6,7 @@ import struct
 import pytest
 from synthetic_sweep import make_sweep
 
-from tune_jobs.tensorboard import ScalarWriter
+from tune_jobs.store.event_files import ScalarWriter
 
 event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
 crc32c = pytest.importorskip("tensorboardX.crc32c")

@@ -10,11 +10,11 @@ import pytest
 
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.machine import Machine
-from tune_jobs.plan import make_plan
-from tune_jobs.search_space import draw_point
-from tune_jobs.spec_file import load_spec
-from tune_jobs.tpe import propose_point
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.search.tpe import propose_point
+from tune_jobs.spec.domains import draw_point
+from tune_jobs.spec.file import load_spec
 
 pytest.importorskip("optuna")
 

@@ -6,9 +6,9 @@ import pytest
 from fake_engine import FakeClock, FakeEngine, make_task
 from trial_runs import Trial
 
-from policies.evaluate import Evaluator
-from policies.portable import read_policy
-from tune_jobs.trial import TrialLoop
+from policies.acting.evaluate import Evaluator
+from policies.portable.file import read_policy
+from tune_jobs.training.trial_loop import TrialLoop
 
 # -- stop rules
 
@@ -143,7 +143,7 @@ def test_the_evaluation_is_the_mean_of_greedy_episodes_of_the_very_policy(tmp_pa
         loop.advance(0.0)
         progress = loop.advance(0.0)
         assert progress.status == "completed"
-        from policies.policy import NetworkPolicy
+        from policies.acting.policy import NetworkPolicy
 
         for record in progress.checkpoints:
             episodes = evaluator.run(NetworkPolicy(read_policy(tmp_path / record.path)))

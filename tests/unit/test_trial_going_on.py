@@ -8,10 +8,10 @@ import pytest
 from fake_engine import FakeClock, FakeEngine
 from trial_runs import Trial
 
-from policies.policy import NonFiniteWeightsError
-from policies.tallies import tally_of
-from tune_jobs.ownership import Owner, OwnershipLostError
-from tune_jobs.store import SweepStore
+from policies.acting.policy import NonFiniteWeightsError
+from policies.envs.tallies import tally_of
+from tune_jobs.store.ownership import Owner, OwnershipLostError
+from tune_jobs.store.sweep_store import SweepStore
 
 # -- going on
 

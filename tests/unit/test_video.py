@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
-import policies.movies
+import policies.acting.movies
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.movies import GifWriter, Mp4Writer
+from policies.acting.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
+from policies.acting.video import record_comparison, record_video
 from policies.errors import CannotRunError, EnvError, SpecError
-from policies.evaluate import evaluate_policy
-from policies.movies import GifWriter, Mp4Writer
-from policies.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
-from policies.video import record_comparison, record_video
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
@@ -202,7 +202,7 @@ def test_an_encoder_that_fails_is_one_clear_error(tmp_path, monkeypatch):
 
 
 def test_a_gif_stays_within_its_size_and_its_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(policies.movies, "_GIF_MAX_FRAMES", 40)
+    monkeypatch.setattr(policies.acting.movies, "_GIF_MAX_FRAMES", 40)
     rng = np.random.default_rng(0)
     writer = GifWriter(tmp_path / "a.gif", 50, max_bytes=60_000)
     drawn = []
@@ -238,7 +238,7 @@ def test_a_gif_without_pictures_is_refused(tmp_path):
 
 def test_a_white_background_stays_white_and_nothing_is_printed(tmp_path):
     code = (
-        "from policies.video import record_video; from policies.policy import RandomPolicy; from pathlib "
+        "from policies.acting.video import record_video; from policies.acting.policy import RandomPolicy; from pathlib "
         "import Path\n"
         "record_video(RandomPolicy.for_env('CartPole-v0'), env_id='CartPole-v0', seeds=1,\n"
         f"             mp4=Path({str(tmp_path / 'a.mp4')!r}), gif=Path({str(tmp_path / 'a.gif')!r}))"

@@ -4,8 +4,8 @@ import math
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
-from tune_jobs.store import TrialStore
-from tune_jobs.trial import TrialLoop
+from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.training.trial_loop import TrialLoop
 
 
 class Trial:

@@ -1,0 +1,1 @@
+"""Policies that act: loaded from files, or baselines; played, evaluated and filmed."""

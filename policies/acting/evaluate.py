@@ -1,0 +1,368 @@
+"""Seeded greedy episodes of any policy.
+
+Episode i is exactly this: `env.reset(seed=seeds[i])`, then greedy actions until the episode is terminated,
+truncated or
+as long as the cap. Its return and length depend on nothing else: neither on the episodes evaluated beside it
+nor on their order, so the same seed gives the same episode in a trial, on the command line and in a video.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, cast, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.acting.policy import Policy
+from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
+from policies.envs.faults import close_env, env_failed
+from policies.envs.make import make_env, make_vector_env
+from policies.errors import EnvError, EnvFailedError, SpecError
+
+MAX_EPISODE_STEPS = 10_000
+"""The cap for an env without a time limit."""
+_MAX_ENVS = 16
+_MAX_CARTPOLES = 256
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes in the order of their seeds."""
+
+    seeds: tuple[int, ...]
+    returns: tuple[float, ...]
+    """Undiscounted sum of the rewards of each."""
+    lengths: tuple[int, ...]
+    """Env steps of each."""
+
+    @property
+    def mean_return(self) -> float:
+        """Mean episode return."""
+        return math.fsum(self.returns) / len(self.returns)
+
+
+@runtime_checkable
+class Resettable(Protocol):
+    """A policy that draws numbers: reset from each episode's seed, its episodes are reproducible too."""
+
+    def reset(self, seed: int) -> None:
+        """Start again from a seed."""
+
+
+class Evaluator:
+    """Evaluates policies on fixed seeds, keeping its environments open between calls.
+
+    Args:
+        env_id: Gymnasium id.
+        env_args: Arguments of the env's constructor; None: none.
+        seeds: One episode for each, in this order; none negative.
+        max_episode_steps: Cap on the env steps of an episode; None: the env's time limit, or 10,000 if it has
+            none.
+
+    Raises:
+        EnvError: The environment cannot be made.
+        SpecError: There are no seeds, or one of them or the cap is out of range.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        env_args: Mapping[str, Any] | None,
+        seeds: Sequence[int],
+        *,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        self.seeds = check_seeds(seeds)
+        self.env_id, self.env_args = env_id, dict(env_args or {})
+        self._envs = [make_env(env_id, self.env_args)]
+        self.max_episode_steps = episode_cap(self._envs[0], max_episode_steps)
+        self._cartpoles = _CartPoles.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)
+
+    @property
+    def cartpole_starts(self) -> NDArray[np.float64] | None:
+        """CartPole's start states by seed, shape (num_seeds, 4); None: it is another env, or has wrappers."""
+        return None if self._cartpoles is None else self._cartpoles.start_states
+
+    def check(self, policy: Policy) -> None:
+        """Check that a policy can be run.
+
+        Raises:
+            NonFiniteWeightsError: Its weights are NaN or infinite.
+            EnvError: It is for other observations or actions.
+        """
+        check_policy(policy, self._envs[0])
+
+    def run(self, policy: Policy) -> Episodes:
+        """One greedy episode a seed.
+
+        Raises:
+            NonFiniteWeightsError: The policy's weights are NaN or infinite.
+            EnvError: The policy is for other observations or actions, or the env raised an error.
+        """
+        self.check(policy)
+        if isinstance(policy, Resettable):
+            # It draws numbers in the order of its calls, so its episodes must be played one after the other.
+            results = [self._play_alone(policy, seed) for seed in self.seeds]
+        elif self._cartpoles is not None:
+            results = self._cartpoles.play(policy, self.max_episode_steps)
+        else:
+            results = self._play_side_by_side(policy)
+        returns, lengths = zip(*results, strict=True)
+        return Episodes(self.seeds, returns, lengths)
+
+    def close(self) -> None:
+        """Close the environments; no `run` after it."""
+        for env in self._envs:
+            close_env(env)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _play_alone(self, policy: Policy, seed: int) -> tuple[float, int]:
+        return play_episode(policy, self._envs[0], seed, max_episode_steps=self.max_episode_steps)
+
+    def _play_side_by_side(self, policy: Policy) -> list[tuple[float, int]]:
+        """Several envs at once, so that the network sees a batch; a free env takes the next seed."""
+        while len(self._envs) < min(len(self.seeds), _MAX_ENVS):
+            self._envs.append(make_env(self.env_id, self.env_args))
+        waiting = deque(enumerate(self.seeds))
+        results: dict[int, tuple[float, int]] = {}
+        running = [_Running(env, *waiting.popleft()) for env in self._envs[: len(self.seeds)]]
+        while running:
+            actions = cast("NDArray[Any]", policy.act(np.stack([episode.observation for episode in running])))
+            for episode, action in zip(running, actions, strict=True):
+                if episode.step(action) or episode.length >= self.max_episode_steps:
+                    results[episode.index] = (episode.total, episode.length)
+            ended = [episode for episode in running if episode.index in results]
+            running = [episode for episode in running if episode.index not in results]
+            running += [_Running(episode.env, *waiting.popleft()) for episode in ended if waiting]
+        return [results[index] for index in range(len(self.seeds))]
+
+
+def evaluate_policy(
+    policy: Policy,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seeds: Sequence[int],
+    max_episode_steps: int | None = None,
+) -> Episodes:
+    """One greedy episode a seed.
+
+    Args:
+        policy: What acts.
+        env_id: Gymnasium id.
+        env_args: Arguments of the env's constructor; None: none.
+        seeds: One episode for each, in this order.
+        max_episode_steps: Cap on the env steps of an episode; None: the env's time limit, or 10,000 if it has
+            none.
+
+    Raises:
+        NonFiniteWeightsError: The policy's weights are NaN or infinite.
+        EnvError: The environment cannot be made, does not go with the policy, or raised an error.
+    """
+    with Evaluator(env_id, env_args, seeds, max_episode_steps=max_episode_steps) as evaluator:
+        return evaluator.run(policy)
+
+
+def play_episode(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int) -> tuple[float, int]:
+    """One greedy episode in one environment: its return and its env steps.
+
+    Args and errors are those of `episode_steps`.
+    """
+    *_, (length, total, _) = episode_steps(policy, env, seed, max_episode_steps=max_episode_steps)
+    return total, length
+
+
+def episode_steps(
+    policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int
+) -> Iterator[tuple[int, float, bool]]:
+    """One greedy episode in one environment, step by step.
+
+    Args:
+        policy: What acts; reset from the seed if it can be.
+        env: Where; it is not closed.
+        seed: Of the env's reset.
+        max_episode_steps: Cap on its env steps.
+
+    Yields:
+        After the reset and after each step: env steps so far, return so far, whether the episode is over.
+
+    Raises:
+        EnvError: The env raised an error.
+    """
+    if isinstance(policy, Resettable):
+        policy.reset(seed)
+    episode = _Running(env, 0, seed)
+    over = False
+    yield 0, 0.0, over
+    while not over:
+        over = episode.step(policy.act(episode.observation)) or episode.length >= max_episode_steps
+        yield episode.length, episode.total, over
+
+
+def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
+    """Check that a policy's weights are finite and that it goes with an environment.
+
+    Raises:
+        NonFiniteWeightsError: The policy's weights are NaN or infinite.
+        EnvError: The policy is for other observations or actions.
+    """
+    policy.check_finite()
+    pairs = {
+        "observations": (policy.observation_space, env.observation_space),
+        "actions": (policy.action_space, env.action_space),
+    }
+    for what, (ours, theirs) in pairs.items():
+        same = type(ours) is type(theirs) and ours.shape == theirs.shape
+        if same and isinstance(ours, gym.spaces.Discrete) and isinstance(theirs, gym.spaces.Discrete):
+            same = (ours.n, ours.start) == (theirs.n, theirs.start)
+        if not same:
+            env_id = env.spec.id if env.spec is not None else "this env"
+            raise EnvError(
+                f"The policy is for {policy.env_id}, whose {what} are {ours}; those of {env_id} are {theirs}.",
+                f"Use it with {policy.env_id}.",
+            )
+
+
+def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
+    """The seeds as ints.
+
+    Raises:
+        SpecError: There are none, or one is negative.
+    """
+    result = tuple(int(seed) for seed in seeds)
+    if not result:
+        raise SpecError("There are no seeds to evaluate on.", "Ask for at least one episode.")
+    if min(result) < 0:
+        raise SpecError(f"The seed {min(result)} is negative.", "Use seeds of 0 or more.")
+    return result
+
+
+def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
+    """Env steps after which an episode is cut off.
+
+    Raises:
+        SpecError: The given cap is below 1.
+    """
+    if max_episode_steps is None:
+        limit = None if env.spec is None else env.spec.max_episode_steps
+        return MAX_EPISODE_STEPS if limit is None else limit
+    if max_episode_steps < 1:
+        raise EnvError(f"The cap on episode steps is {max_episode_steps}.", "Use a cap of 1 or more, or none.")
+    return max_episode_steps
+
+
+class _Running:
+    """An episode being played in a scalar environment."""
+
+    def __init__(self, env: gym.Env[Any, Any], index: int, seed: int) -> None:
+        self.env, self.index, self.seed = env, index, seed
+        self.length = 0
+        self.total = 0.0
+        try:
+            self.observation, _ = env.reset(seed=seed)
+        except BaseException as error:  # an env may raise anything
+            raise self._env_failed("reset", error) from error
+        check_observation(self.observation, self._env_id, 0)
+
+    def step(self, action: Any) -> bool:
+        """Step once; whether the episode has ended."""
+        # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
+        if isinstance(action, np.generic):
+            action = action.item()
+        try:
+            self.observation, reward, terminated, truncated, _ = self.env.step(action)
+            self.length += 1
+            reward = reward_as_number(reward)
+            self.total += reward
+        except BaseException as error:  # an env may raise anything
+            raise self._env_failed("step", error) from error
+        if not (math.isfinite(reward) and is_sound(np.asarray(self.observation))):
+            check_reward(reward, self._env_id, self.length)
+            check_observation(self.observation, self._env_id, self.length)
+        return bool(terminated or truncated)
+
+    @property
+    def _env_id(self) -> str:
+        return self.env.spec.id if self.env.spec is not None else type(self.env.unwrapped).__name__
+
+    def _env_failed(self, method: str, error: BaseException) -> EnvFailedError:
+        return env_failed(
+            f"{self._env_id} raised an error in {method}() of the episode with seed {self.seed}, after {self.length} "
+            "steps",
+            error,
+        )
+
+
+class _CartPoles:
+    """CartPole by Gymnasium's own vectorised version: ten times as fast as ten environments.
+
+    That version draws the start states of all sub-environments from one generator, so they are drawn here as
+    the scalar env draws them, seed by seed, and set. From equal states the two take the same steps, to the
+    last bit; tests hold the returns and lengths of both against each other.
+    """
+
+    def __init__(self, env: Any, start_states: NDArray[np.float64]) -> None:
+        self._env = env
+        self.start_states = start_states  # shape (num_seeds, 4)
+
+    @classmethod
+    def make_if_cartpole(
+        cls, scalar_env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any], seeds: Sequence[int]
+    ) -> _CartPoles | None:
+        """For a CartPole without further wrappers; None for any other env."""
+        from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
+
+        inner = scalar_env.unwrapped
+        if type(inner) is not CartPoleEnv or (scalar_env.spec and scalar_env.spec.additional_wrappers):
+            return None
+        if scalar_env.observation_space.shape != inner.observation_space.shape:  # pixels, or stacked frames
+            return None
+        vector_env = make_vector_env(env_id, env_args, min(len(seeds), _MAX_CARTPOLES))
+        if type(vector_env) is not CartPoleVectorEnv:
+            return None
+        start_states = []
+        for seed in seeds:
+            scalar_env.reset(seed=seed)
+            start_states.append(copy.copy(inner.state))
+        return cls(vector_env, np.array(start_states, dtype=np.float64))
+
+    def play(self, policy: Policy, max_episode_steps: int) -> list[tuple[float, int]]:
+        """One episode a start state: return and length of each."""
+        num_envs: int = self._env.num_envs
+        results: list[tuple[float, int]] = []
+        for first in range(0, len(self.start_states), num_envs):
+            chunk = self.start_states[first : first + num_envs]
+            results += self._play_chunk(policy, chunk, max_episode_steps)
+        return results
+
+    def _play_chunk(
+        self, policy: Policy, start_states: NDArray[np.float64], max_episode_steps: int
+    ) -> list[tuple[float, int]]:
+        env, num_episodes = self._env, len(start_states)
+        env.reset(seed=0)  # clears the step counters; the states it draws are replaced
+        env.state[:, :num_episodes] = start_states.T
+        observations = env.state.T.astype(np.float32)
+        returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, dtype=np.int64)
+        running = np.ones(num_episodes, dtype=bool)
+        actions = np.zeros(env.num_envs, dtype=np.int64)
+        for _ in range(max_episode_steps):
+            actions[:num_episodes] = policy.act(observations[:num_episodes])
+            observations, rewards, terminated, truncated, _ = env.step(actions)
+            # Sub-environments that have ended start further episodes by themselves, which do not count.
+            returns[running] += rewards[:num_episodes][running]
+            lengths[running] += 1
+            running &= ~(terminated | truncated)[:num_episodes]
+            if not running.any():
+                break
+        return [(float(total), int(length)) for total, length in zip(returns, lengths, strict=True)]

@@ -1,0 +1,324 @@
+"""Policies that act: a network read from a portable file, or a baseline without one; NumPy alone.
+
+`Policy.act` takes one observation, shape (n,) or (height, width, channels), and gives one action ready for `env.step`,
+or takes a batch, shape (num, ...), and gives a batch of actions. Acting is greedy. The actions are those that RLlib
+sends to the env: shifted by the start of a Discrete space, and for Box actions transformed as the policy file says:
+
+* `unsquash`: the network's [-1, 1] is stretched over the bounds and clipped to them; all of them are finite.
+* `by_component`: the same for components with two bounds; the others are clipped to the bound that they have.
+* `clip`: clipped to the bounds. So are actions of older files that say `unsquash` though a bound is infinite: their
+  policies were trained on actions as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from policies.arguments import checked
+from policies.envs.action_bounds import ToBounds
+from policies.envs.make import check_env
+from policies.errors import TuneJobsError
+from policies.portable.file import (
+    BASELINE_KINDS,
+    ActionTransform,
+    PolicyNetwork,
+    PortablePolicy,
+    read_policy,
+    space_from_description,
+)
+from policies.portable.forward import ForwardPass
+
+ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
+Action = int | NDArray[Any]
+
+
+class ObservationError(TuneJobsError):
+    """An observation is not of the shape that the policy takes."""
+
+
+NON_FINITE_HINT = "Lower the learning rate, or set grad_clip; scale rewards and observations down if they are large."
+
+
+class NonFiniteWeightsError(TuneJobsError):
+    """A network holds NaN or infinite weights: its training went wrong, and what it does means nothing."""
+
+
+class Policy(ABC):
+    """Something that acts greedily in an environment.
+
+    Args:
+        observation_space: What it observes.
+        action_space: What its actions are taken from.
+        env_id: The environment it is for.
+        env_args: The arguments of that environment.
+        description: What it is, in a few words; captions and messages show it.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        *,
+        env_id: str,
+        env_args: Mapping[str, Any] | None,
+        description: str,
+    ) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.env_id = env_id
+        self.env_args = dict(env_args or {})
+        self.description = description
+
+    def act(self, observations: ArrayLike) -> Action:
+        """The greedy action for one observation, or for each of a batch.
+
+        Args:
+            observations: Of the shape of an observation, or (num, *that shape).
+
+        Returns:
+            For one observation what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
+            (Box). For a batch an array of shape (num,) or (num, action_dim).
+
+        Raises:
+            ObservationError: The observations are of another shape, or no numbers.
+        """
+        shape = self.observation_space.shape or ()
+        try:
+            batch = np.asarray(observations, dtype=np.float32)
+        except (TypeError, ValueError) as error:
+            raise ObservationError(
+                f"Observations must be numbers of shape {shape}: {error}.",
+                "Pass what env.reset or env.step returned.",
+            ) from error
+        single = batch.ndim == len(shape)
+        if batch.shape[-len(shape) :] != shape or batch.ndim > len(shape) + 1:
+            raise ObservationError(
+                f"The observations are of shape {batch.shape}; this policy ({self.env_id}) takes one of "
+                f"shape {shape}, or a batch of them.",
+                "Pass what env.reset or env.step returned.",
+            )
+        actions = self._act_batch(batch[None] if single else batch)
+        if not single:
+            return actions
+        return (
+            int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", actions[0])
+        )
+
+    def check_finite(self) -> None:  # noqa: B027 (a baseline has no weights)
+        """Raise unless all weights are finite.
+
+        Raises:
+            NonFiniteWeightsError: A weight is NaN or infinite; the message names its layer.
+        """
+
+    @abstractmethod
+    def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        """Actions for observations of shape (num, ...)."""
+
+
+class WeightsPolicy(Policy):
+    """Greedy actions by the weights of a portable policy; the base of those that have any.
+
+    Args:
+        portable: The weights and their spaces.
+        description: Shown in captions; by default the algorithm and the env.
+    """
+
+    def __init__(self, portable: PortablePolicy, description: str | None = None) -> None:
+        action_space = space_from_description(portable.action_space)
+        super().__init__(
+            space_from_description(portable.observation_space),
+            action_space,
+            env_id=portable.env_id,
+            env_args=portable.env_args,
+            description=description or f"{portable.algorithm.upper()} on {portable.env_id}",
+        )
+        self.portable = portable
+        self._to_actions = action_function(portable, action_space)
+
+    def check_finite(self) -> None:
+        """See `Policy.check_finite`."""
+        check_finite_tensors(self.portable.network, self.description)
+
+
+class NetworkPolicy(WeightsPolicy):
+    """Greedy actions of a portable network.
+
+    The result for an observation does not depend on what else is in its batch, to the last bit, so an episode
+    is the same one whether it is evaluated alone, beside others, or filmed.
+
+    Args:
+        portable: The network and its spaces.
+        description: Shown in captions; by default the algorithm and the env.
+    """
+
+    def __init__(self, portable: PortablePolicy, description: str | None = None) -> None:
+        super().__init__(portable, description)
+        self._forward = ForwardPass(portable.network)
+
+    def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
+        """The network's raw output: logits, means and log standard deviations, or Q-values or advantages.
+
+        Args:
+            observations: Shape (num, n), or (num, height, width, channels).
+
+        Returns:
+            Shape (num, num_outputs).
+        """
+        return self._forward(np.asarray(observations, dtype=np.float32))
+
+    def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        return self._to_actions(self.outputs(observations))
+
+
+class RandomPolicy(Policy):
+    """Actions drawn uniformly from the action space, as `action_space.sample()` draws them.
+
+    Args:
+        observation_space: Of the env; only the shape matters.
+        action_space: What is drawn from.
+        env_id: The environment it is for.
+        env_args: The arguments of that environment.
+        seed: First seed; `reset` sets another.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        *,
+        env_id: str,
+        env_args: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ) -> None:
+        # A copy: a space has one generator, and the env's own must not be touched.
+        own_space = copy_space(action_space)
+        super().__init__(observation_space, own_space, env_id=env_id, env_args=env_args, description="random policy")
+        self.reset(seed)
+
+    @classmethod
+    def for_env(cls, env_id: str, env_args: Mapping[str, Any] | None = None, *, seed: int = 0) -> RandomPolicy:
+        """A random policy for an environment.
+
+        Raises:
+            EnvError: The environment cannot be made, or its spaces are not supported.
+        """
+        info = check_env(env_id, env_args)
+        return cls(info.observation_space, info.action_space, env_id=info.env_id, env_args=info.env_args, seed=seed)
+
+    def reset(self, seed: int) -> None:
+        """Start again from a seed: the same seed gives the same actions."""
+        # Gymnasium seeds an env's generator with this very seed. Another one is derived from it, or the
+        # actions would be drawn from the numbers that the env's start states and noise come from.
+        derived = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
+        self.action_space.seed(int(derived))
+
+    def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        actions = [self.action_space.sample() for _ in range(len(observations))]
+        return np.array(actions).reshape(len(observations), *(self.action_space.shape or ()))
+
+
+def policy_from_portable(portable: PortablePolicy, description: str | None = None) -> Policy:
+    """The policy that a portable one describes: a network's, or a baseline's.
+
+    Args:
+        portable: What was read from a file, or made in memory.
+        description: Shown in captions and messages; None: by kind, algorithm and env.
+    """
+    network = portable.network
+    policy: Policy
+    if network.kind == "module":
+        from policies.acting.module_policy import ModulePolicy  # torch and RLlib, which no other policy needs
+
+        return ModulePolicy(portable, description)
+    if network.kind not in BASELINE_KINDS:
+        return NetworkPolicy(portable, description)
+    spaces = (space_from_description(portable.observation_space), space_from_description(portable.action_space))
+    if network.kind == "random":
+        policy = RandomPolicy(*spaces, env_id=portable.env_id, env_args=portable.env_args)
+    else:
+        from policies.acting.baselines import ConstantPolicy  # it is a Policy, so it imports this module
+
+        assert network.action is not None  # read_policy and save_policy have checked it
+        policy = ConstantPolicy(*spaces, network.action, env_id=portable.env_id, env_args=portable.env_args)
+    if description is not None:
+        policy.description = description
+    return policy
+
+
+@checked
+def load_policy(path: str | Path) -> Policy:
+    """Read a policy from its portable file; needs no Ray and no torch, and executes nothing in the file.
+
+    A policy whose network is an RLModule of the user's own does need them, and its class from an allowed module.
+
+    Args:
+        path: `policy.json`, `policy.safetensors`, or the folder that holds them.
+
+    Raises:
+        NotFoundError: There is no such file.
+        CheckpointError: The file is incomplete, altered, or of another format.
+        SpecError: It needs a class from a module that is not allowed.
+    """
+    return policy_from_portable(read_policy(Path(path)))
+
+
+def copy_space(space: gym.Space[Any]) -> ActionSpace:
+    """A space equal to this one, with a random generator of its own."""
+    if isinstance(space, gym.spaces.Box):
+        return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
+    if isinstance(space, gym.spaces.Discrete):
+        return gym.spaces.Discrete(int(space.n), start=int(space.start))
+    raise TuneJobsError(f"Actions of kind {type(space).__name__} are not supported.", "Use Box or Discrete actions.")
+
+
+def check_finite_tensors(network: PolicyNetwork, description: str) -> None:
+    """Raise unless all numbers of a network are finite.
+
+    Args:
+        network: Of any kind.
+        description: Of the policy, for the message.
+
+    Raises:
+        NonFiniteWeightsError: A weight or a statistic is NaN or infinite; the message says where.
+    """
+    for place, arrays in network.parts().items():
+        count = sum(int(array.size - np.isfinite(array).sum()) for array in arrays)
+        if count:
+            raise NonFiniteWeightsError(
+                f"The policy {description!r} has {count} weights that are NaN or infinite in {place}.",
+                NON_FINITE_HINT,
+            )
+
+
+def action_function(
+    portable: PortablePolicy, action_space: ActionSpace
+) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
+    """What turns the network's outputs, shape (num, num_outputs), into actions for the env."""
+    if isinstance(action_space, gym.spaces.Discrete):
+        start = int(action_space.start)
+        return lambda outputs: np.argmax(outputs, axis=1) + start
+    low, high, dtype = action_space.low, action_space.high, action_space.dtype
+    size = math.prod(action_space.shape)
+    transform = portable.action_transform
+    to_bounds = ToBounds(action_space)
+    if transform == "by_component" or (transform == "unsquash" and to_bounds.stretches_all):
+        return lambda outputs: to_bounds(outputs[:, :size])
+    if transform == "none":
+        return lambda outputs: outputs[:, :size].astype(dtype)
+    return lambda outputs: np.clip(outputs[:, :size], low, high).astype(dtype)
+
+
+def action_transform(action_space: gym.Space[Any]) -> ActionTransform:
+    """What a policy file says of how its actions become those of this space, as they did in training."""
+    if not isinstance(action_space, gym.spaces.Box):
+        return "none"
+    return "unsquash" if ToBounds(action_space).stretches_all else "by_component"

@@ -1,0 +1,313 @@
+"""Episodes of any policy as MP4 and GIF, with a caption strip that counts steps and return.
+
+The episodes are those that `policies.acting.evaluate` plays on the same seeds. Frames go to the encoder as they are
+drawn, so a long episode needs no memory for its MP4; the GIF keeps a bounded number of small frames.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from policies.acting.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
+from policies.acting.movies import GifWriter, Mp4Writer
+from policies.acting.policy import Policy
+from policies.envs.faults import close_env
+from policies.envs.make import make_env
+from policies.envs.rendering import draw_without_display
+from policies.errors import EnvError, SpecError, said_by
+
+_HOLD_S = 1.0  # the last picture stays, so that the final return can be read
+_DEFAULT_FPS = 30.0
+_MIN_WIDTH = 320  # smaller frames are enlarged, or the caption would not fit
+_GIF_SCALE = 0.5
+_GIF_MIN_WIDTH = 280
+_BACKGROUND = (24, 27, 34)
+_TEXT = (240, 242, 246)
+_DIM = (158, 164, 176)
+
+
+@dataclass(frozen=True, eq=False)
+class _Panel:
+    """A frame and what its caption strip says; one that is held is the very same object."""
+
+    frame: Image.Image
+    title: str
+    steps: int
+    total: float
+    over: bool
+
+
+def record_video(
+    policy: Policy,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seeds: int | Sequence[int],
+    mp4: Path | None = None,
+    gif: Path | None = None,
+    caption: str | None = None,
+    fps: float | None = None,
+    max_steps: int | None = None,
+) -> Episodes:
+    """Film one greedy episode a seed, one after the other.
+
+    Args:
+        policy: What acts.
+        env_id: Gymnasium id.
+        env_args: Arguments of the env's constructor; None: none.
+        seeds: One seed or several.
+        mp4: File to write (H.264); None: no MP4.
+        gif: File to write (looping, half the size, at most about 3 MB); None: no GIF.
+        caption: Left half of the caption strip; None: the policy's description.
+        fps: Frames a second; None: the env's `render_fps`, so that it plays in real time.
+        max_steps: Cap on the env steps of an episode; None: as `evaluate_policy`.
+
+    Returns:
+        The episodes that were filmed.
+
+    Raises:
+        EnvError: The environment cannot be made or drawn, does not go with the policy, or raised an error.
+        NonFiniteWeightsError: The policy's weights are NaN or infinite.
+        CannotRunError: A file cannot be written, or there is no video encoder.
+    """
+    filmed = check_seeds([seeds] if isinstance(seeds, int | np.integer) else seeds)
+    title = policy.description if caption is None else caption
+    ends = []
+    with ExitStack() as stack:
+        stage = stack.enter_context(_Stage(policy, env_id, env_args, title, max_steps))
+        film = stack.enter_context(_Film(mp4, gif, stage.fps if fps is None else fps))
+        for seed in filmed:
+            for panel in stage.play(seed):
+                film.add([panel], last=panel.over)
+            ends.append(panel)
+    return Episodes(filmed, tuple(end.total for end in ends), tuple(end.steps for end in ends))
+
+
+def record_comparison(
+    left: Policy,
+    right: Policy,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seed: int,
+    captions: tuple[str, str],
+    left_mp4: Path,
+    right_mp4: Path,
+    right_gif: Path,
+    both_mp4: Path,
+    max_steps: int | None = None,
+) -> tuple[Episodes, Episodes]:
+    """Film one episode of each of two policies, alone and next to each other, drawing each frame once.
+
+    Args:
+        left: What acts on the left.
+        right: What acts on the right.
+        env_id: Gymnasium id.
+        env_args: Arguments of the env's constructor; None: none.
+        seed: Of both episodes.
+        captions: Of the left and the right.
+        left_mp4: File of the left one alone.
+        right_mp4: File of the right one alone.
+        right_gif: The same as a GIF.
+        both_mp4: File of the two side by side; the shorter one holds its last frame.
+        max_steps: Cap on the env steps of an episode; None: as `evaluate_policy`.
+
+    Returns:
+        The episodes of the left and of the right.
+
+    Raises:
+        EnvError: The environment cannot be made or drawn, does not go with a policy, or raised an error.
+        NonFiniteWeightsError: A policy's weights are NaN or infinite.
+        CannotRunError: A file cannot be written, or there is no video encoder.
+    """
+    (seed,) = check_seeds([seed])
+    with ExitStack() as stack:
+        stages = [
+            stack.enter_context(_Stage(policy, env_id, env_args, title, max_steps))
+            for policy, title in zip((left, right), captions, strict=True)
+        ]
+        fps = stages[0].fps
+        alone = [stack.enter_context(_Film(mp4, gif, fps)) for mp4, gif in ((left_mp4, None), (right_mp4, right_gif))]
+        both = stack.enter_context(_Film(both_mp4, None, fps))
+        before: list[_Panel | None] = [None, None]
+        panels: list[_Panel] = []
+        for panels in _in_step([stage.play(seed) for stage in stages]):
+            for film, panel, known in zip(alone, panels, before, strict=True):
+                if panel is not known:
+                    film.add([panel], last=panel.over)
+            both.add(panels, last=all(panel.over for panel in panels))
+            before = list(panels)
+    first, second = (Episodes((seed,), (panel.total,), (panel.steps,)) for panel in panels)
+    return first, second
+
+
+class _Stage:
+    """An environment that can be drawn, and the policy that acts in it; a context manager."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        env_id: str,
+        env_args: Mapping[str, Any] | None,
+        title: str,
+        max_steps: int | None,
+    ) -> None:
+        self._policy, self._title = policy, title
+        self._env = _make_drawable_env(env_id, env_args)
+        check_policy(policy, self._env)
+        self._cap = episode_cap(self._env, max_steps)
+        self.fps = float(self._env.metadata.get("render_fps") or _DEFAULT_FPS)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        close_env(self._env)
+
+    def play(self, seed: int) -> Iterator[_Panel]:
+        """The episode of a seed, a panel for the reset and for each step."""
+        for steps, total, over in episode_steps(self._policy, self._env, seed, max_episode_steps=self._cap):
+            yield _Panel(self._draw(), self._title, steps, total, over)
+
+    def _draw(self) -> Image.Image:
+        env_id = self._env.spec.id if self._env.spec is not None else "The env"
+        try:
+            frame = np.asarray(self._env.render())
+        except Exception as error:  # an env may raise anything
+            raise EnvError(
+                f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
+                "Install what it needs to draw without a display (for MuJoCo set MUJOCO_GL=egl or osmesa).",
+            ) from error
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+            raise EnvError(
+                f"{env_id} draws arrays of shape {frame.shape} and dtype {frame.dtype}, not frames.",
+                "Mend its render(): it must return a uint8 array (height, width, 3).",
+            )
+        picture = Image.fromarray(frame)
+        zoom = -(-_MIN_WIDTH // picture.width)
+        if zoom > 1:
+            picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
+        return picture
+
+
+class _Film:
+    """The files that are being written; a context manager: they appear when it ends without an error."""
+
+    def __init__(self, mp4: Path | None, gif: Path | None, fps: float) -> None:
+        if not 0 < fps < 1000:
+            raise SpecError(f"A video of {fps} frames a second cannot be made.", "Use a number such as 30.")
+        self._fps = fps
+        self._mp4 = None if mp4 is None else Mp4Writer(Path(mp4), fps)
+        self._gif = None if gif is None else GifWriter(Path(gif), fps)
+
+    def __enter__(self) -> Self:
+        if self._mp4 is not None:
+            self._mp4.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._mp4 is not None:
+            self._mp4.__exit__(kind, error, traceback)
+        if self._gif is not None and kind is None:
+            self._gif.save()
+
+    def add(self, panels: Sequence[_Panel], *, last: bool) -> None:
+        """Add the next moment; the last one of an episode is held."""
+        if self._mp4 is not None:
+            self._mp4.add(_picture(panels, 1.0), 1 + round(self._fps * _HOLD_S) if last else 1)
+        if self._gif is not None:
+            scale = min(1.0, max(_GIF_SCALE, _GIF_MIN_WIDTH / panels[0].frame.width))
+            self._gif.add(lambda: _picture(panels, scale), hold_s=_HOLD_S if last else 0.0)
+
+
+def _make_drawable_env(env_id: str, env_args: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
+    draw_without_display()
+    with warnings.catch_warnings():
+        # Gymnasium warns of an unknown render mode; it is an error here, raised below.
+        warnings.simplefilter("ignore")
+        plain = make_env(env_id, env_args)
+        modes = list(plain.metadata.get("render_modes") or [])
+        close_env(plain)
+        if "rgb_array" not in modes:
+            raise EnvError(
+                f"{env_id} cannot be filmed: it has no render mode 'rgb_array' (it has: {', '.join(modes) or 'none'}).",
+                "Evaluate it without a video, or add the render mode to the env.",
+            )
+        return make_env(env_id, env_args, render_mode="rgb_array")
+
+
+def _in_step(plays: Sequence[Iterator[_Panel]]) -> Iterator[list[_Panel]]:
+    """The panels of several episodes until the longest is over; the others stay as they ended."""
+    panels = [next(play) for play in plays]
+    yield panels
+    while not all(panel.over for panel in panels):
+        panels = [panel if panel.over else next(play) for panel, play in zip(panels, plays, strict=True)]
+        yield panels
+
+
+def _picture(panels: Sequence[_Panel], scale: float) -> Image.Image:
+    """The panels next to each other, each under its caption strip."""
+    parts = [_captioned(panel, scale) for panel in panels]
+    gap = max(2, round(12 * scale)) if len(parts) > 1 else 0
+    width = sum(part.width for part in parts) + gap * (len(parts) - 1)
+    picture = Image.new("RGB", (width, max(part.height for part in parts)), _BACKGROUND)
+    x = 0
+    for part in parts:
+        picture.paste(part, (x, 0))
+        x += part.width + gap
+    return picture
+
+
+# Both panels at both scales: the same ones go into several films, or are held.
+@lru_cache(maxsize=4)
+def _captioned(panel: _Panel, scale: float) -> Image.Image:
+    width, height = (max(1, round(length * scale)) for length in panel.frame.size)
+    # Text is drawn at the final size: scaled down it could not be read in a GIF.
+    strip = min(44, max(26, round(width * 0.066)))
+    strip += (height + strip) % 2  # H.264 wants even heights
+    picture = Image.new("RGB", (width, height + strip), _BACKGROUND)
+    frame = panel.frame if scale == 1.0 else panel.frame.resize((width, height), _filter(scale))
+    picture.paste(frame, (0, strip))
+    draw = ImageDraw.Draw(picture)
+    font = _font(round(strip * 0.46))
+    pad, middle = round(strip * 0.3), strip / 2
+    total = f"{panel.total:.0f}" if float(panel.total).is_integer() else f"{panel.total:.1f}"
+    # Two columns of fixed width, or the words would move at each step as the numbers grow.
+    right: float = width - pad
+    for label, number, colour in (("return", total, _TEXT), ("step", str(panel.steps), _DIM)):
+        draw.text((right, middle), f"{label} {number}", font=font, fill=colour, anchor="rm")
+        right -= max(draw.textlength(f"{label} {digits}", font) for digits in ("000", number)) + pad
+    draw.text((pad, middle), _shorten(panel.title, draw, font, right - pad), font=font, fill=_TEXT, anchor="lm")
+    return picture
+
+
+def _filter(scale: float) -> Image.Resampling:
+    # The mean of whole pixels is as good where it goes out even, and four times as fast.
+    return Image.Resampling.BOX if (1.0 / scale).is_integer() else Image.Resampling.LANCZOS
+
+
+@cache
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)  # unpacks the font each time
+
+
+def _shorten(text: str, draw: ImageDraw.ImageDraw, font: Any, width: float) -> str:
+    text = " ".join(text.split())
+    if draw.textlength(text, font) <= width:
+        return text
+    while text and draw.textlength(text + "…", font) > width:
+        text = text[:-1]
+    return text.rstrip() + "…"

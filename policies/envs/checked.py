@@ -1,0 +1,197 @@
+"""Numbers of an environment that are none, found where it gives them.
+
+A NaN or an infinite number in a reward or an observation ruins the weights of whoever learns from it, many steps later
+and far away. Bounds of a space that are infinite allow any number, but not these.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.envs.faults import close_env, env_failed
+from policies.envs.tallies import only_tally
+from policies.errors import EnvError, EnvFailedError
+
+_LARGEST = float(np.finfo(np.float32).max)
+"""Learners compute in 32 bits: what is larger is infinite to them."""
+_LARGEST_32 = np.finfo(np.float32).max
+"""The same with its precision, or numbers of 16 bits would be compared with infinity."""
+_HINT = "Mend the env: training on it would ruin the weights."
+
+
+def is_sound(values: NDArray[Any]) -> bool:
+    """Whether all numbers are finite, in 32 bits too."""
+    # NaN is not <= anything.
+    return values.dtype == np.uint8 or bool((np.abs(values) <= _LARGEST_32).all())
+
+
+def reward_as_number(reward: Any) -> float:
+    """A reward as the number that it is, or that is the only one of an array or a list, of any shape.
+
+    Raises:
+        TypeError: It is no number.
+        ValueError: It is not one number.
+    """
+    if isinstance(reward, np.ndarray | list | tuple):
+        # From NumPy 2.4 on, float() takes arrays without dimensions alone.
+        reward = np.asarray(reward).item()
+    return float(reward)
+
+
+class PlainSteps(gym.Wrapper[Any, Any, Any, Any]):
+    """A sub-environment for a vector of them: its rewards are plain numbers, and it tells no infos.
+
+    Nobody here reads infos, but Gymnasium makes arrays of them: it fails where those of two environments have other
+    types or shapes, or a number has more than 64 bits.
+    """
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment."""
+        observation, _ = self.env.reset(seed=seed, options=options)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment."""
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return observation, reward_as_number(reward), terminated, truncated, {}
+
+
+def check_reward(reward: float, env_id: str, num_steps: int) -> None:
+    """Refuse a reward that is not finite.
+
+    Args:
+        reward: The env's own.
+        env_id: For the message.
+        num_steps: Env steps of its episode, that of the reward included.
+
+    Raises:
+        EnvFailedError: It is NaN or infinite.
+    """
+    if not abs(reward) <= _LARGEST:
+        raise EnvFailedError(
+            f"The reward of env step {num_steps} of an episode of {env_id} was {_name(reward)}.", _HINT
+        )
+
+
+def check_observation(observation: Any, env_id: str, num_steps: int) -> None:
+    """Refuse an observation that is not finite, whatever the bounds of its space.
+
+    Args:
+        observation: Of any shape.
+        env_id: For the message.
+        num_steps: Env steps of its episode so far; 0: it is the reset's.
+
+    Raises:
+        EnvFailedError: A number of it is NaN or infinite.
+    """
+    values = np.asarray(observation)
+    if is_sound(values):
+        return
+    place = int(np.flatnonzero(~(np.abs(values) <= _LARGEST_32))[0])
+    which = f"after env step {num_steps}" if num_steps else "from reset(), at the beginning"
+    raise EnvFailedError(
+        f"The observation {which} of an episode of {env_id} was {_name(float(values.flat[place]))} (number {place} of "
+        f"its {values.size}, counted from 0).",
+        _HINT,
+    )
+
+
+def _name(value: float) -> str:
+    if math.isnan(value):
+        return "NaN"
+    if math.isinf(value):
+        return "infinite" if value > 0 else "minus infinity"
+    return f"{value:g}, which is infinite in 32 bits"
+
+
+class CheckedEnvs(gym.vector.VectorWrapper):
+    """A vector environment whose errors are `EnvError`s, and whose rewards and observations are finite.
+
+    For those that reset in the step after an episode's end, as `make_vector_env` makes them. A vectorised version of a
+    user's own may return lists, or columns of rewards; here these are arrays. It has no infos, as nobody reads them.
+
+    Args:
+        env: Without a failure penalty: its own rewards are looked at.
+        env_id: For messages.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
+        super().__init__(env)
+        self._env_id = env_id
+        self._shape = (env.num_envs, *(env.single_observation_space.shape or ()))
+        self._lengths = np.zeros(env.num_envs, dtype=np.int64)
+        self._ended = np.zeros(env.num_envs, dtype=np.bool_)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset all sub-environments.
+
+        Raises:
+            EnvFailedError: One raised an error, or its observation is not finite.
+        """
+        try:
+            observations, _ = self.env.reset(seed=seed, options=options)
+        except BaseException as error:
+            raise env_failed(f"{self._env_id} raised an error in reset()", error) from error
+        self._lengths[:], self._ended[:] = 0, False
+        observations = self._as_array(observations, "observations", self._shape)
+        self._check(observations)
+        return observations, {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all sub-environments.
+
+        Raises:
+            EnvFailedError: One raised an error, or its reward or observation is not finite.
+            EnvError: The vectorised version returned something else than rows of numbers.
+        """
+        try:
+            observations, rewards, terminated, truncated, _ = self.env.step(actions)
+        except BaseException as error:
+            raise env_failed(f"{self._env_id} raised an error in step()", error) from error
+        row = self._shape[:1]
+        observations = self._as_array(observations, "observations", self._shape)
+        rewards = self._as_array(rewards, "rewards", row).reshape(row)
+        terminated, truncated = (
+            self._as_array(values, what, row).reshape(row).astype(np.bool_, copy=False)
+            for values, what in ((terminated, "terminated"), (truncated, "truncated"))
+        )
+        self._lengths += 1
+        self._lengths[self._ended] = 0
+        if not is_sound(rewards):
+            for reward, length in zip(rewards.tolist(), self._lengths.tolist(), strict=True):
+                check_reward(reward, self._env_id, length)
+        self._check(observations)
+        ended = np.logical_or(terminated, truncated)
+        if (tally := only_tally()) is not None:
+            tally.add(int(np.count_nonzero(~self._ended)), int(np.count_nonzero(ended)))
+        self._ended = ended
+        return observations, rewards, terminated, truncated, {}
+
+    def _as_array(self, values: Any, what: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """What a vectorised version returned, of this shape; one of one dimension may have further ones of length 1."""
+        try:
+            array = np.asarray(values)
+        except Exception:  # noqa: BLE001 (ragged lists, say)
+            array = np.empty(0, dtype=object)
+        if array.dtype.kind in "biuf" and (array.shape == shape or (len(shape) == 1 and array.size == shape[0])):
+            return array
+        raise EnvError(
+            f"The vectorised {self._env_id} returned {what} of shape {array.shape} and dtype {array.dtype}, not "
+            f"numbers of shape {shape}.",
+            "Mend its vector_entry_point, or register the env without one.",
+        )
+
+    def _check(self, observations: NDArray[Any]) -> None:
+        if not is_sound(observations):
+            for observation, length in zip(observations, self._lengths.tolist(), strict=True):
+                check_observation(observation, self._env_id, length)
+
+    def close(self, **kwargs: Any) -> None:
+        """Close all; that one cannot be closed harms nobody."""
+        del kwargs
+        close_env(self.env)

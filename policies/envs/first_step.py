@@ -1,0 +1,181 @@
+"""The first reset and the first step of an environment: whether it returns what Gymnasium asks for.
+
+Training would find out too, in each trial and each retry; here it is found before anything starts. What is harmless,
+such as observations of float64 where the space says float32, passes: whatever steps environments converts it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from policies.envs.checked import is_sound, reward_as_number
+from policies.envs.faults import env_failed
+from policies.errors import EnvError, shortened
+
+_STEP_HINT = (
+    "Mend its step(): Gymnasium's API wants (observation, reward, terminated, truncated, info), with an observation of "
+    "the observation space, a finite number, two bools and a dict."
+)
+_RESET_HINT = (
+    "Mend its reset(): Gymnasium's API wants (observation, info), with an observation of the observation space and a "
+    "dict."
+)
+
+
+def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> None:
+    """Reset an environment, step it once with some action, and check what it returns.
+
+    Args:
+        env: The environment.
+        env_id: For messages.
+        env_args: For messages.
+
+    Raises:
+        EnvFailedError: It raised an error.
+        EnvError: It returned something else than it should.
+    """
+    name = f"The environment {env_id!r}" + (f" with arguments {dict(env_args)!r}" if env_args else "")
+    _check_call(
+        env, "reset", lambda: env.reset(seed=0),
+        find_problem=_reset_problem, complaint=f"{name} cannot be reset", hint=_RESET_HINT,
+    )  # fmt: skip
+    space = copy.deepcopy(env.action_space)  # the env may draw from its own
+    space.seed(0)
+    action = space.sample()
+    # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
+    action = action.item() if isinstance(action, np.generic) else action
+    _check_call(
+        env, "step", lambda: env.step(action),
+        find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {action!r} after a reset",
+        hint=_STEP_HINT,
+    )  # fmt: skip
+
+
+def _check_call(
+    env: gym.Env[Any, Any],
+    method: str,
+    call: Callable[[], Any],
+    *,
+    find_problem: Callable[[Any, gym.Space[Any]], str | None],
+    complaint: str,
+    hint: str,
+) -> None:
+    env_id = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+    with _returned_by(env.unwrapped, method) as inner:
+        try:
+            problem = find_problem(call(), env.observation_space)
+        except BaseException as error:  # an env may raise anything
+            # A wrapper around it may have stumbled over what it returned.
+            problem = find_problem(inner[-1], env.unwrapped.observation_space) if inner else None
+            if problem is None:
+                raise env_failed(complaint, error, f"Check the env's arguments, or mend its {method}().") from error
+    if problem is not None:
+        raise EnvError(f"{method}() of {env_id} returns {problem}.", hint)
+
+
+@contextlib.contextmanager
+def _returned_by(inner: Any, method: str) -> Iterator[list[Any]]:
+    """What the method returns to the wrappers around an environment."""
+    returned: list[Any] = []
+    original = getattr(inner, method)
+
+    def spy(*args: Any, **kwargs: Any) -> Any:
+        returned.append(original(*args, **kwargs))
+        return returned[-1]
+
+    before = vars(inner).get(method) if hasattr(inner, "__dict__") else None
+    with contextlib.suppress(AttributeError):  # one with slots cannot be spied upon
+        setattr(inner, method, spy)
+    try:
+        yield returned
+    finally:
+        with contextlib.suppress(AttributeError):
+            if before is None:
+                delattr(inner, method)
+            else:
+                setattr(inner, method, before)
+
+
+def _reset_problem(returned: Any, space: gym.Space[Any]) -> str | None:
+    """What is wrong with what reset() returned, or None."""
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        return f"{_kind(returned)}, not the two values (observation, info)"
+    observation, info = returned
+    if not isinstance(info, Mapping):
+        return f"{_kind(info)} as info, not a dict"
+    return _observation_problem(observation, space)
+
+
+def _step_problem(returned: Any, space: gym.Space[Any]) -> str | None:
+    """What is wrong with what step() returned, or None."""
+    if not isinstance(returned, tuple) or len(returned) != 5:
+        return f"{_kind(returned)}, not the five values (observation, reward, terminated, truncated, info)"
+    observation, reward, terminated, truncated, info = returned
+    if problem := _reward_problem(reward):
+        return problem
+    for name, value in (("terminated", terminated), ("truncated", truncated)):
+        if not _is_bool(value):
+            return f"{shortened(value)} ({type(value).__name__}) as {name}, not a bool"
+    if not isinstance(info, Mapping):
+        return f"{_kind(info)} as info, not a dict"
+    return _observation_problem(observation, space)
+
+
+def _reward_problem(reward: Any) -> str | None:
+    if isinstance(reward, str | bytes):
+        return f"{shortened(reward)} as reward, not a number"
+    try:
+        array = np.asarray(reward)
+        number = reward_as_number(reward)
+        is_number = array.size == 1 and array.dtype.kind in "biuf"
+    except Exception:  # noqa: BLE001 (whatever it is, it is no number)
+        is_number = False
+    if not is_number:
+        return f"{_kind(reward)} as reward, not a number"
+    if is_sound(np.asarray(number)):
+        return None
+    return f"the reward {number!r}{_if_finite(number)}"
+
+
+def _is_bool(value: Any) -> bool:
+    return isinstance(value, bool | np.bool_) or (
+        isinstance(value, np.ndarray) and value.shape == () and value.dtype == np.bool_
+    )
+
+
+def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
+    wanted = np.dtype(space.dtype)
+    try:
+        array = np.asarray(observation)
+    except Exception:  # noqa: BLE001 (ragged lists, say)
+        return f"{_kind(observation)} as observation, not an array of shape {space.shape}"
+    if array.shape != space.shape:
+        return f"observations of shape {array.shape} but declares {space.shape}"
+    # Of a fraction, bytes would lose what is behind the point.
+    if array.dtype.kind not in ("biuf" if wanted.kind == "f" else "biu"):
+        return f"observations of dtype {array.dtype} but declares {wanted}"
+    for place in np.ndindex(array.shape) if not is_sound(array) else ():
+        if not is_sound(value := np.asarray(array[place])):
+            return f"observations that are not finite: {value} at {list(place)}{_if_finite(value)}"
+    return None
+
+
+def _if_finite(value: Any) -> str:
+    """What is added to a number that is not sound, though it is finite."""
+    return ", which is infinite in 32 bits" if np.isfinite(value) else ""
+
+
+def _kind(value: Any) -> str:
+    """A value in a few words."""
+    if value is None:
+        return "None"
+    if isinstance(value, tuple | list):
+        return f"a {type(value).__name__} of {len(value)}"
+    shown = shortened(value)
+    return f"{shown} ({type(value).__name__})" if len(shown) <= 60 else f"a {type(value).__name__}"

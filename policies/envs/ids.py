@@ -1,0 +1,112 @@
+"""What an env id means: an entry of Gymnasium's registry, or something in a module that was allowed.
+
+The registry's entry is looked up here, and Gymnasium is never handed the id itself: it would import the module that an
+id such as `module:Env-v0` names, allowed or not.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, parse_env_id
+
+from policies.envs.modules import import_module_allowed
+from policies.envs.plugins import load_env_plugins
+from policies.errors import EnvError, SpecError
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvCreator
+
+
+def normalize_env_id(env_id: str) -> str:
+    """The registered id that a user's id means: `CartPole` is the newest `CartPole-v<n>`.
+
+    An id of the form `module:Name` keeps its module, so that other processes import it too.
+
+    Raises:
+        EnvError: Not a string, empty, not registered, or in a module that is not allowed or does not have it.
+    """
+    return find_env(env_id)[0]
+
+
+def find_env(env_id: str) -> tuple[str, EnvSpec]:
+    """The normalised id, and what Gymnasium makes the environment from.
+
+    Args:
+        env_id: A registered id, with its version or without; or `module:Name` with the name of one that the module
+            registers, or of a subclass of `gymnasium.Env` in it.
+
+    Raises:
+        EnvError: As `normalize_env_id`.
+    """
+    if not isinstance(env_id, str) or not env_id.strip():
+        raise EnvError(
+            f"The env id is {env_id!r}, which names no environment.",
+            "Give a Gymnasium id such as 'CartPole-v1'.",
+        )
+    env_id = env_id.strip()
+    if ":" in env_id:
+        return _find_in_module(env_id)
+    problems: tuple[str, ...] = ()
+    found = _find_registered(env_id)
+    if found is None:
+        problems = load_env_plugins()
+        found = _find_registered(env_id)
+    if found is None:
+        reasons = "".join(f" {problem}" for problem in problems)
+        guess = _did_you_mean(env_id, list(gym.registry))
+        raise EnvError(
+            f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}",
+            "Correct the id, or install the package that registers it.",
+        )
+    return found, gym.registry[found]
+
+
+def module_of(env_id: str) -> str | None:
+    """The module that an id names; None for one of the registry alone."""
+    module, colon, _ = env_id.strip().partition(":")
+    return module if colon else None
+
+
+def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
+    module_name, _, name = env_id.partition(":")
+    try:
+        module = import_module_allowed(module_name)
+    except SpecError as error:
+        raise EnvError(f"The env id {env_id!r} names a module, by its colon. {error.message}", error.hint) from error
+    found = _find_registered(name)
+    if found is not None:
+        return f"{module_name}:{found}", gym.registry[found]
+    thing: Any = getattr(module, name, None)
+    if isinstance(thing, type) and issubclass(thing, gym.Env):
+        return env_id, EnvSpec(env_id, entry_point=cast("EnvCreator", thing))
+    classes = [
+        name
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, gym.Env) and value.__module__ == module.__name__
+    ]
+    raise EnvError(
+        f"The module {module_name!r} neither registers an environment {name!r} with Gymnasium nor has a class of that "
+        f"name that is a gymnasium.Env.{_did_you_mean(name, [*classes, *gym.registry])}",
+        "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
+    )
+
+
+def _find_registered(env_id: str) -> str | None:
+    if env_id in gym.registry:
+        return env_id
+    try:
+        namespace, name, version = parse_env_id(env_id)
+        newest = find_highest_version(namespace, name) if version is None else None
+    except gym.error.Error:  # of no form that an id can have
+        return None
+    return None if newest is None else get_env_id(namespace, name, newest)
+
+
+def _did_you_mean(env_id: str, known: list[str]) -> str:
+    by_lower_case = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(env_id.lower(), by_lower_case, n=3, cutoff=0.7)
+    names = [repr(by_lower_case[name]) for name in close]
+    return f" Did you mean {' or '.join(names)}?" if names else ""

@@ -1,0 +1,356 @@
+"""Check and make Gymnasium environments.
+
+Words: an *env id* names a registered environment (`CartPole-v1`); *env arguments* are the keyword arguments
+its constructor takes; a *sub-environment* is one of the copies that a vector environment steps at once.
+
+What an id means is decided in `env_ids`; Gymnasium is given what was found, never the id. The env arguments may hold
+the reserved keys of `env_wrappers`, so that whoever makes the environment of a policy observes what the policy did in
+training.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+
+from policies.envs import calls
+from policies.envs.calls import Call
+from policies.envs.checked import PlainSteps
+from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
+from policies.envs.faults import close_env, is_of_env
+from policies.envs.first_step import check_first_step
+from policies.envs.ids import find_env, normalize_env_id
+from policies.envs.rendering import draw_without_display
+from policies.envs.space_hints import action_hint, observation_hint
+from policies.envs.wrappers import FailurePenalty, ObservationWrappers
+from policies.errors import EnvError, said_by
+
+if TYPE_CHECKING:
+    from policies.hyperparams import Algorithm
+
+__all__ = [
+    "ALLOWED_MODULES",
+    "FAILURE_PENALTY",
+    "EnvInfo",
+    "check_env",
+    "make_env",
+    "make_vector_env",
+    "normalize_env_id",
+]
+
+# In an env runner's `env_config` beside the env's arguments, never among them.
+FAILURE_PENALTY, ALLOWED_MODULES = "failure_penalty", "allowed_modules"
+# Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and what env runners are
+# told beside the env's arguments.
+_RESERVED_ARGS = frozenset(
+    {
+        "id",
+        "render_mode",
+        "disable_env_checker",
+        "num_envs",
+        "vectorization_mode",
+        "vector_kwargs",
+        "wrappers",
+        FAILURE_PENALTY,
+        ALLOWED_MODULES,
+    }
+)
+_RGB_ARRAY = "rgb_array"
+# The one argument of gym.make, not of the constructor, that a sweep file may set.
+_MAKE_ARGS = frozenset({"max_episode_steps"})
+
+
+@dataclass(frozen=True)
+class EnvInfo:
+    """What is known of an environment before anything is trained on it."""
+
+    env_id: str
+    env_args: dict[str, Any] = field(hash=False)
+    observation_space: gym.Space[Any]
+    action_space: gym.Space[Any]
+    threshold: float | None
+    """Mean episode return from which it counts as solved; None if the env defines none."""
+    max_episode_steps: int | None
+    """Env steps after which an episode is truncated; None if it never is."""
+    has_vector_entry_point: bool
+    """Whether `make_vector_env` uses the env's own vectorised version."""
+    failure: FailureRule | None = None
+    """When its episodes end by failure; None: never, or it is not known."""
+
+    @property
+    def observes_images(self) -> bool:
+        """Whether observations are images, of shape (rows, columns, channels), and not vectors."""
+        return len(self.observation_space.shape or ()) == 3
+
+
+def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algorithm | None = None) -> EnvInfo:
+    """Make an environment, reset it and step it once, and check that an algorithm can train on it.
+
+    Args:
+        env_id: Gymnasium id.
+        env_args: Keyword arguments of its constructor; None: none.
+        algorithm: Check the action space for this one; None: for any.
+
+    Raises:
+        EnvError: The id is not registered, an argument is wrong, the env cannot be made, its spaces are of a kind
+            that the algorithm cannot take, or what it returns is not what Gymnasium asks for.
+    """
+    env = make_env(env_id, env_args)
+    try:
+        env_id, spec = find_env(env_id)
+        kwargs = dict(env_args or {})
+        wrappers = ObservationWrappers.take_from(kwargs)
+        info = EnvInfo(
+            env_id=env_id,
+            env_args=copy.deepcopy(dict(env_args or {})),
+            observation_space=env.observation_space,
+            action_space=env.action_space,
+            threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
+            max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
+            has_vector_entry_point=not wrappers.pixels and _takes_vector_entry_point(spec, kwargs),
+            failure=failure_rule(env_id, spec, env.metadata, kwargs),
+        )
+        _check_observation_space(info)
+        _check_action_space(info, algorithm)
+        check_first_step(env, info.env_id, info.env_args)
+    finally:
+        close_env(env)
+    return info
+
+
+def make_env(
+    env_id: str, env_args: Mapping[str, Any] | None = None, *, render_mode: str | None = None
+) -> gym.Env[Any, Any]:
+    """Make one environment, with its time limit and the wrappers that its arguments ask for.
+
+    Args:
+        env_id: Gymnasium id, or `module:Name`.
+        env_args: Keyword arguments of its constructor, and reserved keys of `env_wrappers`; None: none.
+        render_mode: As Gymnasium's; None: no rendering.
+
+    Raises:
+        EnvError: The id is not registered, an argument is wrong, or the constructor failed.
+    """
+    env_id, spec, kwargs, wrappers = _find(env_id, env_args)
+    if wrappers.pixels:
+        if render_mode not in (None, _RGB_ARRAY):
+            raise EnvError(f"{env_id} observes pixels, so it cannot have the render mode {render_mode!r}.", "Use none.")
+        render_mode = _prepare_pixels(env_id, spec)
+    if render_mode is not None:
+        kwargs["render_mode"] = render_mode
+    try:
+        with calls.inside(Call.CONSTRUCTOR):
+            # The passive checker only prints warnings, at each env made, and slows every step.
+            env = gym.make(spec, disable_env_checker=True, **kwargs)
+        return calls.watch_env(wrappers.wrap(env))
+    except BaseException as error:  # an env's constructor may raise anything
+        raise _cannot_make(env_id, env_args, error) from error
+
+
+def make_vector_env(
+    env_id: str, env_args: Mapping[str, Any] | None, num_envs: int, *, failure_penalty: float | None = None
+) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """Make a vector environment: the env's own vectorised version if it has one, else a loop over envs.
+
+    Both reset a sub-environment in the step after its episode ended (`AutoresetMode.NEXT_STEP`) and both have
+    the env's time limit. Which one is made is `EnvInfo.has_vector_entry_point`.
+
+    Args:
+        env_id: Gymnasium id, or `module:Name`.
+        env_args: As `make_env`.
+        num_envs: Number of sub-environments.
+        failure_penalty: Reward of steps that end by failure, for training alone: the outermost wrapper is then a
+            `FailurePenalty`. None: the env's own reward.
+
+    Raises:
+        EnvError: As `make_env`; or there is a penalty, and the env has no failure.
+    """
+    env_id, spec, kwargs, wrappers = _find(env_id, env_args)
+    # Before the render mode joins them.
+    own_args = dict(kwargs)
+    try:
+        with calls.inside(Call.CONSTRUCTOR):
+            if not wrappers.pixels and _takes_vector_entry_point(spec, kwargs):
+                env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+            else:
+                if wrappers.pixels:
+                    kwargs["render_mode"] = _prepare_pixels(env_id, spec)
+                env = gym.make_vec(
+                    spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
+                    wrappers=(wrappers.wrap_pixels, PlainSteps), **kwargs,
+                )  # fmt: skip
+        env = calls.watch_env(wrappers.wrap_vector(env))
+    except BaseException as error:  # an env's constructor may raise anything
+        raise _cannot_make(env_id, env_args, error) from error
+    if failure_penalty is None:
+        return env
+    inner: Any = env.unwrapped
+    scalar = inner.envs[0] if isinstance(inner, gym.vector.SyncVectorEnv) else _creator(env_id, spec)
+    rule = failure_rule(env_id, spec, getattr(scalar, "metadata", {}), own_args)
+    return FailurePenalty(env, check_failure_penalty(env_id, rule, failure_penalty), failure_penalty)
+
+
+def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec, dict[str, Any], ObservationWrappers]:
+    """The normalised id, what the env is made from, its constructor's arguments, and the wrappers around it."""
+    kwargs = copy.deepcopy(dict(env_args or {}))
+    with calls.inside(Call.IMPORT):
+        env_id, spec = find_env(env_id)
+        wrappers = ObservationWrappers.take_from(kwargs)
+        _check_args(env_id, spec, kwargs)
+    return env_id, spec, kwargs, wrappers
+
+
+def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
+    """The render mode that gives pixels.
+
+    Raises:
+        EnvError: The env does not have it.
+    """
+    draw_without_display()
+    modes = (getattr(_creator(env_id, spec), "metadata", None) or {}).get("render_modes")
+    if modes is not None and _RGB_ARRAY not in modes:
+        raise EnvError(
+            f"{env_id} has pixels: true, but cannot be drawn: it has no render mode {_RGB_ARRAY!r} "
+            f"(it has: {', '.join(map(str, modes)) or 'none'}).",
+            "Leave pixels out, or add the render mode to the env.",
+        )
+    return _RGB_ARRAY
+
+
+def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
+    """The env's class, or the function that makes it; None if the entry has none.
+
+    Raises:
+        EnvError: The env's module cannot be imported.
+    """
+    if isinstance(spec.entry_point, str):
+        try:
+            creator: Callable[..., Any] = load_env_creator(spec.entry_point)
+        except BaseException as error:  # importing an env's module may raise anything
+            raise _cannot_make(env_id, {}, error) from error
+        return creator
+    return spec.entry_point
+
+
+def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
+    """Refuse arguments that the constructor does not take, naming the nearest that it does."""
+    creator = _creator(env_id, spec)
+    takes_any = creator is None
+    known = set(_MAKE_ARGS)
+    if creator is not None:
+        parameters = inspect.signature(creator).parameters.values()
+        takes_any = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters)
+        known |= {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    known -= _RESERVED_ARGS
+    for name, value in env_args.items():
+        if name in _RESERVED_ARGS:
+            raise EnvError(
+                f"The env argument {name!r} (value {value!r}) cannot be set: it is chosen where the env is used.",
+                f"Remove {name!r} from the env's arguments.",
+            )
+        if name not in known and not takes_any:
+            close = difflib.get_close_matches(str(name), known, n=1)
+            did_you_mean = f" Did you mean {close[0]!r}?" if close else ""
+            raise EnvError(
+                f"{env_id} takes no argument {name!r} (value {value!r}).{did_you_mean}",
+                f"It takes: {', '.join(sorted(known))}.",
+            )
+    if "max_episode_steps" in env_args:
+        _check_limit(env_id, env_args["max_episode_steps"])
+
+
+def _check_limit(env_id: str, limit: Any) -> None:
+    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+        raise EnvError(
+            f"The env argument 'max_episode_steps' of {env_id} is {limit!r}; it must be a whole number >= 1.",
+            "Correct it, or leave it out to keep the env's own limit.",
+        )
+
+
+def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
+    """Whether the env has a vectorised version that accepts these arguments and its time limit, and resets as ours."""
+    # A vector entry point would leave out wrappers of the registry entry, and a time limit it does not take.
+    if spec.vector_entry_point is None or spec.additional_wrappers:
+        return False
+    kwargs = {**spec.kwargs, **env_args}
+    if spec.max_episode_steps is not None:
+        kwargs.setdefault("max_episode_steps", spec.max_episode_steps)
+    try:
+        entry_point = spec.vector_entry_point
+        creator = entry_point if callable(entry_point) else load_env_creator(entry_point)
+        inspect.signature(creator).bind(num_envs=1, **kwargs)
+        # A loop over envs resets as everybody here expects; the same name as a text is allowed too.
+        mode = (getattr(creator, "metadata", None) or {}).get("autoreset_mode", gym.vector.AutoresetMode.NEXT_STEP)
+        return bool(gym.vector.AutoresetMode(mode) is gym.vector.AutoresetMode.NEXT_STEP)
+    except (ImportError, AttributeError, TypeError, ValueError):
+        return False
+
+
+def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:
+    if not is_of_env(error):
+        raise error
+    if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
+        return error
+    detail = said_by(error) or "no message"
+    arguments = f" with arguments {dict(env_args)!r}" if env_args else ""
+    message = f"The environment {env_id!r} cannot be made{arguments}: {type(error).__name__}: {detail}."
+    if "box2d" in detail.lower():
+        # gymnasium[box2d] asks for a source build; this wheel holds the same module.
+        return EnvError(message, "Install it, on every machine that runs trials: pip install Box2D==2.3.10")
+    if isinstance(error, (ImportError, gym.error.DependencyNotInstalled)):
+        return EnvError(message, "Install the package that the message names, on every machine that runs trials.")
+    return EnvError(message, "Check the env's arguments against its documentation.")
+
+
+def _check_observation_space(info: EnvInfo) -> None:
+    space = info.observation_space
+    if not isinstance(space, gym.spaces.Box):
+        raise EnvError(
+            f"{info.env_id} has observations of kind {type(space).__name__} ({space}); only Box observations are "
+            "supported: vectors of numbers, and images.",
+            observation_hint(info.env_id, space),
+        )
+    if len(space.shape) not in (1, 3) or 0 in space.shape:
+        raise EnvError(
+            f"{info.env_id} has observations of shape {space.shape}; only vectors, of shape (n,), and images, of shape "
+            "(rows, columns, channels), are supported.",
+            observation_hint(info.env_id, space),
+        )
+    if not np.issubdtype(space.dtype, np.floating) and not (info.observes_images and space.dtype == np.uint8):
+        kinds = "bytes (uint8) and floating-point numbers" if info.observes_images else "floating-point observations"
+        raise EnvError(
+            f"{info.env_id} has {'images' if info.observes_images else 'observations'} of dtype {space.dtype}; only "
+            f"{kinds} are supported.",
+            f"{observation_hint(info.env_id, space)} Scale them to about [-1, 1] there, or set normalize_observations.",
+        )
+
+
+def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
+    space = info.action_space
+    if isinstance(space, gym.spaces.Discrete):
+        return
+    if not isinstance(space, gym.spaces.Box):
+        raise EnvError(
+            f"{info.env_id} has actions of kind {type(space).__name__} ({space}); only Discrete and 1-D Box "
+            "actions are supported.",
+            action_hint(info.env_id, space),
+        )
+    if algorithm == "dqn":
+        raise EnvError(
+            f"DQN cannot train on {info.env_id}: its actions are continuous ({space}), and DQN needs Discrete ones.",
+            "Use 'algorithm: ppo', or an env with Discrete actions.",
+        )
+    if len(space.shape) != 1 or space.shape[0] == 0 or not np.issubdtype(space.dtype, np.floating):
+        raise EnvError(
+            f"{info.env_id} has actions of shape {space.shape} and dtype {space.dtype}; only floating-point "
+            "Box actions of shape (n,) are supported.",
+            action_hint(info.env_id, space),
+        )

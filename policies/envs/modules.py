@@ -1,0 +1,208 @@
+"""Python modules of a user's own that may be imported by name: with environments, wrappers or RLModules in them.
+
+Importing a module runs its code, so a name in a sweep file or in a policy file is never enough. Who runs the sweep
+allows a module: by `--allow-module`, by `allow_modules`, by passing a class of it to a Python call, or with the
+environment variable TUNE_JOBS_ALLOWED_MODULES (names with commas between them), which other processes inherit. A
+package that is allowed brings its submodules.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from importlib.machinery import PathFinder
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from policies.arguments import checked
+from policies.envs.faults import is_of_env
+from policies.errors import SpecError, said_by
+
+ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
+_NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
+# Names of packages here that a user's own may have too; see tune_jobs/process/own_packages.py.
+_SHARED = ("policies", "analysis")
+
+_allowed: set[str] = set()
+
+
+@checked
+def allow_modules(names: Iterable[str]) -> None:
+    """Allow modules, for as long as this process lives.
+
+    Args:
+        names: Dotted names, such as `my_envs` or `my_package.envs`.
+
+    Raises:
+        SpecError: One of them is no module's name; none is allowed then.
+    """
+    wanted = tuple(names)
+    for name in wanted:
+        # A file's name has the form of a submodule's; nobody calls one `py`.
+        if not isinstance(name, str) or _NAME.fullmatch(name) is None or name.endswith(".py"):
+            raise SpecError(
+                f"{name!r} is not the name of a Python module, so it cannot be allowed.",
+                "Give the name that an import statement would: my_envs for the file my_envs.py.",
+            )
+    _allowed.update(wanted)
+
+
+@contextlib.contextmanager
+def allowed_again() -> Iterator[None]:
+    """Afterwards allow what is allowed now, and nothing that the block has: a sweep's modules are its own."""
+    before = set(_allowed)
+    try:
+        yield
+    finally:
+        _allowed.clear()
+        _allowed.update(before)
+
+
+def allowed_modules() -> tuple[str, ...]:
+    """The modules that are allowed in this process, sorted; those of the environment variable too."""
+    inherited = (name.strip() for name in os.environ.get(ENVIRONMENT_VARIABLE, "").split(","))
+    return tuple(sorted(_allowed.union(name for name in inherited if name)))
+
+
+def is_allowed(module: str) -> bool:
+    """Whether a module, or a package that it is in, is allowed."""
+    return any(module == name or module.startswith(f"{name}.") for name in allowed_modules())
+
+
+def module_folders() -> list[str]:
+    """The folders on this process's path that hold the allowed modules, for other processes' paths.
+
+    Those that this process has not imported are looked for, not imported.
+    """
+    found = []
+    for name in allowed_modules():
+        file, depth = _file_of(name)
+        if file is None:
+            continue
+        path = Path(file).absolute()
+        # Of a package, __file__ is its __init__.py.
+        place = path.parent if path.name == "__init__.py" else path
+        folder = str(place.parents[depth])
+        if folder in {os.path.abspath(entry) for entry in sys.path}:  # noqa: PTH100 (sys.path holds strings)
+            found.append(folder)
+    return list(dict.fromkeys(found))
+
+
+def _file_of(name: str) -> tuple[str | None, int]:
+    """The file (or the folder) of a module or of the package that it is in, and how many packages that is in."""
+    top = name.partition(".")[0]
+    # Of the module itself: two projects may share a package, as a user's own `policies` does with this one.
+    module: Any = sys.modules.get(name) or (None if top in _SHARED else sys.modules.get(top))
+    if module is not None:
+        file = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
+        return file, module.__name__.count(".")
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(name) if top in _SHARED else PathFinder.find_spec(top)
+    if spec is None:
+        return None, 0
+    return spec.origin or next(iter(spec.submodule_search_locations or ()), None), spec.name.count(".")
+
+
+def import_module_allowed(module: str) -> ModuleType:
+    """Import a module, if it is allowed.
+
+    It is looked for in the current folder too, after all other places: the `tune-jobs` command does not have that
+    folder on its path, as a script does.
+
+    Raises:
+        SpecError: The module is not allowed, is nowhere to be found, or raises an error.
+    """
+    if not is_allowed(module):
+        raise SpecError(
+            f"The Python module {module!r} is not allowed: importing it would run its code.",
+            f"If you trust it, allow it with --allow-module {module}, or in Python by passing the class itself; the "
+            f"environment variable {ENVIRONMENT_VARIABLE}={module} does the same.",
+        )
+    here = os.getcwd()  # noqa: PTH109 (sys.path holds strings)
+    if module in _SHARED and here not in sys.path:
+        # Found in any case, and asked for what the user's own has.
+        sys.path.append(here)
+    try:
+        try:
+            return importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            if not _is_part(error.name, module) or here in sys.path:
+                raise
+            sys.path.append(here)
+            importlib.invalidate_caches()
+            return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if not _is_part(error.name, module):
+            raise _failed(module, error) from error
+        raise SpecError(
+            f"The module {module!r} is allowed, but there is none: {error}.",
+            "Run the command in the folder that holds it, or add that folder to PYTHONPATH, on every machine that "
+            "runs trials.",
+        ) from error
+    except BaseException as error:  # a user's module may raise anything
+        if not is_of_env(error):
+            raise
+        raise _failed(module, error) from error
+
+
+def _is_part(missing: str | None, module: str) -> bool:
+    """Whether what is missing is the module itself or a package around it, not something that it imports."""
+    return missing is not None and (module == missing or module.startswith(f"{missing}."))
+
+
+def _failed(module: str, error: BaseException) -> SpecError:
+    return SpecError(
+        f"The module {module!r} cannot be imported: {type(error).__name__}: {said_by(error)}.",
+        f'Try `python -c "import {module}"`, and mend what it says.',
+    )
+
+
+def import_allowed(path: str) -> Any:
+    """What `module:Name` names, if the module is allowed.
+
+    Args:
+        path: A module's dotted name, a colon, and the name of something in it, such as a class.
+
+    Raises:
+        SpecError: The path is of another form, its module is not allowed or cannot be imported, or nothing in it has
+            that name.
+    """
+    module_name, _, name = path.partition(":")
+    if _NAME.fullmatch(module_name) is None or not name.isidentifier():
+        raise SpecError(f"{path!r} does not name something in a module.", "Write it as module:Name.")
+    module = import_module_allowed(module_name)
+    try:
+        return getattr(module, name)
+    except AttributeError as error:
+        raise SpecError(
+            f"The module {module_name!r} ({getattr(module, '__file__', 'built in')}) has nothing called {name!r}.",
+            "Correct the name, or define it there.",
+        ) from error
+
+
+def path_of(thing: type[Any], what: str) -> str:
+    """The `module:Name` under which other processes find a class; allows its module.
+
+    Args:
+        thing: A class that a Python call was given.
+        what: What it is, for messages.
+
+    Raises:
+        SpecError: It is defined in a script, a notebook or a function, where no other process finds it.
+    """
+    module, name = thing.__module__, thing.__qualname__
+    if module == "__main__" or getattr(sys.modules.get(module), name, None) is not thing:
+        where = "the main script" if module == "__main__" else f"a function or class of {module}"
+        raise SpecError(
+            f"The {what} {name} is defined in {where}, where the processes of trials cannot find it.",
+            "Move it to the top level of a module, such as my_envs.py next to the script, and import it from there.",
+        )
+    allow_modules([module])
+    return f"{module}:{name}"

@@ -1,0 +1,1 @@
+"""Environments outside of trials, in a child process that may hang or end without harm."""

@@ -1,0 +1,194 @@
+"""What runs in the guard's child: jobs, each a function of JSON that returns JSON; see `guard`."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from policies.envs import calls
+from policies.envs import faults as env_faults
+from policies.envs import modules as env_modules
+from policies.errors import EnvFailedError, TuneJobsError, said_by
+
+if TYPE_CHECKING:
+    from policies.acting.evaluate import Episodes
+    from policies.acting.policy import Policy
+
+_PARENT_LOOK_S = 1.0
+_PR_SET_PDEATHSIG = 1
+
+
+def main(parent: int, connection: int, page: int, dump: int) -> None:
+    """Do jobs until the parent closes the connection, or ends.
+
+    Args:
+        parent: Its process id.
+        connection: Descriptor of this end of the pipe to it.
+        page: Of the file that calls are told in.
+        dump: Of the file that the fault handler writes to.
+    """
+    _end_with(parent)
+    faulthandler.enable(dump)
+    faulthandler.register(signal.SIGUSR1, dump, all_threads=True)
+    # Standard output may be for one JSON document, and a log has room for what environments print.
+    with contextlib.suppress(OSError):
+        os.dup2(2, 1)
+    told = calls.Page(page)
+    calls.tell(told)
+    import policies.packed.envs.make  # noqa: F401 (every job needs this much, and the parent is busy yet)
+
+    # Then a KeyboardInterrupt that an env raises is told from one that came by a signal.
+    env_faults.note_signals()
+    pipe = Connection(connection)
+    while True:
+        try:
+            asked = json.loads(pipe.recv_bytes())
+        except (EOFError, OSError):
+            break
+        pipe.send_bytes(json.dumps(_answer(asked, told)).encode())
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent ends, whatever it is in then."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_LOOK_S)
+        os._exit(1)
+
+    if os.getppid() != parent:
+        os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _answer(asked: Mapping[str, Any], told: calls.Page) -> dict[str, Any]:
+    arguments = asked["arguments"]
+    try:
+        _see(asked)
+        return {"result": _JOBS[asked["job"]](**arguments)}
+    except BaseException as error:  # noqa: BLE001 (SystemExit, say: an env may raise anything)
+        said = {
+            "kind": type(error).__name__,
+            "message": said_by(error),
+            "hint": "",
+            "traceback": traceback.format_exc(),
+        }
+        if isinstance(error, TuneJobsError):
+            said |= {"message": error.message, "hint": error.hint}
+        elif not isinstance(error, Exception):
+            said |= {
+                "kind": EnvFailedError.__name__,
+                "message": f"{arguments['env_id']} raised {type(error).__name__} in {told.last_raised.phrase}: "
+                f"{said_by(error)}.",
+                "hint": "Mend the env: what goes wrong in it must be an Exception.",
+            }
+        return {"error": said}
+
+
+def _see(asked: Mapping[str, Any]) -> None:
+    """Let this process find what the parent does."""
+    env_modules.allow_modules(asked["modules"])
+    if os.getcwd() != asked["folders"][0]:  # noqa: PTH109
+        os.chdir(asked["folders"][0])
+    missing = [folder for folder in (*asked["folders"], *asked["module_folders"]) if folder not in sys.path]
+    sys.path[:0] = missing
+
+
+# -- jobs
+
+
+def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str, Any]:
+    """See `policies.envs.make.check_env`."""
+    from policies.envs.make import check_env as check
+    from policies.envs.spaces import describe_space
+
+    info = check(env_id, env_args, algorithm)
+    return {
+        "env_id": info.env_id,
+        "observation_space": describe_space(info.observation_space),
+        "action_space": describe_space(info.action_space),
+        "threshold": info.threshold,
+        "max_episode_steps": info.max_episode_steps,
+        "has_vector_entry_point": info.has_vector_entry_point,
+        "failure": None if info.failure is None else {"reward": info.failure.reward},
+    }
+
+
+def check_seedable(env_id: str, env_args: dict[str, Any]) -> None:
+    """See `policies.packed.envs.make.check_seedable`."""
+    from policies.packed.envs.make import check_seedable as check
+
+    check(env_id, env_args)
+
+
+def measure_step(env_id: str, env_args: dict[str, Any]) -> dict[str, Any]:
+    """See `policies.packed.envs.make.measure_step`."""
+    from policies.packed.envs.make import measure_step as measure
+
+    return vars(measure(env_id, env_args))
+
+
+def evaluate_policy(
+    env_id: str, env_args: dict[str, Any], policy: dict[str, str], seeds: Sequence[int], max_episode_steps: int | None
+) -> dict[str, Any]:
+    """See `policies.acting.evaluate.evaluate_policy`."""
+    from policies.acting.evaluate import evaluate_policy as evaluate
+
+    return vars(
+        evaluate(
+            _load(policy), env_id=env_id, env_args=env_args, seeds=seeds, max_episode_steps=max_episode_steps
+        )
+    )  # fmt: skip
+
+
+def record_video(env_id: str, policy: dict[str, str], files: dict[str, str | None], **options: Any) -> dict[str, Any]:
+    """See `policies.acting.video.record_video`."""
+    from policies.acting.video import record_video as record
+
+    return vars(record(_load(policy), env_id=env_id, **_paths(files), **options))
+
+
+def record_comparison(
+    env_id: str, left: dict[str, str], right: dict[str, str], files: dict[str, str], captions: Sequence[str],
+    **options: Any,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """See `policies.acting.video.record_comparison`."""
+    from policies.acting.video import record_comparison as record
+
+    one, other = captions
+    both: tuple[Episodes, Episodes] = record(
+        _load(left), _load(right), env_id=env_id, captions=(one, other), **_paths(files), **options
+    )
+    return [vars(episodes) for episodes in both]
+
+
+def _load(saved: Mapping[str, str]) -> Policy:
+    from policies.acting.policy import policy_from_portable
+    from policies.portable.file import read_policy
+
+    return calls.watch_policy(policy_from_portable(read_policy(Path(saved["folder"])), saved["description"]))
+
+
+def _paths(files: Mapping[str, str | None]) -> dict[str, Any]:
+    return {name: None if file is None else Path(file) for name, file in files.items()}
+
+
+_JOBS: dict[str, Callable[..., Any]] = {
+    job.__name__: job
+    for job in (check_env, check_seedable, measure_step, evaluate_policy, record_video, record_comparison)
+}

@@ -1,0 +1,345 @@
+"""The guard: a child process in which environments run outside of trials.
+
+An environment is somebody's code: it may hang, and it may end its process. In a trial, that is the trial's failure. In
+the plan, the confirmation and the films it would be the end of the process that drives the sweep. So these are done in
+a child, which is waited for while its calls (see `calls`) make progress. It sees what the processes of trials see: Ray
+gives them the working directory and the main script's folder, and PYTHONPATH what allowed modules need beside it.
+
+One child does the work of one call of the Python API or one command, from the plan to the films: its start costs less
+than half a second, and overlaps with whatever its parent does at that time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass
+from multiprocessing.connection import Pipe
+from pathlib import Path
+from typing import IO, Any, Self
+
+from policies.envs.calls import PAGE_BYTES, Call, Page
+from policies.envs.modules import ENVIRONMENT_VARIABLE, allowed_modules, module_folders
+from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
+from policies.files import absolute
+from policies.standard_streams import standard_streams
+
+CALL_TIMEOUT_S = 600.0
+"""How long one call may take, where no sweep says it."""
+_OWN_TIMEOUT_S = 600.0
+"""At least, for what is no user's code: an encoder that hangs, say."""
+_LOOK_S = 0.5
+"""Between two looks at the page, if nothing comes before."""
+_PATIENCE_S = 5.0
+"""How long the child may take to end by itself."""
+_TRACEBACK_S = 1.0
+_MAX_FRAMES = 8
+_PACKAGE = Path(__file__).parent
+# `-P`: nothing of the working directory can stand in for this package. The user's folders come later.
+_BOOTSTRAP = """\
+import sys
+sys.path.insert(0, {root!r})
+import policies
+del sys.path[0]
+from policies.guard.child import main
+main({parent}, {connection}, {page}, {dump})
+"""
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    """What a child has to be started anew for, if it differs."""
+
+    folders: tuple[str, ...]
+    """At the front of the path: the working directory, and the main script's folder."""
+    environment: tuple[str | None, ...]
+
+    @classmethod
+    def now(cls) -> _Surroundings:
+        folders = [str(absolute(Path()))]
+        script = os.path.dirname(os.path.realpath(sys.argv[0]))  # noqa: PTH120 (as Ray finds it)
+        if hasattr(sys.modules.get("__main__"), "__file__") and script in sys.path:
+            folders.append(script)
+        return cls(tuple(folders), tuple(os.environ.get(name) for name in ("PYTHONPATH", ENVIRONMENT_VARIABLE)))
+
+
+class _Child:
+    """A running child, and what is shared with it."""
+
+    def __init__(self, surroundings: _Surroundings) -> None:
+        self.surroundings = surroundings
+        self.modules: set[str] = set()
+        self.has_worked = False
+        with standard_streams():
+            self._begin()
+
+    def _begin(self) -> None:
+        self.connection, theirs = Pipe()
+        self._page_file: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (until `close`)
+        self._page_file.truncate(PAGE_BYTES)
+        self._dump: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        self.page = Page(self._page_file.fileno())
+        numbers = (theirs.fileno(), self._page_file.fileno(), self._dump.fileno())
+        code = _BOOTSTRAP.format(
+            root=str(_PACKAGE.parent), parent=os.getpid(), connection=numbers[0], page=numbers[1], dump=numbers[2]
+        )
+        try:
+            self.process = subprocess.Popen(  # noqa: S603 (this very Python)
+                [sys.executable, "-P", "-c", code],
+                stdin=subprocess.DEVNULL,
+                pass_fds=numbers,
+                # Ctrl-C in a terminal is for the parent, which ends the child.
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise CannotRunError(
+                f"No process can be started to run environments in ({sys.executable}): {error}.",
+                "See what limits the processes of this user, with `ulimit -u`.",
+            ) from error
+        finally:
+            theirs.close()
+
+    @property
+    def was_lost(self) -> bool:
+        """Whether it has ended though nobody had asked it anything: by the system, where memory is scarce, say.
+
+        One that could not even begin has not, and is to say so.
+        """
+        code = self.process.poll()
+        return code is not None and (self.has_worked or code < 0)
+
+    def frames(self) -> list[str]:
+        """Where the user's code is or was, innermost first, as Python's fault handler wrote it."""
+        self._dump.seek(0)
+        said = self._dump.read().decode("utf-8", errors="replace")
+        frames: list[str] = []
+        # Its main thread comes last; what is above it are others.
+        for line in said.rpartition("(most recent call first):")[2].splitlines():
+            place = line.strip()
+            if place.startswith(f'File "{_PACKAGE}'):
+                break
+            if place.startswith("File "):
+                frames.append(place)
+        if any("gymnasium" not in frame for frame in frames):
+            while "gymnasium" in frames[-1]:  # the wrappers that the call came through
+                frames.pop()
+        return frames[:_MAX_FRAMES]
+
+    def dump_frames(self) -> None:
+        """Let the fault handler write where it is; it needs no Python for that."""
+        with contextlib.suppress(OSError):
+            self.process.send_signal(signal.SIGUSR1)
+        end = time.monotonic() + _TRACEBACK_S
+        size = -1
+        while time.monotonic() < end and (size <= 0 or os.fstat(self._dump.fileno()).st_size > size):
+            size = os.fstat(self._dump.fileno()).st_size
+            time.sleep(0.05)
+
+    def close(self, *, patience_s: float) -> None:
+        self.connection.close()
+        try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(patience_s)
+        finally:
+            # Also where somebody is out of patience. The group: what the env started too.
+            with contextlib.suppress(OSError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+            self._page_file.close()
+            self._dump.close()
+
+
+class EnvGuard:
+    """Runs jobs in a child, one after another; a context manager.
+
+    The child is started by `start` or the first job, and again after one that hung or ended it.
+    """
+
+    def __init__(self) -> None:
+        self._child: _Child | None = None
+
+    def start(self) -> None:
+        """Start the child, if there is none, and do not wait for it."""
+        if self._child is None:
+            self._child = _Child(_Surroundings.now())
+
+    def close(self) -> None:
+        """End the child."""
+        if self._child is not None:
+            child, self._child = self._child, None
+            # Before its first job, there is nothing that it could leave behind.
+            child.close(patience_s=_PATIENCE_S if child.has_worked else 0.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def run(self, job: str, env_id: str, *, timeout_s: float = CALL_TIMEOUT_S, **arguments: Any) -> Any:
+        """Do a job in the child.
+
+        Args:
+            job: A function of `guard_process`.
+            env_id: Its environment.
+            timeout_s: How long one call of the user's code may take; the job may take longer.
+            arguments: What else the function takes, as JSON.
+
+        Returns:
+            What it returned, as JSON.
+
+        Raises:
+            EnvFailedError: The environment hung, or ended the process.
+            TuneJobsError: Whatever of these the function raised.
+        """
+        child = self._ready_child()
+        asked = {
+            "job": job,
+            "folders": child.surroundings.folders,
+            "modules": sorted(child.modules),
+            "module_folders": module_folders(),
+            "arguments": {"env_id": env_id, **arguments},
+        }
+        try:
+            # A child that has ended is found by what does not come back.
+            with contextlib.suppress(OSError):
+                child.connection.send_bytes(json.dumps(asked).encode())
+            answer = self._wait(child, env_id, timeout_s)
+        except BaseException:
+            # Also where this process is interrupted: whatever the child does, nobody waits for it any more.
+            self._child = None
+            child.close(patience_s=0.0)
+            raise
+        child.has_worked = True
+        if "error" in answer:
+            raise _error(answer["error"])
+        return answer["result"]
+
+    def _ready_child(self) -> _Child:
+        """A child that sees what this process would let it see now."""
+        modules = set(allowed_modules())
+        child = self._child
+        if child is not None and (
+            child.was_lost or child.surroundings != _Surroundings.now() or not child.modules <= modules
+        ):
+            self.close()
+        self.start()
+        assert self._child is not None
+        self._child.modules = modules
+        return self._child
+
+    def _wait(self, child: _Child, env_id: str, timeout_s: float) -> Any:
+        """Its answer, if it comes; time counts only while nothing is told."""
+        count, waited, before = child.page.count, 0.0, time.monotonic()
+        while True:
+            call = child.page.call
+            limit = timeout_s if call is not Call.NONE else max(timeout_s, _OWN_TIMEOUT_S)
+            try:
+                if child.connection.poll(max(0.01, min(_LOOK_S, limit - waited))):
+                    return json.loads(child.connection.recv_bytes())
+            except (EOFError, OSError):
+                raise _died(child, env_id) from None
+            # Where the env has processes of its own, these may hold the pipe open.
+            if child.process.poll() is not None and not child.connection.poll():
+                raise _died(child, env_id)
+            now = time.monotonic()
+            # However long this process itself was stopped, or did not get to run.
+            waited, before = waited + min(now - before, 2 * _LOOK_S), now
+            if child.page.count != count or child.page.call != call:
+                count, waited = child.page.count, 0.0
+            elif waited >= limit:
+                raise _hung(child, env_id, limit)
+
+
+def _hung(child: _Child, env_id: str, limit: float) -> EnvFailedError:
+    # Before the fault handler is asked: its signal may wake what waits.
+    where = _where(child.page)
+    child.dump_frames()
+    return EnvFailedError(
+        f"{env_id} hangs in {where}: nothing came back for {limit:g} s{_shown(child.frames())}",
+        "Mend what it waits for, or set iteration_timeout_s higher if one call may take so long.",
+    )
+
+
+def _died(child: _Child, env_id: str) -> TuneJobsError:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        child.process.wait(_PATIENCE_S)
+    code = child.process.returncode
+    how = "closed its connection" if code is None else f"ended with exit code {code}"
+    hint = "Mend the env: it must raise an error, not end the process that it runs in."
+    if child.page.call is Call.NONE:
+        hint = "See what it printed to standard error."
+    if code is not None and code < 0:
+        name, said = _signal_name(-code), (signal.strsignal(-code) or "").lower()
+        how = f"was ended by {name} ({said})" if said else f"was ended by {name}"
+        if -code == signal.SIGKILL:
+            hint = "Look at this machine's memory: the system ends processes that take too much."
+    return EnvFailedError(f"The process of {env_id} {how} in {_where(child.page)}{_shown(child.frames())}", hint)
+
+
+def _where(page: Page) -> str:
+    call = page.call
+    if call is Call.STEP and page.steps:
+        return f"{call.phrase}, step {page.steps} after reset()"
+    return call.phrase
+
+
+def _shown(frames: list[str]) -> str:
+    return ":\n" + "\n".join(f"  {frame}" for frame in frames) if frames else "."
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _error(told: dict[str, str]) -> Exception:
+    """What the child raised."""
+    # Some kinds are defined beside what raises them.
+    import policies.acting.policy  # noqa: F401
+
+    kinds = {kind.__name__: kind for kind in _kinds(TuneJobsError)}
+    error: Exception
+    if told["kind"] in kinds:
+        error = kinds[told["kind"]](told["message"], told["hint"])
+    else:
+        error = RuntimeError(f"{told['kind']}: {told['message']}")
+    error.add_note(told["traceback"])
+    return error
+
+
+def _kinds(kind: type[TuneJobsError]) -> Iterator[type[TuneJobsError]]:
+    yield kind
+    for further in kind.__subclasses__():
+        yield from _kinds(further)
+
+
+_current: ContextVar[EnvGuard | None] = ContextVar("guard", default=None)
+
+
+@contextlib.contextmanager
+def guarding(*, start: bool = False) -> Iterator[EnvGuard]:
+    """The guard of the block: the one that is open around it, else a new one.
+
+    Args:
+        start: Start its child at once, because it will be needed.
+    """
+    known = _current.get()
+    with contextlib.ExitStack() as stack:
+        guard = known
+        if guard is None:
+            guard = stack.enter_context(EnvGuard())
+            stack.callback(_current.reset, _current.set(guard))
+        if start:
+            guard.start()
+        yield guard

@@ -1,0 +1,208 @@
+"""What is done with environments outside of trials, in the guard's child: as its namesakes, from the outside.
+
+The functions take, return and raise what those of `envs`, `packed.envs`, `evaluate` and `video` do, and raise
+`EnvFailedError` where the environment hangs or ends its process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from policies.acting.baselines import ConstantPolicy, baseline_policy
+from policies.acting.evaluate import Episodes
+from policies.acting.policy import Policy, RandomPolicy, WeightsPolicy
+from policies.envs.failures import FailureRule
+from policies.envs.make import EnvInfo
+from policies.envs.spaces import space_from_description
+from policies.errors import EnvError
+from policies.files import write_atomic, write_plain
+from policies.guard.guard import CALL_TIMEOUT_S, guarding
+from policies.hyperparams import Algorithm, ConstantHyperparams, RandomHyperparams
+from policies.packed.envs.make import StepTime
+from policies.portable.file import PortablePolicy, save_policy
+
+
+def check_env(
+    env_id: str,
+    env_args: Mapping[str, Any] | None,
+    algorithm: Algorithm | None = None,
+    *,
+    timeout_s: float = CALL_TIMEOUT_S,
+) -> EnvInfo:
+    """See `envs.check_env`.
+
+    Args:
+        env_id: As there.
+        env_args: As there, as JSON.
+        algorithm: As there.
+        timeout_s: How long one call of the environment may take.
+    """
+    args = _as_json(env_id, env_args)
+    try:
+        with guarding() as guard:
+            told: dict[str, Any] = guard.run(
+                "check_env", env_id, env_args=args, algorithm=algorithm, timeout_s=timeout_s
+            )
+    except EnvError as error:
+        raise _told_better(env_id, error) from None
+    failure = told["failure"]
+    told |= {name: space_from_description(told[name]) for name in ("observation_space", "action_space")}
+    told |= {"env_args": args, "failure": None if failure is None else FailureRule(**failure)}
+    return EnvInfo(**told)
+
+
+def check_seedable(env_id: str, env_args: Mapping[str, Any] | None, *, timeout_s: float = CALL_TIMEOUT_S) -> None:
+    """See `packed.envs.check_seedable`; the arguments are those of `check_env`."""
+    with guarding() as guard:
+        guard.run("check_seedable", env_id, env_args=_as_json(env_id, env_args), timeout_s=timeout_s)
+
+
+def measure_step(env_id: str, env_args: Mapping[str, Any] | None, *, timeout_s: float = CALL_TIMEOUT_S) -> StepTime:
+    """See `packed.envs.measure_step`; the arguments are those of `check_env`."""
+    with guarding() as guard:
+        told = guard.run("measure_step", env_id, env_args=_as_json(env_id, env_args), timeout_s=timeout_s)
+    return StepTime(**told)
+
+
+def evaluate_policy(
+    policy: Policy,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seeds: Sequence[int],
+    max_episode_steps: int | None = None,
+    timeout_s: float = CALL_TIMEOUT_S,
+) -> Episodes:
+    """See `evaluate.evaluate_policy`; `timeout_s` is how long one call of the environment or policy may take."""
+    with guarding() as guard, _saved(policy) as (saved,):
+        told = guard.run(
+            "evaluate_policy", env_id, env_args=_as_json(env_id, env_args), policy=saved,
+            seeds=[int(seed) for seed in seeds], max_episode_steps=max_episode_steps, timeout_s=timeout_s,
+        )  # fmt: skip
+    return _episodes(told)
+
+
+def record_video(
+    policy: Policy,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seeds: int | Sequence[int],
+    mp4: Path | None = None,
+    gif: Path | None = None,
+    caption: str | None = None,
+    fps: float | None = None,
+    max_steps: int | None = None,
+    timeout_s: float = CALL_TIMEOUT_S,
+) -> Episodes:
+    """See `video.record_video`; `timeout_s` is how long one call of the environment or policy may take."""
+    filmed = [int(seeds)] if isinstance(seeds, int) else [int(seed) for seed in seeds]
+    with guarding() as guard, _saved(policy) as (saved,), _staged({"mp4": mp4, "gif": gif}) as files:
+        told = guard.run(
+            "record_video", env_id, env_args=_as_json(env_id, env_args), policy=saved, files=files, seeds=filmed,
+            caption=caption, fps=fps, max_steps=max_steps, timeout_s=timeout_s,
+        )  # fmt: skip
+    return _episodes(told)
+
+
+def record_comparison(
+    left: Policy,
+    right: Policy,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seed: int,
+    captions: tuple[str, str],
+    left_mp4: Path,
+    right_mp4: Path,
+    right_gif: Path,
+    both_mp4: Path,
+    max_steps: int | None = None,
+    timeout_s: float = CALL_TIMEOUT_S,
+) -> tuple[Episodes, Episodes]:
+    """See `video.record_comparison`; `timeout_s` is how long one call of the environment or policy may take."""
+    wanted: dict[str, Path | None] = {
+        "left_mp4": left_mp4, "right_mp4": right_mp4, "right_gif": right_gif, "both_mp4": both_mp4,
+    }  # fmt: skip
+    with guarding() as guard, _saved(left, right) as (one, other), _staged(wanted) as files:
+        first, second = guard.run(
+            "record_comparison", env_id, env_args=_as_json(env_id, env_args), left=one, right=other, files=files,
+            captions=captions, seed=seed, max_steps=max_steps, timeout_s=timeout_s,
+        )  # fmt: skip
+    return _episodes(first), _episodes(second)
+
+
+def _as_json(env_id: str, env_args: Mapping[str, Any] | None) -> dict[str, Any]:
+    try:
+        args: dict[str, Any] = json.loads(json.dumps(dict(env_args or {})))
+    except (TypeError, ValueError) as error:
+        raise EnvError(
+            f"The arguments of {env_id!r} are not such as a sweep file can hold: {error}.",
+            "Give numbers, texts, true, false, lists and mappings with texts as keys.",
+        ) from error
+    return args
+
+
+def _told_better(env_id: str, error: EnvError) -> EnvError:
+    """The error, or what is behind it: an id that this process has registered, and no other does."""
+    if not error.message.startswith("No environment ") or env_id.strip() not in gym.registry:
+        return error
+    return EnvError(
+        f"{env_id!r} is registered with Gymnasium in this process alone: the processes of trials do not have it.",
+        f"Call gymnasium.register in a module, such as my_envs.py, allow it, and name the env my_envs:{env_id}; or "
+        "give the env's class.",
+    )
+
+
+def _episodes(told: Mapping[str, Any]) -> Episodes:
+    return Episodes(**{name: tuple(values) for name, values in told.items()})
+
+
+@contextlib.contextmanager
+def _saved(*policies: Policy) -> Iterator[list[dict[str, str]]]:
+    """Policies in files, for as long as the block lasts."""
+    with tempfile.TemporaryDirectory(prefix="tune-jobs-policy-", ignore_cleanup_errors=True) as name:
+        saved = []
+        for number, policy in enumerate(policies):
+            folder = Path(name, str(number))
+            folder.mkdir()
+            save_policy(_portable(policy), folder, write=write_plain)
+            saved.append({"folder": str(folder), "description": policy.description})
+        yield saved
+
+
+def _portable(policy: Policy) -> PortablePolicy:
+    if isinstance(policy, WeightsPolicy):
+        return policy.portable
+    if isinstance(policy, ConstantPolicy):
+        values: RandomHyperparams = ConstantHyperparams(action=policy.action)
+    elif isinstance(policy, RandomPolicy):
+        values = RandomHyperparams()
+    else:
+        raise TypeError(f"A policy of kind {type(policy).__name__} cannot be saved in a file.")
+    return baseline_policy(
+        values,
+        env_id=policy.env_id,
+        env_args=dict(policy.env_args),
+        observation_space=policy.observation_space,
+        action_space=policy.action_space,
+    )
+
+
+@contextlib.contextmanager
+def _staged(files: Mapping[str, Path | None]) -> Iterator[dict[str, str | None]]:
+    """Other places for files, which come to theirs when the block ends well: half a film is left nowhere."""
+    with tempfile.TemporaryDirectory(prefix="tune-jobs-film-", ignore_cleanup_errors=True) as name:
+        staged = {key: None if path is None else Path(name, key + path.suffix) for key, path in files.items()}
+        yield {key: None if path is None else str(path) for key, path in staged.items()}
+        for key, path in files.items():
+            source = staged[key]
+            if path is not None and source is not None:
+                write_atomic(path, source.read_bytes())

@@ -1,0 +1,51 @@
+"""Epsilon-greedy exploration with the schedules of `DQNHyperparams`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from ray.rllib.core.columns import Columns
+from torch import Tensor
+
+from policies.networks.epsilon import EpsilonSchedule
+
+QF_PREDS = "qf_preds"
+"""RLlib's key of Q-values in the output of `compute_q_values`."""
+
+
+class EpsilonGreedy:
+    """Mixin for a DQN RLModule: draws a random action with the probability its schedule gives, else the greedy one.
+
+    `model_config["exploration"]` holds the schedule, as `EpsilonSchedule.as_config` gives it.
+    """
+
+    model_config: Any
+    _schedule: EpsilonSchedule | None = None
+
+    @property
+    def exploration_schedule(self) -> EpsilonSchedule:
+        """The schedule of this module."""
+        if self._schedule is None:
+            self._schedule = EpsilonSchedule(**self.model_config["exploration"])
+        return self._schedule
+
+    @property
+    def epsilon_unit(self) -> str:
+        """What `t` counts: env_step or episode."""
+        return self.exploration_schedule.unit
+
+    def _forward_exploration(self, batch: dict[str, Tensor], t: float = 0.0, **_: Any) -> dict[str, Tensor]:
+        """Actions for a batch of observations.
+
+        Args:
+            batch: Holds observations, shape (N, ...).
+            t: Env steps or episodes so far, in the schedule's unit.
+        """
+        q_values = self.compute_q_values(batch)[QF_PREDS]  # type: ignore[attr-defined]
+        actions = q_values.argmax(dim=-1)
+        epsilon = self.exploration_schedule.at(t)
+        if epsilon > 0.0:
+            random_actions = torch.randint(q_values.shape[-1], actions.shape, device=actions.device)
+            actions = torch.where(torch.rand(actions.shape, device=actions.device) < epsilon, random_actions, actions)
+        return {Columns.ACTIONS: actions}

@@ -1,0 +1,194 @@
+"""The torch layers of our RLModules: encoders, their first weights, and running statistics of observations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from policies.errors import SpecError
+from policies.portable.convolution import output_shape
+from policies.portable.file import Normalization
+
+OBSERVATION_CLIP = 10.0
+"""Normalised observations are clipped to -/+ this."""
+VARIANCE_EPSILON = 1e-8
+"""Added to a variance before its root is divided by."""
+
+_ACTIVATIONS: dict[str, type[nn.Module] | None] = {
+    "linear": None, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "elu": nn.ELU, "gelu": nn.GELU,
+}  # fmt: skip
+# Of the activations torch gives a gain for; the others are close to ReLU.
+_GAINS = {"linear": 1.0, "tanh": 5.0 / 3.0}
+
+
+class Encoder(nn.Module):
+    """Convolutions, if any, then dense layers; the activation after each.
+
+    Args:
+        observation_space: Shape (n,), or (height, width, channels) with convolutions.
+        hidden_sizes: Units of each dense layer.
+        activation: A name of `policies.hyperparams.ACTIVATIONS`.
+        conv_filters: (channels, kernel, stride) of each convolution, without padding; None: none.
+
+    Attributes:
+        conv: The convolutions, or None.
+        mlp: The dense layers.
+        num_features: Numbers an observation becomes.
+
+    Raises:
+        SpecError: Convolutions and observations do not go together.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        hidden_sizes: Sequence[int],
+        activation: str,
+        conv_filters: Sequence[tuple[int, int, int]] | None = None,
+    ) -> None:
+        super().__init__()
+        shape = observation_space.shape or ()
+        make = _ACTIVATIONS[activation]
+        self.conv = None
+        if conv_filters:
+            height, width, channels = output_shape(shape, conv_filters)
+            convolutions: list[nn.Module] = []
+            in_channels = shape[-1]
+            for out_channels, kernel, stride in conv_filters:
+                convolutions.append(nn.Conv2d(in_channels, out_channels, kernel, stride))
+                convolutions += [make()] if make is not None else []
+                in_channels = out_channels
+            self.conv = nn.Sequential(*convolutions)
+            size = height * width * channels
+        elif len(shape) == 1:
+            size = shape[0]
+        else:
+            raise SpecError(
+                f"The observations are of shape {shape}, and conv_filters is not set: only observations of shape (n,) "
+                "go into dense layers.",
+                "Set conv_filters, such as [[16, 8, 4], [32, 4, 2]], if they are images of (height, width, channels).",
+            )
+        dense: list[nn.Module] = []
+        for num_units in hidden_sizes:
+            dense.append(nn.Linear(size, num_units))
+            dense += [make()] if make is not None else []
+            size = num_units
+        self.mlp = nn.Sequential(*dense)
+        self.num_features = size
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Features, shape (B, num_features), of observations of shape (B, ...)."""
+        if self.conv is not None:
+            # Environments give (height, width, channels), torch wants the channels first.
+            observations = self.conv(observations.permute(0, 3, 1, 2)).flatten(1)
+        # Not by calling the modules: what torch does around each call costs as much as a small layer.
+        features = observations
+        for layer in self.mlp:
+            features = layer.forward(features)
+        return features
+
+
+def hidden_gain(activation: str) -> float:
+    """The factor by which orthogonal weights make up for what an activation takes (He et al. 2015; torch's values)."""
+    return _GAINS.get(activation, math.sqrt(2.0))
+
+
+def initialize(module: nn.Module, initializer: str, gain: float) -> None:
+    """Set the first weights of all linear and convolutional layers in a module.
+
+    Args:
+        module: Its other layers stay as they are.
+        initializer: torch (nothing is done), he_uniform (uniform within -/+ sqrt(6 / inputs), He et al. 2015), or
+            orthogonal (Saxe et al. 2014); biases become 0.
+        gain: Factor of orthogonal weights.
+    """
+    if initializer == "torch":
+        return
+    for layer in module.modules():
+        if isinstance(layer, (nn.Linear, nn.Conv2d)):
+            if initializer == "he_uniform":
+                nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+            else:
+                nn.init.orthogonal_(layer.weight, gain=gain)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
+
+class ObservationStatistics:
+    """Mixin for an RLModule: scales uint8 observations by 1/255 and, if asked to, normalises all.
+
+    `setup` must call `add_statistics`, the forward passes `prepare`. With `model_config["normalize_observations"]` the
+    running mean, variance and count are buffers of the module, and so travel with its weights: to env runners, into
+    checkpoints and portable policies. Networks of one module, a target network too, see the same statistics.
+    """
+
+    observation_space: gym.Space[Any]
+    model_config: Any
+    obs_mean: Tensor
+    obs_var: Tensor
+    obs_count: Tensor
+    _observation_scale: float = 1.0
+    _normalizes: bool = False
+
+    def add_statistics(self) -> None:
+        """Register the buffers, if observations are to be normalised."""
+        self._observation_scale = observation_scale(self.observation_space)
+        self._normalizes = bool(self.model_config.get("normalize_observations"))
+        if self._normalizes:
+            shape = self.observation_space.shape or ()
+            self.register_buffer("obs_mean", torch.zeros(shape))  # type: ignore[attr-defined]
+            self.register_buffer("obs_var", torch.ones(shape))  # type: ignore[attr-defined]
+            # A whole number, or RLlib would turn it into one of 24 bits on its way through a checkpoint.
+            self.register_buffer("obs_count", torch.zeros((), dtype=torch.int64))  # type: ignore[attr-defined]
+
+    def prepare(self, observations: Tensor) -> Tensor:
+        """What the networks see of observations of shape (B, ...)."""
+        if self._observation_scale != 1.0:
+            observations = observations.float() * self._observation_scale
+        if self._normalizes:
+            factor = torch.rsqrt(self.obs_var + VARIANCE_EPSILON)
+            observations = ((observations - self.obs_mean) * factor).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+        return observations
+
+    @torch.no_grad()
+    def update_observation_statistics(self, observations: Tensor | NDArray[Any]) -> None:
+        """Merge a batch into the statistics (Chan et al. 1979, the parallel variance); nothing if there are none.
+
+        For learners, after the updates of a phase: so a batch is trained with the statistics it was sampled with.
+
+        Args:
+            observations: As the env gave them, shape (B, ...).
+        """
+        num_new = len(observations)
+        if not self._normalizes or num_new == 0:
+            return
+        batch = torch.as_tensor(observations, device=self.obs_mean.device).double() * self._observation_scale
+        mean = batch.mean(dim=0)
+        count = int(self.obs_count)
+        total = count + num_new
+        delta = mean - self.obs_mean
+        squares = (
+            self.obs_var.double() * count + ((batch - mean) ** 2).sum(dim=0) + delta**2 * (count * num_new / total)
+        )
+        # In place: others hold on to these very tensors.
+        self.obs_mean.copy_(self.obs_mean.double() + delta * (num_new / total))
+        self.obs_var.copy_(squares / total)
+        self.obs_count.fill_(total)
+
+
+def observation_scale(space: gym.Space[Any]) -> float:
+    """What observations are multiplied by, first of all: 1/255 for images of bytes."""
+    return 1.0 / 255.0 if space.dtype == np.uint8 else 1.0
+
+
+def normalization_of(mean: NDArray[Any], variance: NDArray[Any]) -> Normalization:
+    """The statistics of `ObservationStatistics` as a portable policy holds them."""
+    std = np.sqrt(np.asarray(variance, dtype=np.float32) + np.float32(VARIANCE_EPSILON))
+    return Normalization(np.array(mean, dtype=np.float32), std, OBSERVATION_CLIP)

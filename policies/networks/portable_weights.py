@@ -1,0 +1,100 @@
+"""The greedy part of an RLModule's weights as a portable network; needs no ray."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.errors import CheckpointError
+from policies.hyperparams import PPOHyperparams, TrainedHyperparams
+from policies.networks.layers import normalization_of, observation_scale
+from policies.portable.file import ConvLayer, Layer, NetworkKind, Normalization, PolicyNetwork
+from policies.portable.network import conv_filters
+
+Weights = Mapping[str, NDArray[Any]]
+
+
+def network_from_weights(
+    weights: Weights, hyperparams: TrainedHyperparams, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+) -> PolicyNetwork:
+    """The greedy part of the weights of one of our RLModules as a chain of layers.
+
+    Args:
+        weights: State of a `policies.networks.rl_modules` module, numpy.
+        hyperparams: What the module was built from.
+        observation_space: The environment's.
+        action_space: The environment's.
+
+    Raises:
+        CheckpointError: The weights are not those of the network the hyperparameters describe.
+    """
+    if isinstance(hyperparams, PPOHyperparams):
+        # A shared encoder is called just that; separate ones are the actor's and the critic's.
+        encoder = "encoder.encoder" if hyperparams.vf_share_layers else "encoder.actor_encoder"
+        head = "pi"
+        kind: NetworkKind = "gaussian" if isinstance(action_space, gym.spaces.Box) else "categorical"
+    else:
+        # DQN's first head gives Q-values, or advantages where it is dueling: both have the same greedy action.
+        encoder, head, kind = "encoder", "af", "q_values"
+    # Layers with weights stand at every other place, the activations (none if linear) between them.
+    step = 1 if hyperparams.activation == "linear" else 2
+    filters = hyperparams.conv_filters or ()
+    conv = tuple(
+        ConvLayer(*_tensors(weights, f"{encoder}.conv.{position * step}"), stride, hyperparams.activation)
+        for position, (_, _, stride) in enumerate(filters)
+    )
+    layers = [
+        Layer(*_tensors(weights, f"{encoder}.mlp.{position * step}"), hyperparams.activation)
+        for position in range(len(hyperparams.hidden_sizes))
+    ]
+    layers.append(Layer(*_tensors(weights, head), "linear"))
+    network = PolicyNetwork(
+        kind=kind,
+        layers=tuple(layers),
+        conv=conv,
+        normalization=normalization_in(weights) if hyperparams.normalize_observations else None,
+        scale=observation_scale(observation_space),
+    )
+    _check_sizes(network, hyperparams, weights, encoder)
+    return network
+
+
+def _check_sizes(network: PolicyNetwork, hyperparams: TrainedHyperparams, weights: Weights, encoder: str) -> None:
+    """Check that the weights are those of the network the hyperparameters describe, and of no larger one."""
+    num_layers = sum(name.startswith(f"{encoder}.") and name.endswith(".weight") for name in weights)
+    filters = hyperparams.conv_filters or ()
+    pairs = {
+        "hidden layers": ([len(layer.bias) for layer in network.layers[:-1]], list(hyperparams.hidden_sizes)),
+        "convolutions": (conv_filters(network.conv), list(filters)),
+        "so many convolutions and hidden layers:": (num_layers, len(filters) + len(hyperparams.hidden_sizes)),
+        "normalised observations:": ("obs_mean" in weights, hyperparams.normalize_observations),
+    }
+    for what, (found, expected) in pairs.items():
+        if found != expected:
+            raise CheckpointError(
+                f"The network has {what} {found}, its hyperparameters say {expected}.",
+                "Report this: RLlib built another network than the one asked for.",
+            )
+
+
+def _tensors(weights: Weights, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Weight and bias of a layer."""
+    return _tensor(weights, f"{name}.weight"), _tensor(weights, f"{name}.bias")
+
+
+def _tensor(weights: Weights, name: str) -> NDArray[np.float32]:
+    if name not in weights:
+        raise CheckpointError(
+            f"The RLModule has no weights {name!r}; it has {sorted(weights)}.",
+            "Only the networks that tune-jobs builds can be made portable.",
+        )
+    return np.array(weights[name], dtype=np.float32)
+
+
+def normalization_in(weights: Weights) -> Normalization:
+    """The observation statistics among a module's weights."""
+    return normalization_of(_tensor(weights, "obs_mean"), _tensor(weights, "obs_var"))

@@ -1,0 +1,1 @@
+"""DQN of many members at once."""

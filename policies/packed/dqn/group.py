@@ -1,0 +1,200 @@
+"""Members of a pack whose DQN networks are computed together: acting, and the updates of a training phase.
+
+Shapes: M members, N sub-environments a member, B rows a batch, D numbers an observation, A actions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from policies.hyperparams import DQNHyperparams
+from policies.packed.dqn import loss as dqn
+from policies.packed.dqn.replay import Drawn, StackedReplay
+from policies.packed.member import TARGET_PREFIX, Member
+from policies.packed.networks import ActingNetworks
+from policies.packed.optimizers import StackedAdam, StackedOptimizer, StackedRMSprop, clip_by_global_norm
+from policies.packed.ppo.group import scheduled
+from policies.packed.rows import StackedRows
+from policies.packed.sampling import Observations
+
+Floats = NDArray[np.float32]
+
+
+class DQNGroup:
+    """M members with one activation and about the same layer sizes, whose updates are due at the same time.
+
+    Args:
+        members: Equal in everything that gives an update its shape.
+        num_inputs: Numbers of an observation.
+        num_actions: A.
+        replay: Where their batches are drawn.
+        device: Where the updates are computed; acting is on the CPU.
+
+    Attributes:
+        positions: Of the members in their stack.
+        learns: Whether updates of theirs are due.
+    """
+
+    def __init__(
+        self, members: Sequence[Member], num_inputs: int, num_actions: int, replay: StackedReplay, device: str
+    ) -> None:
+        self.members = members
+        self.positions: slice | NDArray[np.int64] = slice(0, 0)
+        self.learns = False
+        self._num_inputs, self._num_actions, self._device = num_inputs, num_actions, device
+        self._replay, self._slots = replay, replay.slots([member.member_id for member in members])
+        self._hyperparams = [cast("DQNHyperparams", member.hyperparams) for member in members]
+        self._rows = StackedRows(members, num_inputs, num_actions, device)
+        self._networks = self._rows.networks
+        self._targets: StackedRows | None = None
+        if self._hyperparams[0].target_network:
+            self._targets = StackedRows(members, num_inputs, num_actions, device, TARGET_PREFIX)
+        self._optimizer = self._make_optimizer()
+        self._rows.read_moments(self._optimizer)
+        self._acting = ActingNetworks(self._networks, len(members))
+        self._grad_clip = self._column(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
+        self._clips = any(item.grad_clip is not None for item in self._hyperparams)
+        self._tau = self._column(lambda item: item.tau)
+        self._copies = all(item.tau == 1.0 for item in self._hyperparams)
+        self._has_schedule = any(item.lr_final is not None for item in self._hyperparams)
+        self._normalizes = self._hyperparams[0].normalize_observations
+
+    def _column(self, value: Callable[[DQNHyperparams], float], dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=dtype)
+
+    def _make_optimizer(self) -> StackedOptimizer:
+        weights, epsilon = self._networks.weights, self._column(lambda item: item.optimizer_epsilon)
+        lr = self._column(lambda item: item.lr)
+        if self._hyperparams[0].optimizer == "adam":
+            return StackedAdam(
+                weights,
+                lr,
+                beta1=self._column(lambda item: item.adam_beta1, torch.float64),
+                beta2=self._column(lambda item: item.adam_beta2, torch.float64),
+                epsilon=epsilon,
+            )
+        return StackedRMSprop(
+            weights,
+            lr,
+            rho=self._column(lambda item: item.rmsprop_rho, torch.float64),
+            momentum=self._column(lambda item: item.rmsprop_momentum),
+            epsilon=epsilon,
+        )
+
+    def act(self, observations: Floats) -> Floats:
+        """Q-values or advantages, (M, N, A), of observations as the networks see them, (M, N, D)."""
+        return self._acting(observations)[..., : self._num_actions]
+
+    def learn(self, numbers: NDArray[np.float64], num_new_steps: int, *, wants_stats: bool) -> list[dict[str, float]]:
+        """Make the updates of one training phase.
+
+        Args:
+            numbers: Uniform in [0, 1), what the batches are drawn with, (updates, M, B).
+            num_new_steps: Env steps of each member since the last phase.
+            wants_stats: Whether to compute the numbers of the last update.
+
+        Returns:
+            For each member, numbers of the last update; empty if they are not wanted.
+        """
+        if self._has_schedule:
+            self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
+        num_updates = len(numbers)
+        observations = Observations(self.members, 1, normalizes=self._normalizes)
+        self._optimizer.begin(num_updates)
+        stats: list[dict[str, float]] = []
+        for number in range(num_updates):
+            drawn = self._replay.draw(self._slots, numbers[number])
+            is_last = wants_stats and number == num_updates - 1
+            stats = self._update(drawn, observations, wants_stats=is_last)
+            self._update_targets(num_new_steps * (1 - (number + 1) / num_updates))
+        for member in self.members:
+            member.num_updates += num_updates
+        self._acting.refresh()
+        return stats
+
+    def _lr(self, member: Member) -> float:
+        item = member.hyperparams
+        return scheduled(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
+
+    def _update(self, drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
+        first, num_inputs = self._hyperparams[0], self._num_inputs
+        rows = observations.prepare_rows(drawn.rows, num_inputs)
+        batch = torch.from_numpy(rows).to(self._device)
+        now, later = batch[..., : num_inputs + 1], batch[..., num_inputs + 1 : 2 * num_inputs + 2]
+        actions, rewards, discounts = batch[..., -3].long(), batch[..., -2], batch[..., -1]
+        weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
+        targets = rewards + discounts * self._next_values(later, uses_double_q=first.double_q)
+        loss = dqn.loss_gradient(self._networks.forward(now), actions, targets, weights, first)
+        self._networks.backward(loss.gradient)
+        norms = None
+        if self._clips:
+            norms = clip_by_global_norm(self._networks.gradients, self._grad_clip, 1)
+        self._optimizer.step(self._networks.gradients)
+        if drawn.indices is not None:
+            self._replay.set_priorities(self._slots, drawn.indices, loss.td_errors.cpu().numpy())
+        if not wants_stats:
+            return []
+        return self._stats(dqn.mean_loss(loss.td_errors, weights, first), loss.q_selected.mean(dim=1), norms)
+
+    def _next_values(self, later: Tensor, *, uses_double_q: bool) -> Tensor:
+        num_members = len(self.members)
+
+        def q_values(rows: StackedRows) -> Tensor:
+            return dqn.q_values(rows.networks.evaluate(later, 0, num_members), self._num_actions)
+
+        if self._targets is None:
+            return dqn.best_next_values(q_values(self._rows), None)
+        online = q_values(self._rows) if uses_double_q else None
+        return dqn.best_next_values(q_values(self._targets), online)
+
+    def _update_targets(self, num_steps_after: float) -> None:
+        """Move the target networks whose time it is; so many env steps of the phase come after this update."""
+        if self._targets is None:
+            return
+        due = []
+        for index, (member, item) in enumerate(zip(self.members, self._hyperparams, strict=True)):
+            interval = item.target_update_interval
+            if interval is not None:
+                by_episode = item.target_update_unit == "episode"
+                now = member.num_episodes if by_episode else member.num_env_steps - num_steps_after
+                if now - member.target_updates_at < interval:
+                    continue
+                member.target_updates_at = now
+            member.num_target_updates += 1
+            due.append(index)
+        if not due:
+            return
+        target, online = self._targets.networks.weights, self._networks.weights
+        if len(due) == len(self.members):
+            if self._copies:
+                target.copy_(online)
+            else:
+                target.lerp_(online, self._tau)
+        else:
+            rows = torch.tensor(due, device=self._device)
+            target[rows] = torch.lerp(target[rows], online[rows], self._tau[rows])
+
+    def _stats(self, losses: Tensor, q_means: Tensor, norms: Tensor | None) -> list[dict[str, float]]:
+        columns = {"total_loss": losses.tolist(), "q_mean": q_means.tolist(), "lr": self._optimizer.lr[:, 0].tolist()}
+        stats = [{name: values[index] for name, values in columns.items()} for index in range(len(self.members))]
+        if norms is not None:
+            for found, norm, item in zip(stats, norms[:, 0].tolist(), self._hyperparams, strict=True):
+                if item.grad_clip is not None:  # the others' is computed beside it
+                    found["gradient_norm"] = norm
+        return [{name: value for name, value in found.items() if math.isfinite(value)} for found in stats]
+
+    def write_back(self) -> None:
+        """Give the members their weights and moments as they are now."""
+        self._rows.write_back(self._optimizer)
+        for member, item in zip(self.members, self._hyperparams, strict=True):
+            if not item.rmsprop_momentum:  # the buffer is the last step itself, and nothing depends on it
+                member.moments.pop("momentum_buffer", None)
+        if self._targets is not None:
+            self._targets.write_back()

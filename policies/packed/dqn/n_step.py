@@ -1,0 +1,90 @@
+"""Steps of a pack's environments -> rows of its replay memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.hyperparams import DQNHyperparams
+from policies.packed.envs.make import Step
+from policies.replay import NStep, Transitions
+
+Floats = NDArray[np.float32]
+
+
+class StackedNStep:
+    """Makes transitions of every member's steps.
+
+    Args:
+        num_envs: Sub-environments of each member.
+        num_inputs: Numbers of an observation.
+        n_step: Steps of reward before bootstrapping; of all members.
+    """
+
+    def __init__(self, num_envs: int, num_inputs: int, n_step: int) -> None:
+        self._num_envs, self._num_inputs, self._n_step = num_envs, num_inputs, n_step
+        self._gamma: dict[str, float] = {}
+        self._waiting: dict[str, NStep] = {}
+
+    def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
+        """Its episodes begin."""
+        self._gamma[member_id] = hyperparams.gamma
+        self._waiting[member_id] = NStep(self._num_envs, self._n_step, hyperparams.gamma)
+
+    def remove_member(self, member_id: str) -> None:
+        """What waits for further rewards will not get them."""
+        del self._gamma[member_id], self._waiting[member_id]
+
+    def rows(
+        self, member_ids: Sequence[str], observations: Floats, actions: NDArray[np.int64], step: Step
+    ) -> Floats | list[Floats]:
+        """The rows that are complete after a vector step.
+
+        Args:
+            member_ids: In the order of the rows of the other arguments.
+            observations: That the actions answered, (S, D).
+            actions: (S,).
+            step: What they led to.
+
+        Returns:
+            (M, N, columns); or, where n_step is more than 1, one array of (K, columns) for each member.
+        """
+        if self._n_step > 1:
+            return self._by_member(member_ids, observations, actions, step)
+        num_inputs = self._num_inputs
+        gamma = np.repeat([self._gamma[name] for name in member_ids], self._num_envs)
+        rows = np.empty((len(actions), 2 * num_inputs + 5), dtype=np.float32)
+        rows[:, :num_inputs] = observations
+        rows[:, num_inputs + 1 : -4] = step.final_observations
+        rows[:, [num_inputs, -4]] = 1.0
+        rows[:, -3], rows[:, -2] = actions, step.rewards
+        rows[:, -1] = np.where(step.terminated, 0.0, gamma)
+        return rows.reshape(len(member_ids), self._num_envs, -1)
+
+    def _by_member(
+        self, member_ids: Sequence[str], observations: Floats, actions: NDArray[np.int64], step: Step
+    ) -> list[Floats]:
+        found = []
+        for index, name in enumerate(member_ids):
+            own = slice(index * self._num_envs, (index + 1) * self._num_envs)
+            columns = {
+                # Two rows: what was acted on, and what came of it before any reset.
+                "obs": np.stack([observations[own], step.final_observations[own]]),
+                "actions": actions[None, own],
+                "rewards": step.rewards[None, own],
+                "terminated": step.terminated[None, own],
+                "truncated": step.truncated[None, own],
+                "stepped": np.ones((1, self._num_envs), dtype=np.bool_),
+            }
+            found.append(self._as_rows(self._waiting[name].transitions(columns)))
+        return found
+
+    def _as_rows(self, transitions: Transitions) -> Floats:
+        num_inputs = self._num_inputs
+        rows = np.ones((len(transitions.actions), 2 * num_inputs + 5), dtype=np.float32)
+        rows[:, :num_inputs] = transitions.obs
+        rows[:, num_inputs + 1 : -4] = transitions.next_obs
+        rows[:, -3], rows[:, -2], rows[:, -1] = transitions.actions, transitions.rewards, transitions.discounts
+        return rows

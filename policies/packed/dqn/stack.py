@@ -1,0 +1,298 @@
+"""DQN of the members of a pack that share a tensor program: one vector of environments, batched updates.
+
+What an iteration does is what `policies.rllib.dqn_algorithm` does for one trial: phases of sampling, each followed by the
+updates that are due.
+
+Shapes: M members, T vector steps, N sub-environments a member, S = M * N rows, B rows a batch, D numbers an
+observation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.hyperparams import DQNHyperparams
+from policies.networks.epsilon import EpsilonSchedule
+from policies.packed.dqn.group import DQNGroup
+from policies.packed.dqn.n_step import StackedNStep
+from policies.packed.dqn.replay import StackedReplay, make_stacked_replay
+from policies.packed.envs.make import PackedEnvs, Step
+from policies.packed.member import Member, MemberStats, group_members
+from policies.packed.sampling import EpisodeTracker, Observations, merge_statistics
+
+Floats = NDArray[np.float32]
+
+_MAX_GROUP = 32
+"""Batches are smaller than PPO's, so more members fit a core's cache."""
+_NUMBERS_AT_ONCE = 65_536
+
+
+@dataclass(eq=False)
+class _Draws:
+    """What the members' actions and batches of some phases are drawn with."""
+
+    explores: Floats
+    """Uniform in [0, 1), (T, M, N): a random action where it is below epsilon."""
+    actions: NDArray[np.int64]
+    """The random actions, (T, M, N)."""
+    batches: NDArray[np.float64]
+    """Uniform in [0, 1), (phases, updates of a phase at most, M, B)."""
+
+
+class DQNStack:
+    """See `Stack`.
+
+    Args:
+        envs: Without members.
+        device: Of the updates.
+    """
+
+    def __init__(self, envs: PackedEnvs, device: str = "cpu") -> None:
+        self.envs, self._device = envs, device
+        self.members: list[Member] = []
+        self._groups: list[DQNGroup] = []
+        self._episodes = EpisodeTracker()
+        self._replay: StackedReplay | None = None
+        self._n_step: StackedNStep | None = None
+        self._stale, self._is_written = False, True
+        self._updates_per_phase = 0.0
+        # Env steps at which a restored member's replay memory is as full as it was when learning began.
+        self._refilled_at: dict[str, int] = {}
+        self._unlearned: list[Floats] = []
+        self._stats: dict[str, MemberStats] = {}
+        self._num_actions = int(cast("gym.spaces.Discrete[Any]", envs.action_space).n)
+        self._num_inputs = math.prod(envs.observation_space.shape or ())
+
+    def add(self, member: Member, env_seed: int) -> None:
+        """See `Stack.add`."""
+        hyperparams = cast("DQNHyperparams", member.hyperparams)
+        self.envs.add(member.member_id, env_seed)
+        self._write_back()
+        if self._replay is None or self._n_step is None:
+            self._replay = make_stacked_replay(hyperparams, self._num_inputs)
+            self._n_step = StackedNStep(self.envs.num_envs, self._num_inputs, hyperparams.n_step)
+        try:
+            self._replay.add_member(member.member_id, hyperparams)
+        except MemoryError:
+            self.envs.remove(member.member_id)
+            raise
+        self._n_step.add_member(member.member_id, hyperparams)
+        self._episodes.add(member.member_id, self.envs.num_envs)
+        if member.num_updates and hyperparams.replay != "none":
+            # Its memory is empty again. It gets as much as it had when learning began, without learning meanwhile.
+            num_steps = max(hyperparams.learning_starts, hyperparams.train_batch_size)
+            self._refilled_at[member.member_id] = member.num_env_steps + num_steps
+        self.members.append(member)
+        self._stale = True
+
+    def remove(self, member_id: str) -> Member:
+        """See `Stack.remove`."""
+        member = self.member(member_id)
+        assert self._replay is not None
+        assert self._n_step is not None
+        self.members.remove(member)
+        self.envs.remove(member_id)
+        self._episodes.remove(member_id)
+        self._replay.remove_member(member_id)
+        self._n_step.remove_member(member_id)
+        self._refilled_at.pop(member_id, None)
+        self._stale = True
+        return member
+
+    def member(self, member_id: str) -> Member:
+        """See `Stack.member`."""
+        self._write_back()
+        (member,) = (item for item in self.members if item.member_id == member_id)
+        return member
+
+    def _write_back(self) -> None:
+        if self._is_written:
+            return
+        for group in self._groups:
+            group.write_back()
+        self._is_written = True
+
+    def _regroup(self) -> None:
+        """Make the groups anew: of members that learn at the same time, whatever their place among the rows."""
+        self._write_back()
+        assert self._replay is not None
+        groups = group_members(
+            self.members,
+            _MAX_GROUP,
+            lambda item: (self._learns(item), self._num_updates(item), round(item.due, 6)),
+        )
+        places = {member.member_id: index for index, member in enumerate(self.members)}
+        self._groups = []
+        for members in groups:
+            group = DQNGroup(members, self._num_inputs, self._num_actions, self._replay, self._device)
+            indices = np.array([places[member.member_id] for member in members], dtype=np.int64)
+            is_run = bool(np.all(np.diff(indices) == 1))
+            group.positions = slice(int(indices[0]), int(indices[-1]) + 1) if is_run else indices
+            group.learns = self._learns(members[0])
+            self._groups.append(group)
+
+    def _arrange(self) -> None:
+        """Put members that are computed together side by side; between iterations alone."""
+        self._write_back()
+        self.members = [member for group in group_members(self.members) for member in group]
+        self._ids = [member.member_id for member in self.members]
+        self.envs.arrange(self._ids)
+        first = cast("DQNHyperparams", self.members[0].hyperparams)
+        self._normalizes = first.normalize_observations
+        self._updates_per_phase = _steps_per_phase(first) * self.envs.num_envs * first.updates_per_env_step
+        self._schedules = [EpsilonSchedule.of(cast("DQNHyperparams", item.hyperparams)) for item in self.members]
+        self._observations = Observations(self.members, self.envs.num_envs, normalizes=self._normalizes)
+        self._regroup()
+        self._stale = False
+
+    def _learns(self, member: Member) -> bool:
+        """Whether updates of a member are due."""
+        assert self._replay is not None
+        hyperparams = cast("DQNHyperparams", member.hyperparams)
+        if member.num_env_steps < self._refilled_at.get(member.member_id, 0):
+            return False
+        (size,) = self._replay.sizes(self._replay.slots([member.member_id]))
+        return member.num_env_steps >= hyperparams.learning_starts and bool(size >= hyperparams.train_batch_size)
+
+    def _num_updates(self, member: Member) -> int:
+        """Updates of a member in a training phase now; 10 x 0.1 is a little less than 1 in binary."""
+        return math.floor(member.due + self._updates_per_phase + 1e-9)
+
+    def _is_mixed(self, group: DQNGroup) -> bool:
+        """Whether updates are due to some members of a group and not to others: sums of fractions drift apart."""
+        if not group.learns:
+            return any(map(self._learns, group.members))
+        return len(set(map(self._num_updates, group.members))) > 1
+
+    def train_iteration(self) -> dict[str, MemberStats]:
+        """See `Stack.train_iteration`."""
+        self.begin_iteration()
+        return self.finish_iteration()
+
+    def begin_iteration(self) -> None:
+        """See `Stack.begin_iteration`: all of it, since sampling waits for the updates of every phase."""
+        if self._stale:
+            self._arrange()
+        first = cast("DQNHyperparams", self.members[0].hyperparams)
+        num_envs, updates_per_phase = self.envs.num_envs, self._updates_per_phase
+        steps_per_phase = _steps_per_phase(first)
+        new_steps = steps_per_phase * num_envs
+        num_phases = math.ceil(first.env_steps_per_iteration / new_steps)
+        at_once = max(1, _NUMBERS_AT_ONCE // ((math.floor(updates_per_phase) + 1) * first.train_batch_size))
+        stats: dict[str, dict[str, float]] = {}
+        rewards, ended = [], []
+        self.envs.begin(num_phases * steps_per_phase)
+        for start in range(0, num_phases, at_once):
+            draws = self._draw(min(at_once, num_phases - start), steps_per_phase, updates_per_phase)
+            for phase in range(start, min(start + at_once, num_phases)):
+                for number in range(steps_per_phase):
+                    step = self._sample(draws, (phase - start) * steps_per_phase + number)
+                    rewards.append(step.own_rewards)
+                    ended.append(step.terminated | step.truncated)
+                # Updates may be rarer than phases: the numbers of the last that is made are wanted.
+                is_late = (num_phases - phase - 1) * updates_per_phase <= 1.0
+                self._learn(draws, phase - start, new_steps, stats if is_late else None)
+        episodes = self._episodes.follow(self._ids, np.stack(rewards), np.stack(ended))
+        for member in self.members:
+            member.num_iterations += 1
+        self._stats = {
+            member.member_id: MemberStats(member.num_env_steps, found, stats.get(member.member_id, {}))
+            for member, found in zip(self.members, episodes, strict=True)
+        }
+
+    def finish_iteration(self) -> dict[str, MemberStats]:
+        """See `Stack.finish_iteration`."""
+        return self._stats
+
+    def _draw(self, num_phases: int, steps_per_phase: int, updates_per_phase: float) -> _Draws:
+        """Each member's numbers for some phases, in an order that does not depend on the members beside it."""
+        num_members, num_envs = len(self.members), self.envs.num_envs
+        num_steps = num_phases * steps_per_phase
+        first = cast("DQNHyperparams", self.members[0].hyperparams)
+        most = math.floor(updates_per_phase) + 1
+        draws = _Draws(
+            np.empty((num_steps, num_members, num_envs), dtype=np.float32),
+            np.empty((num_steps, num_members, num_envs), dtype=np.int64),
+            np.empty((num_phases, most, num_members, first.train_batch_size)),
+        )
+        for index, member in enumerate(self.members):
+            draws.explores[:, index] = member.rng.random((num_steps, num_envs), dtype=np.float32)
+            draws.actions[:, index] = member.rng.integers(0, self._num_actions, (num_steps, num_envs))
+            if first.replay != "none":
+                draws.batches[:, :, index] = member.rng.random((num_phases, most, first.train_batch_size))
+        return draws
+
+    def _sample(self, draws: _Draws, number: int) -> Step:
+        """One vector step, with its transitions put into the replay memory."""
+        assert self._replay is not None
+        assert self._n_step is not None
+        num_members, num_envs = len(self.members), self.envs.num_envs
+        observations = self.envs.observations
+        seen = self._observations.prepare(observations)
+        outputs = np.empty((num_members, num_envs, self._num_actions), dtype=np.float32)
+        for group in self._groups:
+            outputs[group.positions] = group.act(seen[group.positions])
+        epsilon = [
+            schedule.at(member.num_episodes if schedule.unit == "episode" else member.num_env_steps)
+            for schedule, member in zip(self._schedules, self.members, strict=True)
+        ]
+        explores = draws.explores[number] < np.array(epsilon, dtype=np.float32)[:, None]
+        actions = np.where(explores, draws.actions[number], outputs.argmax(axis=-1)).reshape(-1)
+        step = self.envs.step(actions)
+        rows = self._n_step.rows(self._ids, observations, actions, step)
+        if isinstance(rows, list):
+            for name, own in zip(self._ids, rows, strict=True):
+                if len(own):
+                    self._replay.add(self._replay.slots([name]), own[None])
+        else:
+            self._replay.add(self._replay.slots(self._ids), rows)
+        ended = step.terminated | step.truncated
+        counts = ended.reshape(num_members, num_envs).sum(axis=1).tolist() if ended.any() else [0] * num_members
+        for member, count in zip(self.members, counts, strict=True):
+            member.num_env_steps += num_envs
+            member.num_episodes += count
+        if self._normalizes:
+            self._unlearned.append(observations)
+        return step
+
+    def _learn(self, draws: _Draws, phase: int, new_steps: int, stats: dict[str, dict[str, float]] | None) -> None:
+        """The training phase of every member that learns."""
+        if any(map(self._is_mixed, self._groups)):
+            self._regroup()
+        for group in self._groups:
+            if not group.learns:
+                continue
+            num_updates = self._num_updates(group.members[0])
+            for member in group.members:
+                member.due = member.due + self._updates_per_phase - num_updates
+            if not num_updates:
+                continue
+            self._is_written = False
+            numbers = draws.batches[phase, :num_updates][:, group.positions]
+            found = group.learn(numbers, new_steps, wants_stats=stats is not None)
+            if stats is not None:
+                stats.update(zip((member.member_id for member in group.members), found, strict=True))
+        self._learn_statistics()
+
+    def _learn_statistics(self) -> None:
+        """Merge what was observed in the phase into the statistics, if observations are normalised."""
+        if not self._normalizes:
+            return
+        rows = np.stack(self._unlearned).reshape(len(self._unlearned), len(self.members), -1, self._num_inputs)
+        self._unlearned = []
+        for index, member in enumerate(self.members):
+            # A refilling member's are in its checkpoint's statistics already, as far as its policy goes on as it did.
+            if member.num_env_steps > self._refilled_at.get(member.member_id, 0):
+                merge_statistics(member, rows[:, index].reshape(-1, self._num_inputs))
+        self._observations = Observations(self.members, self.envs.num_envs, normalizes=True)
+
+
+def _steps_per_phase(hyperparams: DQNHyperparams) -> int:
+    """Vector steps between two training phases."""
+    return math.ceil(hyperparams.train_freq / hyperparams.num_envs)

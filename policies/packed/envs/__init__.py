@@ -1,0 +1,1 @@
+"""The environments of all members of a pack as one vector."""

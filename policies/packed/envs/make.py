@@ -1,0 +1,316 @@
+"""Environments of many trials at once.
+
+Words: a *pack* trains several trials in one process; each of them is a *member*, named by its trial id. A *row* is one
+sub-environment: member m of a pack owns the rows m * N to (m + 1) * N, where N is the number of each member's
+sub-environments. M is the number of members.
+
+Where an episode ends, the next one begins in the same step: every step is a transition, none of them only resets. What
+a member gets depends on its seed and its actions alone, to the last bit, and not on the members beside it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Literal, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.envs.checked import reward_as_number
+from policies.envs.make import make_env
+from policies.errors import EnvError
+
+EnvKind = Literal["vectorised", "scalar", "processes"]
+
+_SLOW_STEP_US = 1000.0
+"""From here on a step is worth a message to another process."""
+_TIMED_STEPS = 200
+_TIMED_S = 0.15
+_CUT = 20  # the reset without a seed must be repeatable too, also of envs with long episodes
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a step gave; arrays over all rows, which no later step changes."""
+
+    observations: NDArray[Any]
+    """After the step; where an episode ended, the first of the next one. Shape (M * N, ...)."""
+    final_observations: NDArray[Any]
+    """As the step left them, before any reset; the same array object if no episode ended."""
+    rewards: NDArray[np.float32]
+    """What the learner sees: with the failure penalty, if there is one."""
+    own_rewards: NDArray[np.float32]
+    """The env's own, of which returns are made; the same array object if there is no penalty."""
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+class PackedEnvs(Protocol):
+    """One vector of sub-environments for all members of a pack."""
+
+    @property
+    def num_envs(self) -> int:
+        """Sub-environments of each member: N."""
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """Of one sub-environment."""
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """Of one sub-environment."""
+
+    @property
+    def member_ids(self) -> tuple[str, ...]:
+        """In the order of their rows."""
+
+    @property
+    def observations(self) -> NDArray[Any]:
+        """Those that the next actions answer, shape (M * N, ...): float32, or uint8 where images are."""
+
+    @property
+    def errors(self) -> dict[str, Exception]:
+        """Members whose env raised, by id: the `EnvError`. Their rows are zeros from that step on."""
+
+    def add(self, member_id: str, seed: int) -> None:
+        """A further member, after all others, its sub-environments reset from its seed.
+
+        Raises:
+            EnvError: Its environments cannot be made or reset; it is no member then.
+        """
+
+    def remove(self, member_id: str) -> None:
+        """Close a member's sub-environments; the rows after it move up."""
+
+    def arrange(self, member_ids: Sequence[str]) -> None:
+        """Put the members into this order; their running episodes go on."""
+
+    def begin(self, num_steps: int) -> None:
+        """Say that so many steps come next, so that start states can be drawn ahead of them."""
+
+    def step(self, actions: NDArray[Any]) -> Step:
+        """Step every row.
+
+        Args:
+            actions: Of shape (M * N,), whole numbers from 0 (the start of a Discrete space is added here), or
+                (M * N, action_dim), within the bounds of the Box space.
+        """
+
+    def close(self) -> None:
+        """Close all environments; nothing after it."""
+
+
+@dataclass(frozen=True)
+class StepTime:
+    """What was measured of an environment."""
+
+    us: float | None
+    """Microseconds of one env step, the resets after episodes' ends with it; None: it has raised before."""
+    is_vectorised: bool = False
+    """Whether one object steps all of a pack's environments at once."""
+
+
+@dataclass(frozen=True)
+class EnvChoice:
+    """How a pack's environments are stepped, and why."""
+
+    kind: EnvKind
+    step_us: float | None
+    """See `StepTime.us`."""
+    why: str
+    """A phrase for the plan."""
+
+
+def make_packed_envs(
+    env_id: str,
+    env_args: Mapping[str, Any] | None,
+    num_envs: int,
+    *,
+    failure_penalty: float | None = None,
+    kind: EnvKind,
+    num_processes: int = 0,
+) -> PackedEnvs:
+    """Environments for a pack that has no members yet.
+
+    Args:
+        env_id: Gymnasium id, or `module:Name`.
+        env_args: As `policies.envs.make.make_env` takes them.
+        num_envs: Sub-environments of each member.
+        failure_penalty: Reward of steps that end by failure, for training alone; None: the env's own reward.
+        kind: `vectorised`: CartPole alone, all members in one object. `scalar`: any environment, one sub-environment
+            after the other. `processes`: as scalar, in child processes.
+        num_processes: Of the kind `processes`: how many, at least 1.
+
+    Raises:
+        EnvError: The environment cannot be made, is not one of that kind, or there is a penalty and it has no failure.
+    """
+    from policies.packed.envs.cartpole import CartPoleEnvs  # they take `Step` from here
+    from policies.packed.envs.scalar import ScalarEnvs
+
+    if kind == "vectorised":
+        return CartPoleEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty)
+    num_processes = max(1, num_processes) if kind == "processes" else 0
+    return ScalarEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty, num_processes=num_processes)
+
+
+def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
+    """Measure how long a step of an environment takes in a pack.
+
+    Raises:
+        EnvError: The environment cannot be made.
+    """
+    from policies.packed.envs.cartpole import CartPoleRows
+
+    if (rows := CartPoleRows.make(env_id, env_args)) is not None:
+        rows.close()
+        return StepTime(_vectorised_step_us(env_id, env_args), is_vectorised=True)
+    return StepTime(_scalar_step_us(env_id, env_args))
+
+
+def choose_kind(step: StepTime, *, spare_cpus: int, why_none: str = "no CPU is idle") -> EnvChoice:
+    """How to step an environment for a pack: all at once if it can be, in processes if it is slow and CPUs are idle.
+
+    Args:
+        step: As `measure_step` found it.
+        spare_cpus: CPUs that nothing else would use.
+        why_none: Why there are none, if so.
+    """
+    if step.is_vectorised:
+        return EnvChoice("vectorised", step.us, "one object steps them all at once")
+    if step.us is None:
+        return EnvChoice("scalar", None, "no step could be measured")
+    took = f"a step takes {step.us / 1000:.1f} ms" if step.us >= 1000 else f"a step takes {step.us:.0f} us"
+    if step.us <= _SLOW_STEP_US:
+        return EnvChoice("scalar", step.us, took)
+    if spare_cpus < 1:
+        return EnvChoice("scalar", step.us, f"{took}, but {why_none}")
+    idle = "one CPU" if spare_cpus == 1 else f"{spare_cpus} CPUs"
+    return EnvChoice("processes", step.us, f"{took}, and {idle} would be idle")
+
+
+def check_seedable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
+    """Refuse an environment whose steps do not follow from the seed of its first reset and its actions.
+
+    In a pack, a trial could not be repeated then: what it gets would depend on the trials beside it. An env that raises
+    is left to the trial that it happens to.
+
+    Raises:
+        EnvError: The environment cannot be made, or its observations, rewards or ends differ from one time to the next.
+    """
+    alone = list(_trace(env_id, env_args, 0, seconds=_TIMED_S, cut=_CUT))
+    difference = _difference(alone, _beside_another(env_id, env_args, len(alone)))
+    if difference is None:
+        return
+    again = _difference(alone, list(islice(_trace(env_id, env_args, 0, cut=_CUT), len(alone))))
+    if again is not None:
+        raise EnvError(
+            f"{env_id} cannot be seeded, so its trials cannot be packed: after reset(seed=0) and with the same actions "
+            f"{again}.",
+            "Let it draw all random numbers from self.np_random, which reset(seed=...) seeds; or set engine: rllib.",
+        )
+    raise EnvError(
+        f"{env_id} depends on other environments in the same process, so its trials cannot be packed: after "
+        f"reset(seed=0) and with the same actions, but with another copy beside it, {difference}.",
+        "Let each copy keep its own state and draw from self.np_random, not from generators that all share; or set "
+        "engine: rllib.",
+    )
+
+
+def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float:
+    num_envs, num_steps = 64, 50
+    envs = make_packed_envs(env_id, env_args, num_envs, kind="vectorised")
+    envs.add("", 0)
+    actions = np.random.default_rng(0).integers(0, 2, (num_steps, num_envs))
+    envs.step(actions[0])
+    begin = time.perf_counter()
+    envs.begin(num_steps)
+    for row in actions:
+        envs.step(row)
+    seconds = time.perf_counter() - begin
+    envs.close()
+    return 1e6 * seconds / (num_steps * num_envs)
+
+
+def _scalar_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float | None:
+    """Of steps with random actions; the first, which may load things, counts only where it is the only one."""
+    moments = [time.perf_counter() for _ in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
+    if len(moments) == 2:
+        return 1e6 * (moments[1] - moments[0])
+    return 1e6 * (moments[-1] - moments[1]) / (len(moments) - 2) if len(moments) > 2 else None
+
+
+class _Seen(NamedTuple):
+    """What an environment gave."""
+
+    num_steps: int
+    observation: Any
+    reward: float = 0.0
+    terminated: bool = False
+    truncated: bool = False
+    first: Any = None
+    """The next episode's first observation, if this one is over."""
+
+
+def _trace(
+    env_id: str, env_args: Mapping[str, Any] | None, seed: int, *, seconds: float = math.inf, cut: int | None = None
+) -> Iterator[_Seen]:
+    """What an environment gives to random actions, equal ones for equal seeds, until it raises an error.
+
+    Args:
+        env_id: As `policies.envs.make.make_env`.
+        env_args: The same.
+        seed: Of the first reset, and of the actions.
+        seconds: No further step after these.
+        cut: Steps after which an episode that still runs is left for the next; None: no such cut.
+    """
+    env = make_env(env_id, env_args)
+    space = copy.deepcopy(env.action_space)  # the env may draw from its own
+    space.seed(seed)
+    actions = [space.sample() for _ in range(_TIMED_STEPS)]
+    actions = [action.item() if isinstance(action, np.generic) else action for action in actions]
+    deadline = time.perf_counter() + seconds
+    # Whatever it raises is the business of the trial that it happens to.
+    with contextlib.suppress(Exception), contextlib.closing(env):
+        yield _Seen(0, np.array(env.reset(seed=seed)[0]))
+        for num_steps, action in enumerate(actions, start=1):
+            observation, reward, terminated, truncated, _ = env.step(action)
+            seen = _Seen(num_steps, np.array(observation), reward_as_number(reward), bool(terminated), bool(truncated))
+            if terminated or truncated or num_steps == cut:
+                seen = seen._replace(first=np.array(env.reset()[0]))
+            yield seen
+            if time.perf_counter() > deadline:
+                break
+
+
+def _beside_another(env_id: str, env_args: Mapping[str, Any] | None, num: int) -> list[_Seen]:
+    """The same as from an environment alone, but with another one, of another seed, that steps in between."""
+    ours, other = (_trace(env_id, env_args, seed, cut=_CUT) for seed in (0, 1))
+    seen = []
+    for _, one in zip(range(num), ours, strict=False):
+        seen.append(one)
+        next(other, None)
+    return seen
+
+
+def _difference(one: Sequence[_Seen], another: Sequence[_Seen]) -> str | None:
+    """The first difference of two traces in words; None if there is none."""
+    for left, right in zip(one, another, strict=False):
+        when = f"after {left.num_steps} step{'' if left.num_steps == 1 else 's'}" if left.num_steps else "at first"
+        for name in _Seen._fields[1:]:
+            ours, theirs = (np.asarray(getattr(seen, name), dtype=np.float64) for seen in (left, right))
+            what = "next episode's first observation" if name == "first" else name
+            if ours.shape != theirs.shape:
+                return f"the {what} {when} is of shape {ours.shape} one time and {theirs.shape} another"
+            different = np.flatnonzero((ours != theirs) & ~(np.isnan(ours) & np.isnan(theirs)))
+            if different.size:
+                values = [float(array.flat[different[0]]) for array in (ours, theirs)]
+                place = f" (number {different[0]} of it)" if ours.ndim else ""
+                return f"the {what} {when}{place} is {values[0]!r} one time and {values[1]!r} another"
+    return None

@@ -1,0 +1,40 @@
+"""The failure penalty of a pack's environments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.envs.failures import FailureRule
+from policies.envs.make import make_vector_env
+from policies.envs.wrappers import FailurePenalty
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """The reward of steps that end an episode by failure."""
+
+    rule: FailureRule
+    reward: float
+
+    @classmethod
+    def find(cls, env_id: str, env_args: Mapping[str, Any] | None, reward: float | None) -> Penalty | None:
+        """The penalty, with the rule that the environment has; None without one.
+
+        Raises:
+            EnvError: There is a penalty, and the env has no failure.
+        """
+        if reward is None:
+            return None
+        env = make_vector_env(env_id, env_args, 1, failure_penalty=reward)
+        env.close()
+        assert isinstance(env, FailurePenalty)
+        return cls(env.rule, env.penalty)
+
+    def apply(self, rewards: NDArray[np.float32], terminated: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """What the learner sees of the env's own rewards: a new array."""
+        return np.where(self.rule.failed(rewards, terminated), np.float32(self.reward), rewards)

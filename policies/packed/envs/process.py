@@ -1,0 +1,126 @@
+"""Sub-environments in a process of their own, asked through a pipe."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from typing import Any
+
+from policies.child_processes import entry
+from policies.envs.faults import note_signals
+from policies.envs.modules import allow_modules, allowed_modules
+from policies.errors import EnvError
+from policies.packed.envs.sub_envs import HostDiedError, SubEnvs
+from policies.parents import end_with_parent
+
+_PATIENCE_S = 5.0
+"""How long a process may take to close its environments."""
+
+
+class ProcessHost:
+    """A daemon process with some sub-environments; see `Host`.
+
+    It is spawned, not forked: the pack's process has threads, and with them locks that a fork would leave locked.
+    """
+
+    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._env_id = env_id
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=entry(serve), args=(theirs, env_id, dict(env_args or {}), allowed_modules(), _parent()), daemon=True
+        )
+        self._process.start()
+        # Or a pipe whose process has ended would not seem to be closed.
+        theirs.close()
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process."""
+        return self._process.pid
+
+    def send(self, method: str, *args: Any) -> None:
+        """See `Host.send`."""
+        try:
+            self._connection.send((method, args))
+        except OSError as error:
+            raise self._died() from error
+
+    def receive(self) -> Any:
+        """See `Host.receive`."""
+        try:
+            answer = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise self._died() from error
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """See `Host.close`; a process that does not end is killed."""
+        with contextlib.suppress(OSError):
+            self._connection.send(None)
+        self._process.join(_PATIENCE_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._connection.close()
+
+    def _died(self) -> HostDiedError:
+        self._process.join(_PATIENCE_S)
+        code = self._process.exitcode
+        how = "ended" if code is None else f"ended with exit code {code}"
+        if code is not None and code < 0:
+            with contextlib.suppress(ValueError):
+                how = f"was killed by {signal.Signals(-code).name}"
+        return HostDiedError(
+            f"A process that stepped environments of {self._env_id} {how}.",
+            "Look for what the env says in its log, and at this machine's memory.",
+        )
+
+
+def _parent() -> tuple[int, bool]:
+    """This process, and whether this thread lives as long as it does."""
+    return os.getpid(), threading.current_thread() is threading.main_thread()
+
+
+def serve(
+    connection: Connection, env_id: str, env_args: dict[str, Any], modules: tuple[str, ...], parent: tuple[int, bool]
+) -> None:
+    """Answer a `ProcessHost` until it closes, or its process ends: then this one ends too, even inside a step."""
+    pid, by_kernel = parent
+    end_with_parent(parent=pid, by_kernel=by_kernel)
+    # Ctrl-C in a terminal reaches this process too; when it ends is the other's to say.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    note_signals()
+    allow_modules(modules)
+    sub_envs = SubEnvs(env_id, env_args)
+    while True:
+        try:
+            asked = connection.recv()
+        except (EOFError, OSError):
+            asked = None
+        if asked is None:
+            break
+        method, args = asked
+        try:
+            answer = getattr(sub_envs, method)(*args)
+        except EnvError as error:
+            answer = error
+        _note_causes(answer)
+        connection.send(answer)
+    sub_envs.close()
+
+
+def _note_causes(answer: Any) -> None:
+    """Write the causes of the errors in an answer into notes: pickled, an exception has no other any more."""
+    errors = [answer] if isinstance(answer, EnvError) else getattr(answer, "errors", {}).values()
+    for error in errors:
+        if error.__cause__ is not None:
+            error.add_note("".join(traceback.format_exception(error.__cause__)).rstrip())

@@ -1,0 +1,213 @@
+"""Sub-environments that are stepped one after the other, and where they live: here, or in a process of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
+from policies.envs.faults import close_env, env_failed
+from policies.envs.make import make_env
+from policies.envs.spaces import observation_dtype
+from policies.errors import EnvError
+
+
+class HostDiedError(EnvError):
+    """A process of sub-environments has ended."""
+
+
+class Host(Protocol):
+    """Where some sub-environments live.
+
+    Calls are sent to all hosts first and received from them afterwards, so that processes work at the same time.
+    """
+
+    def send(self, method: str, *args: Any) -> None:
+        """Ask for a method of `SubEnvs`.
+
+        Raises:
+            HostDiedError: The process has ended.
+        """
+
+    def receive(self) -> Any:
+        """What the method that was asked for last returned.
+
+        Raises:
+            HostDiedError: The process has ended.
+            EnvError: The method raised it.
+        """
+
+    def close(self) -> None:
+        """Close all sub-environments."""
+
+
+@dataclass(frozen=True, eq=False)
+class SubStep:
+    """What a step of a host's sub-environments gave, in the order in which they were added."""
+
+    final_observations: NDArray[Any]
+    first_observations: dict[int, NDArray[Any]]
+    """Where an episode ended: the first of the next one, by place."""
+    rewards: NDArray[np.float32]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    errors: dict[str, EnvError]
+    """Members one of whose sub-environments raised; what else is here of these means nothing."""
+
+
+@dataclass(eq=False)
+class _SubEnv:
+    member_id: str
+    env: gym.Env[Any, Any]
+    num_steps: int = 0
+    """Of its running episode."""
+
+
+class SubEnvs:
+    """Scalar environments, each of a member, with the wrappers that their arguments ask for.
+
+    Args:
+        env_id: Gymnasium id.
+        env_args: As `policies.envs.make.make_env` takes them.
+    """
+
+    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
+        self._env_id, self._env_args = env_id, dict(env_args or {})
+        self._envs: list[_SubEnv] = []
+
+    def add(self, member_id: str, seeds: Sequence[int]) -> list[NDArray[Any]]:
+        """Make sub-environments of a member, one for each seed.
+
+        Returns:
+            Their first observations.
+
+        Raises:
+            EnvError: One cannot be made or reset; none is there then.
+        """
+        made: list[_SubEnv] = []
+        try:
+            observations = []
+            for seed in seeds:
+                one = _SubEnv(member_id, make_env(self._env_id, self._env_args))
+                made.append(one)
+                observations.append(self._reset(one, seed))
+        except EnvError:
+            _close(made)
+            raise
+        self._envs += made
+        return observations
+
+    def remove(self, member_id: str) -> None:
+        """Close a member's sub-environments, if it has any here."""
+        _close([one for one in self._envs if one.member_id == member_id])
+        self._envs = [one for one in self._envs if one.member_id != member_id]
+
+    def step(self, actions: NDArray[Any]) -> SubStep:
+        """Step all; where an episode ends, begin the next.
+
+        Args:
+            actions: One for each, as the env takes them.
+        """
+        num = len(self._envs)
+        space = self._envs[0].env.observation_space
+        finals: NDArray[Any] = np.zeros((num, *(space.shape or ())), dtype=observation_dtype(space))
+        firsts: dict[int, NDArray[Any]] = {}
+        rewards = np.zeros(num, dtype=np.float32)
+        terminated, truncated = np.zeros(num, dtype=np.bool_), np.zeros(num, dtype=np.bool_)
+        errors: dict[str, EnvError] = {}
+        # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
+        each = actions.tolist() if actions.ndim == 1 else actions
+        lengths = [0] * num
+        for place, (one, action) in enumerate(zip(self._envs, each, strict=True)):
+            if one.member_id in errors:
+                continue
+            try:
+                rewards[place], terminated[place], truncated[place] = self._step(one, action, finals[place])
+                lengths[place] = one.num_steps
+                if terminated[place] or truncated[place]:
+                    firsts[place] = self._reset(one, None)
+            except EnvError as error:
+                errors[one.member_id] = error
+        if not (is_sound(rewards) and is_sound(finals)):
+            self._find_unsound(rewards, finals, lengths, errors)
+        return SubStep(finals, firsts, rewards, terminated, truncated, errors)
+
+    def close(self) -> None:
+        """Close all."""
+        _close(self._envs)
+        self._envs = []
+
+    def _find_unsound(
+        self, rewards: NDArray[np.float32], finals: NDArray[Any], lengths: Sequence[int], errors: dict[str, EnvError]
+    ) -> None:
+        """The members whose rewards or observations are not finite, into `errors`."""
+        for place, one in enumerate(self._envs):
+            if one.member_id not in errors:
+                try:
+                    check_reward(float(rewards[place]), self._env_id, lengths[place])
+                    check_observation(finals[place], self._env_id, lengths[place])
+                except EnvError as error:
+                    errors[one.member_id] = error
+
+    def _step(self, one: _SubEnv, action: Any, final: NDArray[Any]) -> tuple[float, bool, bool]:
+        """Step one; its observation goes into `final`."""
+        one.num_steps += 1
+        try:
+            observation, reward, terminated, truncated, _ = one.env.step(action)
+            self._check_shape(one.env, observation)
+            final[:] = observation
+            return reward_as_number(reward), bool(terminated), bool(truncated)
+        except BaseException as error:  # an env may raise anything
+            raise self._failed("step", error) from error
+
+    def _reset(self, one: _SubEnv, seed: int | None) -> NDArray[Any]:
+        try:
+            observation, _ = one.env.reset(seed=seed)
+            self._check_shape(one.env, observation)
+            # A copy: some envs return the array that they go on writing to.
+            first = np.array(observation, dtype=observation_dtype(one.env.observation_space))
+        except BaseException as error:  # an env may raise anything
+            raise self._failed("reset", error) from error
+        one.num_steps = 0
+        check_observation(first, self._env_id, 0)
+        return first
+
+    def _check_shape(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        if np.shape(observation) != env.observation_space.shape:
+            raise EnvError(
+                f"it returned an observation of shape {np.shape(observation)}, not {env.observation_space.shape}"
+            )
+
+    def _failed(self, method: str, error: BaseException) -> EnvError:
+        return env_failed(f"{self._env_id} raised an error in {method}()", error)
+
+
+class HereHost:
+    """Sub-environments in this very process."""
+
+    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
+        self._sub_envs = SubEnvs(env_id, env_args)
+        self._asked: tuple[str, tuple[Any, ...]] = ("close", ())
+
+    def send(self, method: str, *args: Any) -> None:
+        """See `Host.send`."""
+        self._asked = method, args
+
+    def receive(self) -> Any:
+        """See `Host.receive`."""
+        method, args = self._asked
+        return getattr(self._sub_envs, method)(*args)
+
+    def close(self) -> None:
+        """See `Host.close`."""
+        self._sub_envs.close()
+
+
+def _close(envs: Sequence[_SubEnv]) -> None:
+    for one in envs:
+        close_env(one.env)

@@ -1,0 +1,1 @@
+"""PPO of many members at once."""

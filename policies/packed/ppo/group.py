@@ -1,0 +1,247 @@
+"""Members of a pack whose PPO networks are computed together: acting, values, and the updates of an iteration.
+
+Shapes: M members, T vector steps, N sub-environments a member, R = T * N rows, D numbers an observation, A outputs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from policies.hyperparams import PPOHyperparams
+from policies.packed.member import Member
+from policies.packed.networks import ActingNetworks
+from policies.packed.optimizers import StackedAdam, clip_by_global_norm
+from policies.packed.ppo import loss as ppo
+from policies.packed.rows import StackedRows
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8  # RLlib leaves torch's defaults
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What an iteration's updates learn from, member by member."""
+
+    observations: Floats
+    """As the networks saw them, (M, R, D)."""
+    actions: Floats
+    """One-hot, or as the policy drew them, (M, R, actions)."""
+    outputs: Floats
+    """Of the policy, (M, R, A)."""
+    advantages: Floats
+    """Standardised, (M, R)."""
+    value_targets: Floats
+    """(M, R)."""
+
+
+def scheduled(start: float, final: float | None, num_steps: int | None, now: int) -> float:
+    """A value that moves linearly from start to final over so many env steps."""
+    if final is None or num_steps is None:
+        return start
+    return start + (final - start) * min(1.0, now / num_steps)
+
+
+class PPOGroup:
+    """M members with one activation and about the same layer sizes.
+
+    Args:
+        members: Equal in everything that gives a batch its shape.
+        num_inputs: Numbers of an observation.
+        num_outputs: Of the policy's head.
+        is_gaussian: Whether actions are continuous.
+        device: Where the updates are computed; acting is on the CPU.
+    """
+
+    def __init__(
+        self, members: Sequence[Member], num_inputs: int, num_outputs: int, *, is_gaussian: bool, device: str
+    ) -> None:
+        self.members = members
+        self._num_outputs, self._is_gaussian, self._device = num_outputs, is_gaussian, device
+        self._rows = StackedRows(members, num_inputs, num_outputs, device)
+        self._networks = self._rows.networks
+        self._shares = self._rows.networks_per_member == 1
+        column = self._rows.per_row
+        self._optimizer = StackedAdam(
+            self._networks.weights,
+            lr=column(lambda member: member.hyperparams.lr),
+            beta1=column(lambda _: _BETA1, torch.float64),
+            beta2=column(lambda _: _BETA2, torch.float64),
+            epsilon=column(lambda _: _EPSILON),
+        )
+        self._rows.read_moments(self._optimizer)
+        self._acting = ActingNetworks(self._networks, len(members))
+        self._hyperparams = [cast("PPOHyperparams", member.hyperparams) for member in members]
+        self._unfinished: tuple[ppo.Parts, Tensor | None, int]
+        self._grad_clip = self._per_member(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
+        self._clips = any(item.grad_clip is not None for item in self._hyperparams)
+        self._coefficients = ppo.Coefficients(
+            clip_param=self._per_member(lambda item: item.clip_param),
+            vf_clip_param=self._per_member(lambda item: math.inf if item.vf_clip_param is None else item.vf_clip_param),
+            vf_loss_coeff=self._per_member(lambda item: item.vf_loss_coeff),
+            entropy_coeff=self._per_member(lambda item: item.entropy_coeff),
+            kl_coeff=self._per_member(lambda _: 0.0),
+        )
+
+    def _per_member(self, value: Callable[[PPOHyperparams], float]) -> Tensor:
+        return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=torch.float32)
+
+    def act(self, observations: Floats) -> Floats:
+        """The policy's outputs, (M, N, A), of observations as the networks see them, (M, N, D)."""
+        outputs = self._acting(observations)
+        return outputs[..., : self._num_outputs] if self._shares else outputs
+
+    def values(self, observations: Tensor) -> Tensor:
+        """V, (M, B), of observations with a last column of ones, (M, B, D + 1)."""
+        num_members = len(self.members)
+        if self._shares:
+            return self._networks.forward(observations)[..., -1]
+        return self._networks.evaluate(observations, num_members, 2 * num_members)[..., 0]
+
+    def learn(self, batch: Batch) -> None:
+        """Make the updates of one iteration; on a GPU, only ask for them. `finish` comes next."""
+        first = self._hyperparams[0]
+        num_rows = batch.advantages.shape[1]
+        num_updates = math.ceil(num_rows * first.num_epochs / first.minibatch_size)
+        self._move_schedules()
+        columns = self._columns(batch)
+        indices = torch.from_numpy(self._draw_rows(num_rows, num_updates * first.minibatch_size)).to(self._device)
+        self._optimizer.begin(num_updates)
+        parts, norms = None, None
+        for number in range(num_updates):
+            chosen = indices[:, number * first.minibatch_size : (number + 1) * first.minibatch_size]
+            rows = columns.index_select(0, chosen.reshape(-1)).view(len(self.members), first.minibatch_size, -1)
+            outputs, values = self._forward(rows)
+            minibatch = self._minibatch(rows)
+            if number == num_updates - 1:
+                parts = ppo.loss(outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian)
+            norms = self._update(outputs, values, minibatch)
+        assert parts is not None
+        self._unfinished = parts, norms, num_updates
+
+    def finish(self) -> list[dict[str, float]]:
+        """Wait for the updates of `learn`, and act with the new weights from now on.
+
+        Returns:
+            For each member, numbers of the last update.
+        """
+        self._acting.refresh()
+        return self._stats(*self._unfinished)
+
+    def _columns(self, batch: Batch) -> Tensor:
+        """All that a minibatch needs side by side, so that one gather brings it; (M * R, columns)."""
+        observations = batch.observations
+        num_members, num_rows, num_inputs = observations.shape
+        num_actions, num_outputs = batch.actions.shape[2], self._num_outputs
+        self._bounds = np.cumsum([num_inputs + 1, num_actions, 1, 1, 1, num_outputs]).tolist()
+        actions, outputs = torch.from_numpy(batch.actions), torch.from_numpy(batch.outputs)
+        logp = ppo.log_probabilities(outputs, actions, is_gaussian=self._is_gaussian)
+        keeps_outputs = self._hyperparams[0].use_kl_loss
+        columns = np.empty((num_members, num_rows, self._bounds[-1 if keeps_outputs else -2]), dtype=np.float32)
+        columns[..., :num_inputs] = observations
+        columns[..., num_inputs] = 1.0
+        columns[..., num_inputs + 1 : self._bounds[1]] = batch.actions
+        columns[..., self._bounds[1]] = logp.numpy()
+        columns[..., self._bounds[2]] = batch.advantages
+        columns[..., self._bounds[3]] = batch.value_targets
+        if keeps_outputs:
+            columns[..., self._bounds[4] :] = batch.outputs
+        return torch.from_numpy(columns).view(num_members * num_rows, -1).to(self._device)
+
+    def _draw_rows(self, num_rows: int, num_drawn: int) -> NDArray[np.int64]:
+        """Rows of each update: pass after pass over the batch, each in a new order; into the flattened batch."""
+        num_passes = math.ceil(num_drawn / num_rows)
+        drawn = np.empty((len(self.members), num_drawn), dtype=np.int64)
+        ordered = np.tile(np.arange(num_rows), (num_passes, 1))
+        for index, member in enumerate(self.members):
+            drawn[index] = member.rng.permuted(ordered, axis=1).reshape(-1)[:num_drawn]
+            drawn[index] += index * num_rows
+        return drawn
+
+    def _forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Policy outputs, (M, B, A), and values, (M, B)."""
+        observations = rows[..., : self._bounds[0]]
+        if self._shares:
+            outputs = self._networks.forward(observations)
+            return outputs[..., : self._num_outputs], outputs[..., -1]
+        outputs = self._networks.forward(observations.repeat(2, 1, 1))
+        num_members = len(self.members)
+        return outputs[:num_members], outputs[num_members:, :, 0]
+
+    def _minibatch(self, rows: Tensor) -> ppo.Minibatch:
+        bounds = self._bounds
+        return ppo.Minibatch(
+            actions=rows[..., bounds[0] : bounds[1]],
+            logp=rows[..., bounds[1]],
+            advantages=rows[..., bounds[2]],
+            value_targets=rows[..., bounds[3]],
+            old_outputs=rows[..., bounds[4] :] if self._hyperparams[0].use_kl_loss else None,
+        )
+
+    def _update(self, outputs: Tensor, values: Tensor, minibatch: ppo.Minibatch) -> Tensor | None:
+        """One gradient step; the gradients' norms, (M, 1), if any are clipped."""
+        policy_gradient, value_gradient = ppo.gradients(
+            outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian
+        )
+        num_members, num_rows = values.shape
+        networks = self._networks
+        gradient = torch.zeros(networks.num_networks, num_rows, networks.sizes[-1], device=self._device)
+        gradient[:num_members, :, : self._num_outputs] = policy_gradient
+        gradient[-num_members:, :, -1 if self._shares else 0] = value_gradient
+        networks.backward(gradient)
+        norms = None
+        if self._clips:
+            norms = clip_by_global_norm(networks.gradients, self._grad_clip, self._rows.networks_per_member)
+        self._optimizer.step(networks.gradients)
+        return norms
+
+    def _move_schedules(self) -> None:
+        """Learning rates and entropy weights at the env steps so far, this iteration's among them."""
+        lr, entropy = [], []
+        for member, item in zip(self.members, self._hyperparams, strict=True):
+            now = member.num_env_steps
+            lr.append([scheduled(item.lr, item.lr_final, item.lr_decay_steps, now)])
+            entropy.append([scheduled(item.entropy_coeff, item.entropy_coeff_final, item.entropy_decay_steps, now)])
+        column = torch.tensor(lr, device=self._device, dtype=torch.float32)
+        self._optimizer.lr = column.repeat(self._rows.networks_per_member, 1)
+        self._coefficients.entropy_coeff = torch.tensor(entropy, device=self._device, dtype=torch.float32)
+        if self._hyperparams[0].use_kl_loss:
+            weights = [[member.kl_coeff] for member in self.members]
+            self._coefficients.kl_coeff = torch.tensor(weights, device=self._device, dtype=torch.float32)
+
+    def _stats(self, parts: ppo.Parts, norms: Tensor | None, num_updates: int) -> list[dict[str, float]]:
+        columns = {name: value.tolist() for name, value in vars(parts).items()}
+        columns["lr"] = self._optimizer.lr[: len(self.members), 0].tolist()
+        if norms is not None:
+            columns["gradient_norm"] = norms[:, 0].tolist()
+        stats = []
+        for index, (member, item) in enumerate(zip(self.members, self._hyperparams, strict=True)):
+            member.num_updates += num_updates
+            found = {name: float(values[index]) for name, values in columns.items()}
+            if item.use_kl_loss:
+                member.kl_coeff = _next_kl_coeff(member.kl_coeff, found["kl"], item.kl_target)
+            else:
+                del found["kl"]
+            if item.grad_clip is None:
+                found.pop("gradient_norm", None)  # computed because another member's is clipped
+            stats.append({name: value for name, value in found.items() if math.isfinite(value)})
+        return stats
+
+    def write_back(self) -> None:
+        """Give the members their weights and moments as they are now."""
+        self._rows.write_back(self._optimizer)
+
+
+def _next_kl_coeff(now: float, kl: float, target: float) -> float:
+    """RLlib's rule: half as much again above twice the target, half below half of it."""
+    if kl > 2.0 * target:
+        return now * 1.5
+    return now * 0.5 if kl < 0.5 * target else now

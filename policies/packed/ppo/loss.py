@@ -1,0 +1,159 @@
+"""PPO's update of many members at once: RLlib's loss, with each member's own coefficients.
+
+Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equations 7 and 9, and RLlib's
+`PPOTorchLearner.compute_loss_for_module` (2.60), which clips the squared value error and adds an adaptive KL penalty.
+
+Shapes: M members, B rows of a minibatch a member, A actions (or components of one).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+LOG_STD_CLIP = 20.0  # RLlib's own, as in policies.networks.rl_modules
+_HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(eq=False)
+class Coefficients:
+    """What weighs the parts of the loss, (M, 1) each."""
+
+    clip_param: Tensor
+    vf_clip_param: Tensor
+    """Infinity: no clipping."""
+    vf_loss_coeff: Tensor
+    entropy_coeff: Tensor
+    kl_coeff: Tensor
+
+
+@dataclass(eq=False)
+class Minibatch:
+    """Rows to learn from."""
+
+    actions: Tensor
+    """Discrete: one-hot, (M, B, A). Continuous: as the policy drew them, (M, B, A)."""
+    logp: Tensor
+    """Log probability of the action when it was drawn, (M, B)."""
+    advantages: Tensor
+    """(M, B)."""
+    value_targets: Tensor
+    """(M, B)."""
+    old_outputs: Tensor | None = None
+    """The policy's outputs when the action was drawn, (M, B, outputs); None: no KL penalty."""
+
+
+@dataclass(eq=False)
+class Parts:
+    """Means over the minibatch, (M,) each."""
+
+    total_loss: Tensor
+    policy_loss: Tensor
+    vf_loss: Tensor
+    entropy: Tensor
+    kl: Tensor
+
+
+def gradients(
+    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, is_gaussian: bool
+) -> tuple[Tensor, Tensor]:
+    """Gradients of each member's loss with respect to policy outputs and values.
+
+    Args:
+        outputs: Of the policy, (M, B, A) logits or (M, B, 2A) means and log standard deviations.
+        values: (M, B).
+        batch: The rows.
+        coefficients: Of the members.
+        is_gaussian: Whether the actions are continuous.
+
+    Returns:
+        Of the shapes of `outputs` and `values`.
+    """
+    if is_gaussian:
+        return _by_autograd(outputs, values, batch, coefficients)
+    # By hand: a graph of these small tensors would cost more than the networks.
+    num_rows = outputs.shape[1]
+    logp_all = torch.log_softmax(outputs, dim=-1)
+    probabilities = logp_all.exp()
+    logp = (logp_all * batch.actions).sum(dim=-1)
+    ratio = (logp - batch.logp).exp_()
+    surrogate = batch.advantages * ratio
+    limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param).mul_(batch.advantages)
+    # The minimum passes a gradient where the ratio itself is the smaller one, or both are equal; and what is no number.
+    weight = torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / num_rows)
+    out = (probabilities - batch.actions).mul_(weight.unsqueeze(-1))
+    if bool(coefficients.entropy_coeff.any()):
+        entropy = -(probabilities * logp_all).sum(dim=-1, keepdim=True)
+        scale = (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
+        out += (logp_all + entropy).mul_(probabilities).mul_(scale)
+    if batch.old_outputs is not None:
+        old = torch.softmax(batch.old_outputs, dim=-1)
+        out += (probabilities - old).mul_((coefficients.kl_coeff / num_rows).unsqueeze(-1))
+    return out, _value_gradient(values, batch, coefficients)
+
+
+def _value_gradient(values: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tensor:
+    errors = values - batch.value_targets
+    factor = coefficients.vf_loss_coeff * (2 / values.shape[1])
+    if bool(coefficients.vf_clip_param.isinf().all()):
+        return errors.mul_(factor)
+    return torch.where(errors**2 > coefficients.vf_clip_param, 0.0, errors).mul_(factor)
+
+
+def _by_autograd(
+    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients
+) -> tuple[Tensor, Tensor]:
+    outputs, values = outputs.detach().requires_grad_(), values.detach().requires_grad_()
+    with torch.enable_grad():
+        total = loss(outputs, values, batch, coefficients, is_gaussian=True).total_loss.sum()
+        policy_gradient, value_gradient = torch.autograd.grad(total, (outputs, values))
+    return policy_gradient, value_gradient
+
+
+def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, is_gaussian: bool) -> Parts:
+    """Each member's loss and its parts, as RLlib computes them; arguments as `gradients`."""
+    logp, entropy = _logp_and_entropy(outputs, batch.actions, is_gaussian=is_gaussian)
+    ratio = torch.exp(logp - batch.logp)
+    limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param)
+    surrogate = torch.min(batch.advantages * ratio, batch.advantages * limited)
+    vf_loss = torch.minimum((values - batch.value_targets) ** 2, coefficients.vf_clip_param)
+    kl = torch.zeros_like(entropy)
+    if batch.old_outputs is not None:
+        kl = _kl(batch.old_outputs, outputs, is_gaussian=is_gaussian)
+    rows = -surrogate + coefficients.vf_loss_coeff * vf_loss - coefficients.entropy_coeff * entropy
+    rows = rows + coefficients.kl_coeff * kl
+    return Parts(rows.mean(dim=1), -surrogate.mean(dim=1), vf_loss.mean(dim=1), entropy.mean(dim=1), kl.mean(dim=1))
+
+
+def _logp_and_entropy(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) -> tuple[Tensor, Tensor]:
+    """Log probability of the actions and entropy of the policy, (M, B) each."""
+    if not is_gaussian:
+        logp_all = torch.log_softmax(outputs, dim=-1)
+        return (logp_all * actions).sum(dim=-1), -(logp_all.exp() * logp_all).sum(dim=-1)
+    mean, log_std = _split(outputs)
+    rows = -0.5 * ((actions - mean) / log_std.exp()) ** 2 - log_std - _HALF_LOG_TWO_PI
+    return rows.sum(dim=-1), (log_std + 0.5 + _HALF_LOG_TWO_PI).sum(dim=-1)
+
+
+def log_probabilities(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) -> Tensor:
+    """Log probability of the actions, (M, B); arguments as `gradients`."""
+    return _logp_and_entropy(outputs, actions, is_gaussian=is_gaussian)[0]
+
+
+def _kl(old: Tensor, new: Tensor, *, is_gaussian: bool) -> Tensor:
+    """KL divergence of the policy now from the one that drew the actions, (M, B)."""
+    if not is_gaussian:
+        old_logp = torch.log_softmax(old, dim=-1)
+        return (old_logp.exp() * (old_logp - torch.log_softmax(new, dim=-1))).sum(dim=-1)
+    old_mean, old_log_std = _split(old)
+    mean, log_std = _split(new)
+    squares = torch.exp(2 * old_log_std) + (old_mean - mean) ** 2
+    return (log_std - old_log_std + squares / (2 * torch.exp(2 * log_std)) - 0.5).sum(dim=-1)
+
+
+def _split(outputs: Tensor) -> tuple[Tensor, Tensor]:
+    mean, log_std = outputs.chunk(2, dim=-1)
+    return mean, log_std.clamp(-LOG_STD_CLIP, LOG_STD_CLIP)

@@ -1,0 +1,286 @@
+"""PPO of the members of a pack that share a tensor program: one vector of environments, one batched update.
+
+Shapes: M members, T vector steps, N sub-environments a member, S = M * N rows, R = T * N, D numbers an observation,
+A outputs of the policy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from contextlib import AbstractContextManager
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from policies.envs.action_bounds import ToBounds
+from policies.hyperparams import PPOHyperparams
+from policies.packed.envs.make import PackedEnvs
+from policies.packed.member import Member, MemberStats, group_members
+from policies.packed.networks import with_ones
+from policies.packed.ppo.gae import advantages_and_targets, standardise
+from policies.packed.ppo.group import Batch, PPOGroup
+from policies.packed.ppo.loss import LOG_STD_CLIP
+from policies.packed.sampling import EpisodeTracker, Observations, one_hot
+
+Floats = NDArray[np.float32]
+
+
+class Fragment:
+    """What T vector steps gave; columns of shape (T, S, ...)."""
+
+    def __init__(self, num_steps: int, num_rows: int, num_inputs: int, num_outputs: int) -> None:
+        shape = (num_steps, num_rows)
+        self.observations = np.empty((*shape, num_inputs), dtype=np.float32)
+        self.outputs = np.empty((*shape, num_outputs), dtype=np.float32)
+        self.actions: NDArray[Any] = np.empty(0)
+        """(T, S) of whole numbers, or (T, S, num_actions) as the policy drew them."""
+        self.rewards, self.own_rewards = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        self.terminated, self.ended = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
+        self.cuts: list[tuple[int, int, Floats]] = []
+        """(step, row, observation) at the end of each truncated episode."""
+        self.last: Floats = np.empty((num_rows, num_inputs), dtype=np.float32)
+        """The observations that the next actions answer."""
+
+
+class PPOStack:
+    """See `Stack`.
+
+    Args:
+        envs: Without members.
+        device: Of the updates.
+    """
+
+    def __init__(self, envs: PackedEnvs, device: str = "cpu") -> None:
+        self.envs, self._device = envs, device
+        self.members: list[Member] = []
+        self._groups: list[PPOGroup] = []
+        self._episodes = EpisodeTracker()
+        self._stale, self._is_written = False, True
+        self._ended: list[tuple[tuple[float, int], ...]] = []
+        self._stream = torch.cuda.Stream() if device.startswith("cuda") else None  # type: ignore[no-untyped-call]
+        space = envs.action_space
+        self._is_gaussian = isinstance(space, gym.spaces.Box)
+        if isinstance(space, gym.spaces.Box):
+            self._num_actions = math.prod(space.shape)
+            self._to_bounds = ToBounds(space)
+        else:
+            self._num_actions = int(cast("gym.spaces.Discrete[Any]", space).n)
+        self._num_outputs = self._num_actions * (2 if self._is_gaussian else 1)
+        self._num_inputs = math.prod(envs.observation_space.shape or ())
+
+    def add(self, member: Member, env_seed: int) -> None:
+        """A further member; its episodes begin."""
+        self.envs.add(member.member_id, env_seed)
+        self._write_back()
+        self.members.append(member)
+        self._episodes.add(member.member_id, self.envs.num_envs)
+        self._stale = True
+
+    def remove(self, member_id: str) -> Member:
+        """Take a member out, with its weights as they are now."""
+        self._write_back()
+        (member,) = (item for item in self.members if item.member_id == member_id)
+        self.members.remove(member)
+        self.envs.remove(member_id)
+        self._episodes.remove(member_id)
+        self._stale = True
+        return member
+
+    def member(self, member_id: str) -> Member:
+        """A member, with its weights as they are now."""
+        self._write_back()
+        (member,) = (item for item in self.members if item.member_id == member_id)
+        return member
+
+    def _write_back(self) -> None:
+        if self._stale or self._is_written:
+            return
+        for group in self._groups:
+            group.write_back()
+        self._is_written = True
+
+    def _regroup(self) -> None:
+        groups = group_members(self.members)
+        self.members = [member for group in groups for member in group]
+        self.envs.arrange([member.member_id for member in self.members])
+        self._groups = [
+            PPOGroup(group, self._num_inputs, self._num_outputs, is_gaussian=self._is_gaussian, device=self._device)
+            for group in groups
+        ]
+        first = self.members[0].hyperparams
+        self._observations = Observations(self.members, self.envs.num_envs, normalizes=first.normalize_observations)
+        self._stale = False
+
+    def train_iteration(self) -> dict[str, MemberStats]:
+        """See `Stack.train_iteration`."""
+        self.begin_iteration()
+        return self.finish_iteration()
+
+    def begin_iteration(self) -> None:
+        """See `Stack.begin_iteration`: sample a batch of each member and ask for the updates."""
+        if self._stale:
+            self._regroup()
+        self._is_written = False
+        first = cast("PPOHyperparams", self.members[0].hyperparams)
+        num_steps = math.ceil(first.train_batch_size / self.envs.num_envs)
+        fragment = self._sample(num_steps)
+        episodes = self._episodes.follow(
+            [member.member_id for member in self.members], fragment.own_rewards, fragment.ended
+        )
+        for member, ended in zip(self.members, episodes, strict=True):
+            member.num_env_steps += num_steps * self.envs.num_envs
+            member.num_episodes += len(ended)
+            member.num_iterations += 1
+        start = 0
+        with self._on_own_stream():
+            for group in self._groups:
+                stop = start + len(group.members)
+                group.learn(self._batch(group, fragment, start, stop))
+                start = stop
+        self._observations.learn(fragment.observations)
+        self._ended = episodes
+
+    def finish_iteration(self) -> dict[str, MemberStats]:
+        """See `Stack.finish_iteration`."""
+        with self._on_own_stream():
+            stats = [found for group in self._groups for found in group.finish()]
+        return {
+            member.member_id: MemberStats(member.num_env_steps, ended, found)
+            for member, ended, found in zip(self.members, self._ended, stats, strict=True)
+        }
+
+    def _on_own_stream(self) -> AbstractContextManager[Any]:
+        """Where a GPU works on other stacks too, each waits for its own work alone."""
+        return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+
+    def _sample(self, num_steps: int) -> Fragment:
+        envs, num_members, num_envs = self.envs, len(self.members), self.envs.num_envs
+        fragment = Fragment(num_steps, num_members * num_envs, self._num_inputs, self._num_outputs)
+        noise = self._draw_noise(num_steps)
+        envs.begin(num_steps)
+        bounds = np.cumsum([0, *(len(group.members) for group in self._groups)]).tolist()
+        outputs = fragment.outputs.reshape(num_steps, num_members, num_envs, self._num_outputs)
+        chosen = []
+        for step in range(num_steps):
+            fragment.observations[step] = envs.observations
+            seen = self._observations.prepare(envs.observations)
+            for group, start, stop in zip(self._groups, bounds, bounds[1:], strict=False):
+                outputs[step, start:stop] = group.act(seen[start:stop])
+            actions = self._choose(fragment.outputs[step], noise[step])
+            chosen.append(actions)
+            done = envs.step(self._to_env(actions))
+            fragment.rewards[step], fragment.own_rewards[step] = done.rewards, done.own_rewards
+            fragment.terminated[step] = done.terminated
+            fragment.ended[step] = done.terminated | done.truncated
+            if done.truncated.any():
+                cut = np.flatnonzero(done.truncated & ~done.terminated)
+                fragment.cuts += [(step, row, done.final_observations[row]) for row in cut.tolist()]
+        fragment.actions = np.stack(chosen)
+        fragment.last = np.array(envs.observations, dtype=np.float32)
+        return fragment
+
+    def _draw_noise(self, num_steps: int) -> Floats:
+        """What the actions of so many steps are drawn with: Gumbel or normal numbers, (T, S, actions)."""
+        num_envs = self.envs.num_envs
+        shape = (num_steps, num_envs, self._num_actions)
+        parts = []
+        for member in self.members:
+            if self._is_gaussian:
+                parts.append(member.rng.standard_normal(shape, dtype=np.float32))
+            else:
+                # The largest of logits + Gumbel noise is a draw from their softmax (Gumbel 1954).
+                parts.append(member.rng.standard_exponential(shape, dtype=np.float32))
+        noise = np.concatenate(parts, axis=1)
+        if not self._is_gaussian:
+            np.maximum(noise, np.finfo(np.float32).tiny, out=noise)
+            np.negative(np.log(noise, out=noise), out=noise)
+            if self._num_actions == 2:
+                # Then only the difference counts.
+                noise = noise[..., 0] - noise[..., 1]
+        return noise
+
+    def _choose(self, outputs: Floats, noise: Floats) -> NDArray[Any]:
+        """Draw each row's action."""
+        if self._is_gaussian:
+            mean, log_std = outputs[:, : self._num_actions], outputs[:, self._num_actions :]
+            return np.asarray(mean + np.exp(log_std.clip(-LOG_STD_CLIP, LOG_STD_CLIP)) * noise, dtype=np.float32)
+        if self._num_actions == 2:
+            return np.asarray(outputs[:, 1] - outputs[:, 0] > noise, dtype=np.int64)
+        return np.asarray((outputs + noise).argmax(axis=1), dtype=np.int64)
+
+    def _to_env(self, actions: NDArray[Any]) -> NDArray[Any]:
+        if not self._is_gaussian:
+            return actions
+        # A member whose weights are not finite fails at its next evaluation, and no env should be given what it draws.
+        return self._to_bounds(np.nan_to_num(actions))
+
+    def _batch(self, group: PPOGroup, fragment: Fragment, start: int, stop: int) -> Batch:
+        """The rows of a group's members, start to stop of the stack, with advantages and value targets."""
+        num_envs = self.envs.num_envs
+        rows = slice(start * num_envs, stop * num_envs)
+        num_members, num_steps = stop - start, len(fragment.rewards)
+
+        def by_member(values: NDArray[Any]) -> NDArray[Any]:
+            """(T, m * N, ...) -> (m, T * N, ...)."""
+            shape = (num_steps, num_members, num_envs, *values.shape[2:])
+            moved = values.reshape(shape).swapaxes(0, 1)
+            return moved.reshape(num_members, num_steps * num_envs, *values.shape[2:])
+
+        seen = self._observations.part(start, stop).prepare(fragment.observations[:, rows])
+        seen = by_member(seen.reshape(num_steps, num_members * num_envs, -1))
+        values, next_values = self._values(group, fragment, seen, start, stop)
+        hyperparams = [cast("PPOHyperparams", member.hyperparams) for member in group.members]
+        repeat = np.repeat(np.arange(num_members), num_envs)
+        advantages, targets = advantages_and_targets(
+            fragment.rewards[:, rows],
+            values,
+            next_values,
+            terminated=fragment.terminated[:, rows],
+            ended=fragment.ended[:, rows],
+            gamma=np.array([item.gamma for item in hyperparams], dtype=np.float32)[repeat],
+            gae_lambda=np.array([item.gae_lambda for item in hyperparams], dtype=np.float32)[repeat],
+        )
+        actions = fragment.actions[:, rows]
+        if not self._is_gaussian:
+            actions = one_hot(actions, self._num_actions)
+        return Batch(
+            observations=seen,
+            actions=by_member(actions),
+            outputs=by_member(fragment.outputs[:, rows]),
+            advantages=standardise(by_member(advantages)),
+            value_targets=by_member(targets),
+        )
+
+    def _values(
+        self, group: PPOGroup, fragment: Fragment, seen: Floats, start: int, stop: int
+    ) -> tuple[Floats, Floats]:
+        """V of what was acted on and of what each step led to, (T, m * N)."""
+        num_envs = self.envs.num_envs
+        num_members, num_steps = stop - start, len(fragment.rewards)
+        observations = self._observations.part(start, stop)
+        rows = slice(start * num_envs, stop * num_envs)
+        last = observations.prepare(fragment.last[rows])
+        values = self._evaluate(group, np.concatenate([seen, last], axis=1))
+        values = values.reshape(num_members, num_steps + 1, num_envs).swapaxes(0, 1)
+        values = values.reshape(num_steps + 1, num_members * num_envs)
+        next_values = np.array(values[1:])
+        cuts = [(step, row - rows.start, final) for step, row, final in fragment.cuts if rows.start <= row < rows.stop]
+        if cuts:
+            # As many rows a member as the one with most has; what is not filled is not read.
+            places = [row // num_envs for _, row, _ in cuts]
+            slots = [places[:number].count(place) for number, place in enumerate(places)]
+            finals = np.zeros((num_members, max(slots) + 1, fragment.last.shape[1]), dtype=np.float32)
+            for place, slot, (_, _, final) in zip(places, slots, cuts, strict=True):
+                finals[place, slot] = final
+            found = self._evaluate(group, observations.prepare(finals.reshape(-1, finals.shape[-1])))
+            for place, slot, (step, row, _) in zip(places, slots, cuts, strict=True):
+                next_values[step, row] = found[place, slot]
+        return values[:-1], next_values
+
+    def _evaluate(self, group: PPOGroup, observations: Floats) -> Floats:
+        with torch.no_grad():
+            return group.values(torch.from_numpy(with_ones(observations)).to(self._device)).cpu().numpy()

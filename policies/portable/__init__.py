@@ -1,0 +1,1 @@
+"""The portable policy: its file, its network, and the forward pass in NumPy."""

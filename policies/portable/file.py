@@ -1,0 +1,240 @@
+"""The portable policy file: what it takes to act, without Ray, torch or pickle.
+
+It is a pair of files side by side. `policy.safetensors` holds the weights; `policy.json` says what network
+they form (see `policies.portable.network`), which environment it acts in and how it was trained, and carries the SHA-256
+of the weights.
+
+Formats: 1 had layers alone; 2 has all that `policies.portable.network` describes, and writes the bounds of a space as one
+number where they are all equal. Both are read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from policies.envs.spaces import describe_space, space_from_description
+from policies.errors import MALFORMED, CheckpointError, NotFoundError
+from policies.files import read_regular, write_atomic
+from policies.portable.network import (
+    BASELINE_KINDS,
+    ConvLayer,
+    Layer,
+    ModuleWeights,
+    NetworkKind,
+    Normalization,
+    PolicyNetwork,
+    action_problem,
+    network_from_json,
+    network_problem,
+    network_to_json,
+)
+
+__all__ = [
+    "BASELINE_KINDS", "FORMAT_VERSION", "ActionTransform", "ConvLayer", "Layer", "ModuleWeights", "NetworkKind",
+    "Normalization", "PolicyNetwork", "PortablePolicy", "action_problem", "describe_space", "read_policy",
+    "save_policy", "space_from_description",
+]  # fmt: skip
+
+FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, 2)
+_MAX_CHARS = 400
+"""Of what a message quotes."""
+
+ActionTransform = Literal["none", "unsquash", "by_component", "clip"]
+
+
+@dataclass(frozen=True, eq=False)
+class PortablePolicy:
+    """A network and all that is needed to let it act in its environment."""
+
+    network: PolicyNetwork
+    algorithm: str
+    env_id: str
+    env_args: dict[str, Any]
+    observation_space: dict[str, Any]
+    """As `describe_space` gives it."""
+    action_space: dict[str, Any]
+    action_transform: ActionTransform = "none"
+    """What turns a Box action of the network into one of the env: see `policies.acting.policy`."""
+    training: dict[str, Any] = field(default_factory=dict)
+    """Where it comes from: trial id, iteration, hyperparameters, seed, ... Free, and not needed to act."""
+
+
+def save_policy(
+    policy: PortablePolicy,
+    folder: Path,
+    stem: str = "policy",
+    *,
+    write: Callable[[Path, bytes | str], None] = write_atomic,
+) -> Path:
+    """Write `<stem>.safetensors` and `<stem>.json` into a folder.
+
+    Each file appears whole or not at all, the weights first, so an interrupted save never leaves a JSON file
+    without its weights; the hash in it tells if the weights beside it are those of another save.
+
+    Args:
+        policy: What to write.
+        folder: Where.
+        stem: Name of the files, without their endings.
+        write: Writes a file; `write_plain` where the folder is not to be seen yet.
+
+    Returns:
+        The path of the JSON file.
+
+    Raises:
+        CheckpointError: The network does not map the observations to the actions.
+        CannotRunError: The folder cannot be written.
+    """
+    from safetensors.numpy import save
+
+    _check(policy, f"policy to save as {folder / stem}")
+    network, tensors = network_to_json(policy.network)
+    weights: bytes = save(tensors)
+    description = {
+        "format_version": FORMAT_VERSION,
+        "algorithm": policy.algorithm,
+        "env_id": policy.env_id,
+        "env_args": policy.env_args,
+        "observation_space": policy.observation_space,
+        "action_space": policy.action_space,
+        "action_transform": policy.action_transform,
+        "network": network,
+        "weights_sha256": hashlib.sha256(weights).hexdigest(),
+        "training": policy.training,
+    }
+    write(folder / f"{stem}.safetensors", weights)
+    write(folder / f"{stem}.json", json.dumps(_jsonable(description), indent=2, allow_nan=False) + "\n")
+    return folder / f"{stem}.json"
+
+
+def read_policy(path: Path) -> PortablePolicy:
+    """Read a portable policy; nothing in the files is executed.
+
+    Args:
+        path: The JSON file, the safetensors file beside it, or a folder that holds `policy.json`.
+
+    Raises:
+        NotFoundError: One of the two files is not there.
+        CheckpointError: The files do not belong together, were altered, or are of another format.
+    """
+    json_path, weights_path = _locate(Path(path))
+    try:
+        description = json.loads(read_regular(json_path))
+        weights = read_regular(weights_path, max_bytes=None)
+    except (ValueError, RecursionError, MemoryError) as error:  # JSON and UTF-8 errors are both ValueErrors
+        raise _broken(json_path, f"is not JSON: {error}") from error
+    except OSError as error:
+        raise NotFoundError(
+            f"The policy file {json_path} cannot be read: {error.strerror}.", "Check its permissions."
+        ) from error
+    if not isinstance(description, dict) or "format_version" not in description:
+        raise _broken(json_path, "is not a policy file: it has no format_version")
+    version = description["format_version"]
+    if version not in READABLE_VERSIONS:
+        known = " and ".join(str(number) for number in READABLE_VERSIONS)
+        raise CheckpointError(
+            f"The policy file {json_path} has format version {repr(version)[:80]}; this tune-jobs reads {known}.",
+            "Update tune-jobs, or write the policy file again from its checkpoint.",
+        )
+    digest = hashlib.sha256(weights).hexdigest()
+    if digest != description.get("weights_sha256"):
+        raise _broken(
+            weights_path,
+            f"has SHA-256 {digest[:12]}..., but {json_path.name} names "
+            f"{str(description.get('weights_sha256'))[:12]}...",
+        )
+    policy = _assemble(description, weights, json_path)
+    _check(policy, f"policy file {json_path}")
+    return policy
+
+
+def _locate(path: Path) -> tuple[Path, Path]:
+    if path.is_dir():
+        path = path / "policy.json"
+    elif path.suffix not in {".json", ".safetensors"}:
+        if not path.exists():
+            raise NotFoundError(f"There is no policy file {path}.", "Give a policy.json, or the folder that holds one.")
+        raise CheckpointError(
+            f"{path} is not a policy file: its name ends in neither .json nor .safetensors.",
+            "Give a policy.json, or the folder that holds one.",
+        )
+    pair = (path.with_suffix(".json"), path.with_suffix(".safetensors"))
+    for file in pair:
+        if not file.is_file():
+            raise NotFoundError(
+                f"There is no policy file {file}.",
+                "Give a policy.json with its .safetensors beside it, or the folder that holds both.",
+            )
+    return pair
+
+
+def _broken(path: Path, what: str) -> CheckpointError:
+    return CheckpointError(
+        f"The policy file {path} {what[:_MAX_CHARS]}.",
+        "It is incomplete or was altered: copy both files again, or write them again from the checkpoint.",
+    )
+
+
+def _assemble(description: dict[str, Any], weights: bytes, place: Path) -> PortablePolicy:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        tensors = load(weights)
+        network = network_from_json(description["network"], tensors)
+        if tensors:
+            raise _broken(place, f"does not describe the tensors {sorted(tensors)}")
+        return PortablePolicy(
+            network=network,
+            algorithm=str(description["algorithm"]),
+            env_id=str(description["env_id"]),
+            env_args=dict(description["env_args"]),
+            observation_space=dict(description["observation_space"]),
+            action_space=dict(description["action_space"]),
+            action_transform=description["action_transform"],
+            training=dict(description.get("training") or {}),
+        )
+    except KeyError as error:
+        raise _broken(place, f"lacks {error}") from error
+    except (SafetensorError, *MALFORMED) as error:
+        raise _broken(place, f"cannot be read: {error}") from error
+
+
+def _check(policy: PortablePolicy, place: str) -> None:
+    """Check that the network maps the observations to the actions.
+
+    Raises:
+        CheckpointError: It does not, or a name is unknown.
+    """
+    observation_space = space_from_description(policy.observation_space)
+    action_space = space_from_description(policy.action_space)
+    problem = network_problem(policy.network, observation_space, action_space)
+    if policy.action_transform not in get_args(ActionTransform):
+        problem = f"action transform {policy.action_transform!r} is none of {', '.join(get_args(ActionTransform))}"
+    if problem:
+        raise CheckpointError(
+            f"Wrong {place}: {problem[:_MAX_CHARS]}.", "Write the policy file again from its checkpoint."
+        )
+
+
+def _jsonable(value: Any) -> Any:
+    """Metadata as JSON has it: NumPy scalars as numbers, tuples as lists, NaN and infinity as null."""
+    if isinstance(value, Mapping):
+        return {str(key): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_jsonable(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _jsonable(value.tolist())
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, (str, int, float, bool)) or value is None else str(value)

@@ -1,0 +1,208 @@
+"""The forward pass of a portable network, in NumPy."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.portable.convolution import convolve
+from policies.portable.network import ConvLayer, Layer, Normalization, PolicyNetwork
+
+_IMAGES_AT_ONCE = 32  # a convolution needs several times the memory of its images
+
+
+class ForwardPass:
+    """Observations -> outputs of a network.
+
+    The result for an observation does not depend on what else is in its batch, to the last bit.
+
+    Args:
+        network: One with layers.
+    """
+
+    def __init__(self, network: PolicyNetwork) -> None:
+        self._scale = None if network.scale == 1.0 else np.float32(network.scale)
+        self._normalize = None if network.normalization is None else _Normalize(network.normalization)
+        self._conv = [_Conv(layer) for layer in network.conv]
+        self.layers = [_Linear(layer) for layer in network.layers]
+
+    @property
+    def prepares(self) -> bool:
+        """Whether `prepare` does anything."""
+        return self._scale is not None or self._normalize is not None
+
+    def prepare(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Scaled and normalised observations."""
+        x = observations
+        if self._scale is not None:
+            x = x * self._scale
+        return x if self._normalize is None else self._normalize(x)
+
+    def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Outputs, shape (num, num_outputs), for observations of shape (num, ...)."""
+        if self._conv and len(observations) > _IMAGES_AT_ONCE:
+            parts = range(0, len(observations), _IMAGES_AT_ONCE)
+            return np.concatenate([self(observations[first : first + _IMAGES_AT_ONCE]) for first in parts])
+        x = self.prepare(observations)
+        if self._conv:
+            for conv in self._conv:
+                x = conv(x)
+            x = x.transpose(0, 3, 1, 2)  # channel by channel, as torch flattens
+        # One vector-matrix product an observation (a stack of 1-row matrices): a single product of the batch
+        # takes other BLAS kernels at other batch sizes, whose results differ in the last bit. It costs no
+        # more at these sizes.
+        x = x[:, None, :] if x.ndim == 2 else x.reshape(len(x), 1, math.prod(x.shape[1:]))
+        for layer in self.layers:
+            x = layer(x)
+        return x[:, 0, :]
+
+
+class ForwardPasses:
+    """Several networks at once, each for observations of its own; the bits are those of a `ForwardPass` each.
+
+    Args:
+        passes: Of networks with layers and without convolutions, all of one `layout`.
+    """
+
+    def __init__(self, passes: Sequence[ForwardPass]) -> None:
+        self._passes = passes
+        self._layers = [_Linears(linears) for linears in zip(*(one.layers for one in passes), strict=True)]
+
+    def choose(self, places: Sequence[int]) -> ForwardPasses:
+        """Some of these networks alone."""
+        return ForwardPasses([self._passes[place] for place in places])
+
+    @staticmethod
+    def layout(network: PolicyNetwork) -> tuple[Any, ...]:
+        """What networks must have in common to be computed at once; empty if a network cannot be."""
+        if network.conv or not network.layers:
+            return ()
+        layers = tuple((layer.weight.shape, layer.activation) for layer in network.layers)
+        return (network.scale != 1.0 or network.normalization is not None, layers)
+
+    def __call__(self, observations: NDArray[np.float32], counts: Sequence[int]) -> NDArray[np.float32]:
+        """Outputs, shape (num, num_outputs).
+
+        Args:
+            observations: Shape (num, n): those for the first network, then those for the second, and so on.
+            counts: How many there are for each.
+        """
+        bounds = list(itertools.pairwise(itertools.accumulate(counts, initial=0)))
+        x = observations
+        if self._passes[0].prepares:
+            parts = zip(self._passes, bounds, strict=True)
+            x = np.concatenate([one.prepare(x[first:last]) for one, (first, last) in parts])
+        x = x[:, None, :]
+        for layer in self._layers:
+            x = layer(x, bounds)
+        return x[:, 0, :]
+
+
+class _Normalize:
+    def __init__(self, normalization: Normalization) -> None:
+        self._mean, self._std = normalization.mean, normalization.std
+        self._clip = np.float32(normalization.clip)
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray(np.clip((x - self._mean) / self._std, -self._clip, self._clip), dtype=np.float32)
+
+
+class _Conv:
+    """A convolution, its kernels turned once into the matrix that the product wants."""
+
+    def __init__(self, layer: ConvLayer) -> None:
+        self._kernel, self._stride = layer.weight.shape[2], layer.stride
+        self._matrix = np.ascontiguousarray(layer.weight.reshape(len(layer.weight), -1).T, dtype=np.float32)
+        self._bias = np.asarray(layer.bias, dtype=np.float32)
+        self._activation = _ACTIVATION_FUNCTIONS[layer.activation]
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        x = convolve(x, self._matrix, self._bias, kernel=self._kernel, stride=self._stride)
+        return x if self._activation is None else self._activation(x)
+
+
+class _Linear:
+    """A layer, its weights transposed once into the order that the product wants."""
+
+    def __init__(self, layer: Layer) -> None:
+        self.matrix = np.ascontiguousarray(layer.weight.T, dtype=np.float32)
+        self.bias = np.asarray(layer.bias, dtype=np.float32)
+        self.activation = _ACTIVATION_FUNCTIONS[layer.activation]
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        x = np.matmul(x, self.matrix)
+        x += self.bias
+        return x if self.activation is None else self.activation(x)
+
+
+class _Linears:
+    """A layer of several networks."""
+
+    def __init__(self, linears: Sequence[_Linear]) -> None:
+        self._linears = linears
+        self._activation = linears[0].activation
+
+    @functools.cached_property
+    def _stack(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """All matrices and all biases, with a 1 for what they are multiplied by in between."""
+        matrices, biases = ([getattr(linear, name) for linear in self._linears] for name in ("matrix", "bias"))
+        return np.stack(matrices)[:, None], np.stack(biases)[:, None, None]
+
+    def __call__(self, x: NDArray[np.float32], bounds: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
+        if len({last - first for first, last in bounds}) == 1:
+            # As many observations for each network: one call, of the same vector-matrix products.
+            matrices, biases = self._stack
+            y = np.matmul(x.reshape(len(bounds), -1, 1, x.shape[-1]), matrices)
+            y += biases
+            y = y.reshape(len(x), 1, -1)
+        else:
+            y = np.empty((len(x), 1, len(self._linears[0].bias)), dtype=np.float32)
+            for linear, (first, last) in zip(self._linears, bounds, strict=True):
+                part = y[first:last]
+                np.matmul(x[first:last], linear.matrix, out=part)
+                part += linear.bias
+        return y if self._activation is None else self._activation(y)
+
+
+def _relu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.maximum(x, np.float32(0.0), out=x)
+
+
+def _tanh(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.tanh(x, out=x)
+
+
+def _silu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    # x * sigmoid(x). For very negative x the exponential overflows, and the quotient is the right limit, -0.
+    with np.errstate(over="ignore"):
+        return np.asarray(x / (np.float32(1.0) + np.exp(-x)), dtype=np.float32)
+
+
+def _elu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    negative = np.expm1(np.minimum(x, np.float32(0.0)))
+    return np.asarray(np.where(x > 0, x, negative), dtype=np.float32)
+
+
+def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    # The exact form, torch's default: x times the normal distribution function.
+    # math.erf number by number costs a few times the product of the layer; only SciPy has a faster one.
+    cumulative = 0.5 * (1.0 + _erf(x / math.sqrt(2.0)).astype(np.float64))
+    return np.asarray(x * cumulative, dtype=np.float32)
+
+
+_erf = np.frompyfunc(math.erf, 1, 1)
+
+_ACTIVATION_FUNCTIONS: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]] | None] = {
+    "linear": None,
+    "relu": _relu,
+    "tanh": _tanh,
+    "silu": _silu,
+    "elu": _elu,
+    "gelu": _gelu,
+}

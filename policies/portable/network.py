@@ -1,0 +1,310 @@
+"""The network of a portable policy: its parts, their JSON and tensors, and whether they fit together.
+
+Words: a *layer* is a linear map followed by an activation; the *network* is the chain from observation to output:
+scale, normalization, convolutions, layers, each of them but the last optional. What the output means is the network's
+*kind*:
+
+* `categorical` (PPO, Discrete actions): one logit an action; greedy: the largest.
+* `gaussian` (PPO, Box actions): mean and log standard deviation of each component; greedy: the mean.
+* `q_values` (DQN): one value an action; greedy: the largest. Of a dueling network the layers end in the
+  advantages: the state value is the same for all actions, so it never changes which one is greedy, and is
+  left out.
+* `random`, `constant` (the baselines): no layers; actions drawn uniformly, or always the same one.
+* `module`: no layers; the weights of an RLModule class of the user's own, which computes the actions itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.errors import SpecError
+from policies.hyperparams import ACTIVATIONS
+from policies.portable.convolution import output_shape
+
+NetworkKind = Literal["categorical", "gaussian", "q_values", "random", "constant", "module"]
+BASELINE_KINDS: tuple[NetworkKind, ...] = ("random", "constant")
+Tensors = dict[str, NDArray[Any]]
+ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
+
+_MODULE_PREFIX = "module."
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One linear map and the activation after it: `activation(weight @ x + bias)`."""
+
+    weight: NDArray[np.float32]
+    """Shape (num_outputs, num_inputs)."""
+    bias: NDArray[np.float32]
+    """Shape (num_outputs,)."""
+    activation: str = "linear"
+    """A name of `policies.hyperparams.ACTIVATIONS`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConvLayer:
+    """One convolution without padding, and the activation after it."""
+
+    weight: NDArray[np.float32]
+    """Shape (out_channels, in_channels, kernel, kernel)."""
+    bias: NDArray[np.float32]
+    """Shape (out_channels,)."""
+    stride: int
+    """Pixels between two places of the kernel."""
+    activation: str = "linear"
+    """A name of `policies.hyperparams.ACTIVATIONS`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normalization:
+    """`(x - mean) / std`, no further from 0 than `clip`."""
+
+    mean: NDArray[np.float32]
+    """Of the shape of an observation."""
+    std: NDArray[np.float32]
+    """Of the shape of an observation; > 0."""
+    clip: float
+
+
+@dataclass(frozen=True, eq=False)
+class ModuleWeights:
+    """What an RLModule of the user's own is built from again."""
+
+    class_path: str
+    """`module:Class`."""
+    model_config: dict[str, Any]
+    tensors: Tensors = field(default_factory=dict)
+    """Its state by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyNetwork:
+    """The chain from observation to output, and what the output means (see the module)."""
+
+    kind: NetworkKind
+    layers: tuple[Layer, ...]
+    """After images are flattened, channel by channel."""
+    action: int | tuple[float, ...] | None = None
+    """Of kind `constant` alone: what it does, one number for each component where actions are Box."""
+    conv: tuple[ConvLayer, ...] = ()
+    """Before the layers, for observations of shape (height, width, channels)."""
+    normalization: Normalization | None = None
+    scale: float = 1.0
+    """What observations are multiplied by, first of all."""
+    module: ModuleWeights | None = None
+    """Of kind `module` alone."""
+
+    def parts(self) -> dict[str, tuple[NDArray[Any], ...]]:
+        """All its numbers, by the place that a message names."""
+        parts: dict[str, tuple[NDArray[Any], ...]] = {}
+        if self.normalization is not None:
+            parts["the observation statistics"] = (self.normalization.mean, self.normalization.std)
+        parts |= {f"convolution {index}": (layer.weight, layer.bias) for index, layer in enumerate(self.conv)}
+        parts |= {f"layer {index}": (layer.weight, layer.bias) for index, layer in enumerate(self.layers)}
+        if self.module is not None:
+            parts |= {name: (tensor,) for name, tensor in self.module.tensors.items()}
+        return parts
+
+
+# -- on disk
+
+
+def network_to_json(network: PolicyNetwork) -> tuple[dict[str, Any], Tensors]:
+    """A network as a JSON object and the tensors it names; parts that it does not have are left out."""
+    # Contiguous: safetensors writes the memory as it lies, so a transposed view would be written transposed.
+    tensors: Tensors = {}
+    description: dict[str, Any] = {
+        "kind": network.kind,
+        "activations": [layer.activation for layer in network.layers],
+        "sizes": [layer.weight.shape[0] for layer in network.layers],
+    }
+    for index, layer in enumerate(network.layers):
+        tensors[f"layers.{index}.weight"] = np.ascontiguousarray(layer.weight, dtype=np.float32)
+        tensors[f"layers.{index}.bias"] = np.ascontiguousarray(layer.bias, dtype=np.float32)
+    if network.action is not None:
+        description["action"] = network.action
+    if network.scale != 1.0:
+        description["scale"] = network.scale
+    if network.normalization is not None:
+        description["normalization"] = {"clip": network.normalization.clip}
+        tensors["normalization.mean"] = np.ascontiguousarray(network.normalization.mean, dtype=np.float32)
+        tensors["normalization.std"] = np.ascontiguousarray(network.normalization.std, dtype=np.float32)
+    if network.conv:
+        description["conv"] = [{"stride": layer.stride, "activation": layer.activation} for layer in network.conv]
+        for index, conv in enumerate(network.conv):
+            tensors[f"conv.{index}.weight"] = np.ascontiguousarray(conv.weight, dtype=np.float32)
+            tensors[f"conv.{index}.bias"] = np.ascontiguousarray(conv.bias, dtype=np.float32)
+    if network.module is not None:
+        description["module"] = {"class": network.module.class_path, "model_config": network.module.model_config}
+        for name, tensor in network.module.tensors.items():
+            tensors[_MODULE_PREFIX + name] = np.ascontiguousarray(tensor)
+    return description, tensors
+
+
+def network_from_json(description: Mapping[str, Any], tensors: Tensors) -> PolicyNetwork:
+    """The network that `network_to_json` described; the tensors it takes are removed from `tensors`.
+
+    Raises:
+        KeyError: A tensor or a field is missing.
+        TypeError: A field is of the wrong type.
+        ValueError: The same.
+    """
+    layers = tuple(
+        Layer(tensors.pop(f"layers.{index}.weight"), tensors.pop(f"layers.{index}.bias"), str(activation))
+        for index, activation in enumerate(description["activations"])
+    )
+    conv = tuple(
+        ConvLayer(
+            tensors.pop(f"conv.{index}.weight"),
+            tensors.pop(f"conv.{index}.bias"),
+            stride=int(layer["stride"]),
+            activation=str(layer["activation"]),
+        )
+        for index, layer in enumerate(description.get("conv", ()))
+    )
+    normalization = module = None
+    if "normalization" in description:
+        mean, std = tensors.pop("normalization.mean"), tensors.pop("normalization.std")
+        normalization = Normalization(mean, std, clip=float(description["normalization"]["clip"]))
+    if "module" in description:
+        # Sorted: safetensors gives them in another order each time.
+        names = sorted(name for name in tensors if name.startswith(_MODULE_PREFIX))
+        module = ModuleWeights(
+            class_path=str(description["module"]["class"]),
+            model_config=dict(description["module"]["model_config"]),
+            tensors={name.removeprefix(_MODULE_PREFIX): tensors.pop(name) for name in names},
+        )
+    return PolicyNetwork(
+        kind=description["kind"],
+        layers=layers,
+        action=_action_from_json(description.get("action")),
+        conv=conv,
+        normalization=normalization,
+        scale=float(description.get("scale", 1.0)),
+        module=module,
+    )
+
+
+def _action_from_json(value: Any) -> int | tuple[float, ...] | None:
+    if isinstance(value, list):
+        return tuple(float(item) for item in value)
+    return None if value is None else int(value)
+
+
+# -- whether the parts fit
+
+
+def network_problem(network: PolicyNetwork, observation_space: gym.Space[Any], action_space: ActionSpace) -> str:
+    """Why a network does not map these observations to these actions; empty if it does."""
+    kind = network.kind
+    if kind not in get_args(NetworkKind):
+        return f"network kind {kind!r} is none of {', '.join(get_args(NetworkKind))}"
+    if (network.module is None) is (kind == "module"):
+        return f"a network of kind {kind!r} has {'no' if network.module is None else 'a'} module"
+    if kind == "module" or kind in BASELINE_KINDS:
+        if network.layers or network.conv:
+            return f"a network of kind {kind!r} has {len(network.layers)} layers, but takes none"
+        return "" if kind == "module" else _baseline_problem(network, action_space)
+    shape = observation_space.shape or ()
+    return _normalization_problem(network.normalization, shape) or _chain_problem(network, shape, action_space)
+
+
+def _chain_problem(network: PolicyNetwork, shape: tuple[int, ...], action_space: ActionSpace) -> str:
+    """Why convolutions and layers do not lead from observations of a shape to the actions."""
+    if isinstance(action_space, gym.spaces.Box) is not (network.kind == "gaussian"):
+        what = "box" if isinstance(action_space, gym.spaces.Box) else "discrete"
+        return f"a network of kind {network.kind!r} gives no actions of type {what!r}"
+    if network.conv:
+        if problem := _conv_problem(network.conv, shape):
+            return problem
+        shape = output_shape(shape, conv_filters(network.conv))
+    num_actions = 2 * math.prod(action_space.shape) if isinstance(action_space, gym.spaces.Box) else action_space.n
+    return _layers_problem(network.layers, math.prod(shape), int(num_actions))
+
+
+def conv_filters(conv: tuple[ConvLayer, ...]) -> list[tuple[int, int, int]]:
+    """(channels, kernel, stride) of each convolution."""
+    return [(layer.weight.shape[0], layer.weight.shape[2], layer.stride) for layer in conv]
+
+
+def _normalization_problem(normalization: Normalization | None, shape: tuple[int, ...]) -> str:
+    if normalization is None:
+        return ""
+    for name in ("mean", "std"):
+        found = getattr(normalization, name).shape
+        if found != shape:
+            return f"the normalization has a {name} of shape {found}, but observations are of shape {shape}"
+    return "" if normalization.clip > 0 else f"the normalization clips at {normalization.clip}"
+
+
+def _conv_problem(conv: tuple[ConvLayer, ...], shape: tuple[int, ...]) -> str:
+    channels = shape[-1] if shape else 0
+    for index, layer in enumerate(conv):
+        weight, bias = layer.weight, layer.bias
+        if layer.activation not in ACTIVATIONS:
+            return f"convolution {index} has activation {layer.activation!r}; known are {', '.join(ACTIVATIONS)}"
+        if weight.ndim != 4 or weight.shape[1] != channels or weight.shape[2] != weight.shape[3] or layer.stride < 1:
+            return (
+                f"convolution {index} has weights of shape {weight.shape} and stride {layer.stride}, "
+                f"but its input has {channels} channels"
+            )
+        if bias.shape != weight.shape[:1]:
+            return f"convolution {index} has a bias of shape {bias.shape} but weights of shape {weight.shape}"
+        channels = weight.shape[0]
+    try:
+        output_shape(shape, conv_filters(conv))
+    except SpecError as error:
+        return error.message.rstrip(".")
+    return ""
+
+
+def _layers_problem(layers: tuple[Layer, ...], num_inputs: int, num_outputs: int) -> str:
+    size = num_inputs
+    for index, layer in enumerate(layers):
+        weight, bias = layer.weight, layer.bias
+        if layer.activation not in ACTIVATIONS:
+            return f"layer {index} has activation {layer.activation!r}; known are {', '.join(ACTIVATIONS)}"
+        if weight.ndim != 2 or weight.shape[1] != size:
+            return f"layer {index} has weights of shape {weight.shape}, but its input has {size} numbers"
+        if bias.shape != weight.shape[:1]:
+            return f"layer {index} has a bias of shape {bias.shape} but weights of shape {weight.shape}"
+        size = weight.shape[0]
+    if not layers:
+        return "the network has no layers"
+    return "" if size == num_outputs else f"the network has {size} outputs, but its actions need {num_outputs}"
+
+
+def _baseline_problem(network: PolicyNetwork, action_space: ActionSpace) -> str:
+    if network.kind == "random":
+        return "" if network.action is None else f"a network of kind 'random' has the action {network.action!r}"
+    return action_problem(network.action, action_space)
+
+
+def action_problem(action: int | tuple[float, ...] | None, space: ActionSpace) -> str:
+    """Why an action is none of a space; empty if it is one.
+
+    Args:
+        action: An int for Discrete actions; one number for each component for Box actions.
+        space: Where actions are taken from.
+    """
+    if isinstance(space, gym.spaces.Discrete):
+        first, last = int(space.start), int(space.start) + int(space.n) - 1
+        fits = isinstance(action, int) and first <= action <= last
+        return "" if fits else f"{action!r} is none of the actions, which are the whole numbers {first} to {last}"
+    size = math.prod(space.shape)
+    numbers = f"a list of {size} number{'' if size == 1 else 's'}"
+    if not isinstance(action, tuple) or len(action) != size:
+        shown = list(action) if isinstance(action, tuple) else action
+        return f"{shown!r} is none of the actions, each of which is {numbers}"
+    values = np.array(action, dtype=np.float64).reshape(space.shape)
+    # In the space's own precision, or its bounds themselves would seem to lie outside.
+    if not space.contains(values.astype(space.dtype)):
+        return f"{list(action)!r} is none of the actions, which lie in {space.low.tolist()} to {space.high.tolist()}"
+    return ""

@@ -1,0 +1,1 @@
+"""Hyperparameters as RLlib configurations; sampling, learners, and checkpoints restored."""

@@ -1,0 +1,180 @@
+"""RLlib's weights as a portable policy, and an RLlib checkpoint as an `Algorithm` that trains on.
+
+A restore succeeds with the very weights that were saved, or raises: RLlib's own `from_checkpoint` only warns when a
+module class cannot be imported or a key is missing, and goes on with fresh weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.core import DEFAULT_MODULE_ID
+
+from policies.acting.policy import action_transform
+from policies.errors import CheckpointError, TuneJobsError
+from policies.hyperparams import PPOHyperparams, TrainedHyperparams
+from policies.networks.portable_weights import network_from_weights, normalization_in
+from policies.networks.rl_modules import RL_MODULE_KEY, import_module_class
+from policies.portable.file import (
+    ModuleWeights,
+    PolicyNetwork,
+    PortablePolicy,
+    describe_space,
+)
+
+Weights = Mapping[str, NDArray[Any]]
+
+_RESTORE_HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
+
+
+def _module_network(algorithm: Algorithm, class_path: str) -> PolicyNetwork:
+    """What a module of the user's own is built from again, with the weights that acting needs."""
+    module = _modules(algorithm)["learner"]
+    weights = ModuleWeights(class_path, dict(module.model_config), module.get_state(inference_only=True))
+    return PolicyNetwork(kind="module", layers=(), module=weights)
+
+
+def portable_policy(
+    algorithm: Algorithm,
+    hyperparams: TrainedHyperparams,
+    *,
+    env_id: str,
+    env_args: dict[str, Any],
+    training: dict[str, Any] | None = None,
+) -> PortablePolicy:
+    """The greedy policy of a running Algorithm, with all that is needed to act without RLlib.
+
+    Raises:
+        CheckpointError: Its network is not the one the hyperparameters describe.
+    """
+    module = algorithm.get_module()
+    observation_space, action_space = module.observation_space, module.action_space
+    class_path = module.model_config.get(RL_MODULE_KEY)
+    if class_path is None:
+        network = network_from_weights(learner_weights(algorithm), hyperparams, observation_space, action_space)
+    else:
+        network = _module_network(algorithm, class_path)
+    return PortablePolicy(
+        network=network,
+        algorithm="ppo" if isinstance(hyperparams, PPOHyperparams) else "dqn",
+        env_id=env_id,
+        env_args=env_args,
+        observation_space=describe_space(observation_space),
+        action_space=describe_space(action_space),
+        action_transform=action_transform(action_space),
+        training=training or {},
+    )
+
+
+def learner_weights(algorithm: Algorithm) -> dict[str, NDArray[Any]]:
+    """The learner's weights of the one RLModule, as numpy arrays."""
+    weights: dict[str, NDArray[Any]] = algorithm.learner_group.get_weights()[DEFAULT_MODULE_ID]
+    return weights
+
+
+def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = None) -> Algorithm:
+    """Restore an RLlib checkpoint as an `Algorithm` that can train on.
+
+    RLlib's checkpoints are pickles: restore only what you trust. Callers check the manifest's hashes first.
+
+    Args:
+        rllib_checkpoint: The folder RLlib's `save_to_path` wrote.
+        expected: The network that was saved beside it; the restored weights must be equal to it.
+
+    Raises:
+        CheckpointError: RLlib cannot restore it, or the weights are not the expected ones.
+    """
+    if expected is not None and expected.module is not None:
+        # Before RLlib imports it: it would go on with another class where this one is missing.
+        import_module_class(expected.module.class_path)
+    try:
+        algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
+    except Exception as error:
+        raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
+    try:
+        _check_module_classes(algorithm)
+        if expected is not None:
+            check_weights(algorithm, expected)
+    except TuneJobsError as error:
+        algorithm.stop()
+        raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
+    return algorithm
+
+
+def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: PolicyNetwork) -> None:
+    """Give a new Algorithm the state of a checkpoint, and let its own settings act on it.
+
+    Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's.
+    Learning rate, betas and the like are the Algorithm's: RLlib's optimizer state brings the old ones along (2.60).
+
+    Args:
+        algorithm: Just built, with networks of the same shapes. It is stopped if this fails.
+        rllib_checkpoint: The folder RLlib's `save_to_path` wrote; a pickle, as in `restore_algorithm`.
+        expected: The network that was saved beside it.
+
+    Raises:
+        CheckpointError: RLlib cannot restore it, or the weights are not the expected ones.
+    """
+    settings = [
+        {name: value for name, value in group.items() if name != "params"} for group in _optimizer_groups(algorithm)
+    ]
+    try:
+        algorithm.restore_from_path(str(rllib_checkpoint.absolute()))
+        for group, own in zip(_optimizer_groups(algorithm), settings, strict=True):
+            group.update(own)
+        check_weights(algorithm, expected)
+    except TuneJobsError as error:
+        algorithm.stop()
+        raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
+    except Exception as error:
+        algorithm.stop()
+        raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
+
+
+def _optimizer_groups(algorithm: Algorithm) -> list[dict[str, Any]]:
+    """The optimizer's groups of parameters, each with its settings; as in torch."""
+    learner = algorithm.learner_group._learner  # noqa: SLF001 - RLlib has no public way to the local one
+    return [group for _, item in learner.get_optimizers_for_module(DEFAULT_MODULE_ID) for group in item.param_groups]
+
+
+def _modules(algorithm: Algorithm) -> dict[str, Any]:
+    """The RLModules of this process: the one that learns, and the one that acts, if it is here."""
+    modules = {"learner": algorithm.learner_group._learner.module[DEFAULT_MODULE_ID]}  # noqa: SLF001
+    runner = algorithm.env_runner
+    if runner is not None and runner.module is not None:
+        modules["env runner"] = runner.module
+    return modules
+
+
+def _check_module_classes(algorithm: Algorithm) -> None:
+    for source, module in _modules(algorithm).items():
+        class_path = module.model_config.get(RL_MODULE_KEY)
+        if class_path is not None and type(module) is not import_module_class(class_path):
+            raise CheckpointError(
+                f"the restored {source} has a module of class {type(module).__name__}, but {class_path} was saved.",
+                _RESTORE_HINT,
+            )
+
+
+def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
+    """Check that an Algorithm's learner and its env runner hold a network's very weights.
+
+    Raises:
+        CheckpointError: They differ.
+    """
+    sources = {source: module.get_state() for source, module in _modules(algorithm).items()}
+    for source, weights in sources.items():
+        held = {np.asarray(value).tobytes() for value in weights.values()}
+        if "obs_mean" in weights:
+            normalization = normalization_in(weights)
+            held |= {normalization.mean.tobytes(), normalization.std.tobytes()}
+        for place, arrays in expected.parts().items():
+            if any(array.tobytes() not in held for array in arrays):
+                raise CheckpointError(
+                    f"the restored {source} does not hold the saved weights of {place}.", _RESTORE_HINT
+                )

@@ -1,0 +1,1 @@
+"""The command line: parse, call the verbs of `tune_jobs.sweeps.verbs`, print."""

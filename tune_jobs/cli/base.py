@@ -1,0 +1,227 @@
+"""What every command shares: options, errors as messages with exit codes, a clean standard output."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from policies.errors import CannotRunError, TuneJobsError, said_by
+
+if TYPE_CHECKING:
+    from tune_jobs.sweeps.drive import SweepResult
+
+_INTERRUPTED, _CANNOT_PRINT = 130, CannotRunError.exit_code
+_NOBODY_READS = (errno.EPIPE, errno.EIO)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_UNCHANGED = {
+    "launch": "No trial had begun, and nothing was kept.",
+    "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` goes on with it.",
+    "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
+}
+_JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+class CommandGroup(click.Group):
+    """A group whose commands end with a clear message and the right exit code, never with a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the chosen command; exit codes as in the design."""
+        try:
+            return super().invoke(ctx)
+        except (click.exceptions.Exit, click.Abort, BrokenPipeError):
+            raise
+        except click.ClickException as error:
+            if ctx.meta.get(_JSON):
+                _print_json_error(error.format_message(), "", error.exit_code)
+            raise
+        except KeyboardInterrupt as interruption:
+            hint = _hint_after(interruption, ctx.invoked_subcommand or "")
+            with losing_what_nobody_reads(True):  # noqa: FBT003
+                _print_error(ctx, "Interrupted.", hint, _INTERRUPTED)
+            ctx.exit(_INTERRUPTED)
+        except TuneJobsError as error:
+            if ctx.meta.get(DEBUG):
+                traceback.print_exc()
+            _print_error(ctx, error.message, error.hint, error.exit_code)
+            ctx.exit(error.exit_code)
+        except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback on a user's terminal
+            # Of a file of ours it would be a CannotRunError, with the file's name.
+            if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
+                _write_nowhere(1)
+                said = f"The output of this command cannot be written: {error.strerror}."
+                _print_error(ctx, said, "Free space where it goes, or send it elsewhere.", _CANNOT_PRINT)
+                ctx.exit(_CANNOT_PRINT)
+            message = f"Unexpected {type(error).__name__}: {said_by(error)}"
+            if ctx.meta.get(DEBUG):
+                traceback.print_exc()
+                hint = ""
+            else:
+                hint = f"This is a bug in tune-jobs. The traceback is in {_save_traceback()}; --debug prints it."
+            _print_error(ctx, message, hint, TuneJobsError.exit_code)
+            ctx.exit(TuneJobsError.exit_code)
+
+
+def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
+    from tune_jobs.process.interruption import SweepInterrupted
+
+    if isinstance(interruption, SweepInterrupted):
+        return _UNCHANGED[command]
+    return "What is done is kept; `tune-jobs resume SWEEP` goes on with it." if command in _UNCHANGED else ""
+
+
+def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) -> None:
+    click.echo(f"error: {message}" + (f"\n{hint}" if hint else ""), err=True)
+    if ctx.meta.get(_JSON):
+        _print_json_error(message, hint, exit_code)
+
+
+def _print_json_error(message: str, hint: str, exit_code: int) -> None:
+    from tune_jobs.cli.output import print_json
+
+    print_json({"error": message, "hint": hint, "exit_code": exit_code})
+
+
+def _save_traceback() -> str:
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="tune-jobs-error-", suffix=".txt", delete=False, encoding="utf-8"
+    ) as file:
+        traceback.print_exc(file=file)
+    return file.name
+
+
+def _remember_json(ctx: click.Context, _: click.Parameter, value: bool) -> bool:  # noqa: FBT001 - click's signature
+    ctx.meta[_JSON] = value
+    return value
+
+
+def print_version(ctx: click.Context, _: click.Parameter, value: bool) -> None:  # noqa: FBT001 - click's signature
+    """Callback of --version: print it and leave."""
+    if not value or ctx.resilient_parsing:
+        return
+    from importlib import metadata
+
+    try:
+        version = metadata.version("tune-jobs")
+    except metadata.PackageNotFoundError:
+        version = "(not installed)"
+    click.echo(f"tune-jobs {version}")
+    ctx.exit()
+
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, callback=_remember_json, is_eager=True,
+    help="Print one JSON document on standard output.",
+)  # fmt: skip
+storage_option = click.option(
+    "--storage", metavar="FOLDER", help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]"
+)
+num_episodes_option = click.option(
+    "--num-episodes", type=click.IntRange(1, 2**18), default=100, show_default=True, help="Greedy episodes."
+)
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="A.B=VALUE",
+    help="Override one field of the sweep file; VALUE is YAML, empty takes the field out. May be repeated.",
+)  # fmt: skip
+
+
+def _allow(_: click.Context, __: click.Parameter, names: tuple[str, ...]) -> None:
+    from policies.envs.modules import allow_modules
+
+    allow_modules(names)
+
+
+allow_module_option = click.option(
+    "--allow-module", multiple=True, metavar="NAME", callback=_allow, expose_value=False,
+    help="Let env ids and rl_module name this Python module, which runs its code. May be repeated.",
+)  # fmt: skip
+env_option = click.option(
+    "--env", "env_id", metavar="ID", help="Environment; needed for a baseline, else the policy's own."
+)
+
+
+def _read_action(_: click.Context, __: click.Parameter, text: str | None) -> int | tuple[float, ...] | None:
+    """A whole number, or numbers with commas between them: brackets may stand around those."""
+    if text is None:
+        return None
+    try:
+        if not text.lstrip().startswith("[") and "," not in text and "." not in text:
+            return int(text)
+        return tuple(float(part) for part in text.strip().strip("[]").split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{text!r} is neither a whole number nor a list such as [0.5,-1].") from error
+
+
+action_option = click.option(
+    "--action", metavar="VALUE", callback=_read_action,
+    help="What 'constant' does: a number, or a list such as [0.5,-1].  [default: 0]",
+)  # fmt: skip
+
+
+def run_options(command: _Command) -> _Command:
+    """Options of the commands that run trials."""
+    for option in (
+        click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report."),
+        click.option("--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."),
+        click.option("--address", metavar="ADDRESS", help="Ray cluster: auto or ray://...; without it, this machine."),
+        allow_module_option,
+        storage_option,
+        json_option,
+    ):
+        command = option(command)
+    return command
+
+
+@contextlib.contextmanager
+def stdout_for(*, as_json: bool) -> Iterator[None]:
+    """With --json nothing but the document may reach standard output, whatever a library prints."""
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        yield
+
+
+def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> SweepResult:
+    """What a launch, resume or extend came to, also where a signal ended it.
+
+    Raises:
+        KeyboardInterrupt: It ended before the sweep had begun.
+    """
+    from tune_jobs.process.interruption import SweepInterrupted
+
+    try:
+        return call(*args, **kwargs)
+    except SweepInterrupted as interruption:
+        if interruption.result is None:
+            raise
+        return interruption.result
+
+
+@contextlib.contextmanager
+def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT001
+    """Of what may go away: who read a command's output from a pipe, its terminal, and if it was interrupted anything.
+
+    A sweep that was run is not told as failed for that.
+    """
+    try:
+        yield
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except OSError as error:
+        if not interrupted and error.errno not in _NOBODY_READS:
+            raise
+        _write_nowhere(1, 2)
+
+
+def _write_nowhere(*numbers: int) -> None:
+    """From now on: Python flushes standard output and error once more when it ends."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for number in numbers:
+        os.dup2(nowhere, number)
+    os.close(nowhere)

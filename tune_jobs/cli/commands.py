@@ -1,0 +1,330 @@
+"""The command line: parse, call `tune_jobs.sweeps.verbs`, print.
+
+Importing this imports neither ray nor torch, so help, validation and dry runs answer at once. With `--json`
+standard output holds one JSON document, also when a command fails; everything else goes to standard error.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from policies.errors import SpecError
+from policies.guard.guard import guarding
+from policies.standard_streams import standard_streams
+from tune_jobs.cli.base import (
+    DEBUG,
+    CommandGroup,
+    action_option,
+    allow_module_option,
+    env_option,
+    json_option,
+    losing_what_nobody_reads,
+    num_episodes_option,
+    print_version,
+    result_of,
+    run_options,
+    set_option,
+    stdout_for,
+    storage_option,
+)
+
+
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.option("--debug", is_flag=True, help="Print the traceback of an error.")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=print_version,
+    help="Print the version.",
+)
+@click.pass_context
+def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's signature
+    """Hyperparameter search for reinforcement learning: from one sweep file to the best policy on video.
+
+    SPEC is a sweep file or a preset; SWEEP is a sweep's name or folder.
+
+    Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials or the best's confirmation failed, 4 no such
+    sweep, trial or checkpoint, 5 cannot run here, 130 interrupted.
+    """
+    ctx.meta[DEBUG] = debug
+
+
+@cli.command()
+@click.argument("spec")
+@set_option
+@click.option(
+    "--name", help="Name of the sweep.  [default: SPEC's `name`, else the file's or preset's, with a number if taken]"
+)
+@click.option("--dry-run", is_flag=True, help="Print the plan and start nothing.")
+@run_options
+@click.pass_context
+def launch(
+    ctx: click.Context,
+    /,
+    *,
+    spec: str,
+    overrides: tuple[str, ...],
+    name: str | None,
+    dry_run: bool,
+    storage: str | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Run a sweep: all trials, then the best policy, its video and a report."""
+    # Its child starts while this process still imports what it needs itself.
+    ctx.with_resource(guarding(start=True))
+    if dry_run:
+        from tune_jobs.cli import plan_view as cli_plan
+        from tune_jobs.sweeps.dry_run import planned
+
+        with stdout_for(as_json=as_json):
+            loaded, plan = planned(spec, overrides, name=name, storage=storage, address=options["address"])
+        cli_plan.show_plan(loaded, plan, as_json=as_json)
+        return
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        result = result_of(sweeps.launch, spec, overrides=overrides, name=name, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
+    ctx.exit(result.exit_code)
+
+
+@cli.command(name="list")
+@storage_option
+@json_option
+def list_command(*, storage: str | None, as_json: bool) -> None:
+    """List the sweeps of a storage folder."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        statuses = sweeps.list_sweeps(storage)
+    cli_output.show_sweeps(statuses, as_json=as_json)
+
+
+@cli.command()
+@click.argument("sweep")
+@storage_option
+@json_option
+def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
+    """Say how far a sweep is."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        state = sweeps.status(sweep, storage=storage)
+    cli_output.show_status(state, as_json=as_json)
+
+
+@cli.command()
+@click.argument("sweep")
+@storage_option
+@json_option
+def trials(*, sweep: str, storage: str | None, as_json: bool) -> None:
+    """List the trials of a sweep with their points, scores and errors."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        records = sweeps.trials(sweep, storage=storage)
+    cli_output.show_trials(records, as_json=as_json)
+
+
+@cli.command()
+@click.argument("sweep")
+@click.option("--retry-failed", is_flag=True, help="Run the failed trials again, too.")
+@run_options
+@click.pass_context
+def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: bool, **options: Any) -> None:
+    """Go on with a sweep that was interrupted: what is done stays, trials go on from their checkpoints.
+
+    Such a trial begins new episodes there, and DQN fills its replay memory anew: its numbers differ from those of a
+    trial that nothing has interrupted.
+    """
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        result = result_of(sweeps.resume, sweep, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
+    ctx.exit(result.exit_code)
+
+
+@cli.command()
+@click.argument("sweep")
+@click.option("--num-samples", type=click.IntRange(min=1), required=True, help="How many more samples to run.")
+@run_options
+@click.pass_context
+def extend(
+    ctx: click.Context, /, *, sweep: str, num_samples: int, storage: str | None, as_json: bool, **options: Any
+) -> None:
+    """Add trials to a sweep: more samples of its space, the earlier points stay as they are."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        result = result_of(sweeps.extend, sweep, num_samples, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
+    ctx.exit(result.exit_code)
+
+
+@cli.command()
+@click.argument("sweep")
+@storage_option
+@json_option
+def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
+    """Ask a running sweep to stop; it can be resumed."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        was_running = sweeps.stop(sweep, storage=storage)
+    cli_output.show_stop(sweep, was_running=was_running, as_json=as_json)
+
+
+@cli.command()
+@click.argument("sweep")
+@num_episodes_option
+@allow_module_option
+@storage_option
+@json_option
+def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -> None:
+    """Choose the best checkpoint, confirm it on fresh seeds and export its policy."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        record = sweeps.best(sweep, storage=storage, num_episodes=num_episodes)
+    cli_output.show_best(record, as_json=as_json)
+
+
+@cli.command()
+@click.argument("source")
+@num_episodes_option
+@click.option("--first-seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the first episode; they count up.")
+@env_option
+@action_option
+@allow_module_option
+@storage_option
+@json_option
+def evaluate(
+    *,
+    source: str,
+    num_episodes: int,
+    first_seed: int | None,
+    env_id: str | None,
+    action: int | tuple[float, ...] | None,
+    storage: str | None,
+    as_json: bool,
+) -> None:
+    """Run greedy episodes of a policy, beside a random one.
+
+    SOURCE is a sweep (its best policy), SWEEP/TRIAL such as mysweep/t0003, a checkpoint folder, a policy
+    file, or a baseline with --env: 'random', or 'constant' with --action.
+    """
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    _check_baseline(source, env_id)
+    with stdout_for(as_json=as_json):
+        policy, random = sweeps.evaluate(
+            source, storage=storage, num_episodes=num_episodes, first_seed=first_seed, env_id=env_id, action=action
+        )
+    cli_output.show_evaluation(policy, random, as_json=as_json)
+
+
+@cli.command()
+@click.argument("source")
+@click.option("--output", metavar="PATH", help="File to write, as .mp4 and .gif; or a folder, ending with /.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
+@env_option
+@action_option
+@allow_module_option
+@storage_option
+@json_option
+def video(
+    *,
+    source: str,
+    output: str | None,
+    seed: int | None,
+    env_id: str | None,
+    action: int | tuple[float, ...] | None,
+    storage: str | None,
+    as_json: bool,
+) -> None:
+    """Film a policy: MP4 and GIF; of a sweep also before and after training side by side.
+
+    SOURCE is as for evaluate.
+    """
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    _check_baseline(source, env_id)
+    with stdout_for(as_json=as_json):
+        paths = sweeps.video(source, storage=storage, output=output, seed=seed, env_id=env_id, action=action)
+    cli_output.show_paths(paths, as_json=as_json)
+
+
+def _check_baseline(source: str, env_id: str | None) -> None:
+    if source in ("random", "constant") and env_id is None:
+        raise SpecError(f"A {source} policy has no environment of its own.", "Add --env, such as --env CartPole-v1.")
+
+
+@cli.command()
+@click.argument("sweep")
+@allow_module_option
+@storage_option
+@json_option
+def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
+    """Write the report of a sweep: one HTML page, tables and figures."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        path = sweeps.report(sweep, storage=storage)
+    cli_output.show_paths({"report": path}, as_json=as_json)
+
+
+@cli.command()
+@click.argument("name", required=False)
+@json_option
+def presets(*, name: str | None, as_json: bool) -> None:
+    """List the presets, or print the sweep file of one."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.spec.file import find_preset, list_presets
+
+    if name is None:
+        cli_output.show_presets(list_presets(), as_json=as_json)
+    else:
+        cli_output.show_preset(find_preset(name), as_json=as_json)
+
+
+@cli.command()
+@json_option
+def schema(*, as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON either way
+    """Print the JSON Schema of the sweep file, for editors."""
+    from tune_jobs.cli.output import print_json
+    from tune_jobs.spec.file import json_schema
+
+    print_json(json_schema())
+
+
+def main() -> None:
+    """Entry point of the `tune-jobs` script."""
+    from tune_jobs.process.interruption import end_in_order
+
+    end_in_order()
+    with standard_streams():
+        cli(prog_name="tune-jobs")
+
+
+if __name__ == "__main__":
+    main()

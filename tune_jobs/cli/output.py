@@ -1,0 +1,350 @@
+"""What the commands print: tables for people, one JSON document for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from pydantic import BaseModel
+
+from analysis.wording import counted
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from analysis.records import BestRecord, EvaluationRecord, TrialRecord
+    from tune_jobs.spec.file import Preset
+    from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
+
+# Derived figures that a reader of the JSON would otherwise compute anew.
+_DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
+_STATUS_STYLES = {
+    "completed": "green",
+    "failed": "red",
+    "running": "cyan",
+    "stopped": "yellow",
+    "paused": "yellow",
+}
+
+
+def to_json(value: Any) -> Any:
+    """Records, dataclasses and paths as JSON-like data; a number that isn't finite becomes null."""
+    if isinstance(value, BaseModel):
+        data = {name: getattr(value, name) for name in type(value).model_fields}
+        data |= {name: getattr(value, name) for name in _DERIVED if hasattr(type(value), name)}
+        return to_json(data)
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    return [to_json(item) for item in value] if isinstance(value, Iterable) else str(value)
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON document on standard output."""
+    click.echo(json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def format_value(value: Any) -> str:
+    """A hyperparameter for a table: 64x64 for lists, four digits for floats."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return "x".join(format_value(item) for item in value)
+    return "-" if value is None else str(value)
+
+
+def format_score(value: float | None) -> str:
+    """A return for a table."""
+    return "-" if value is None else f"{value:.1f}"
+
+
+def format_duration(seconds: float) -> str:
+    """Seconds as people say them: 42 s, 3 min 20 s, 2 h 5 min."""
+    if not math.isfinite(seconds):
+        return "-"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def format_bytes(number: float) -> str:
+    """Bytes in powers of 1,000."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if number < 1000:
+            return f"{number:.0f} {unit}"
+        number /= 1000
+    return f"{number:.1f} TB"
+
+
+def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
+    """Print what a launch, resume or extend came to, and where everything lies."""
+    at = "" if storage is None else f" --storage {shlex.quote(storage)}"
+    if result.sweep.address is not None:
+        at += f" --address {shlex.quote(result.sweep.address)}"
+    how_to_resume = f"tune-jobs resume {shlex.quote(result.sweep.name)}{at}"
+    if as_json:
+        print_json({**to_json(result), "exit_code": result.exit_code})
+    else:
+        console = make_console()
+        _print_trial_counts(console, result.trials)
+        if result.best is not None:
+            _print_best(console, result.best)
+        elif result.why_no_best is not None:
+            console.print(f"no best policy: {result.why_no_best}", style="yellow")
+        from analysis.wording import shown_path
+
+        paths = {"sweep": result.folder, **result.artifacts}
+        print_facts(console, {name.replace("_", " "): shown_path(path) for name, path in paths.items()})
+        for note in result.notes:
+            console.print(f"note: {note}", style="yellow")
+    if result.interrupted:
+        done = result.sweep.state == "completed"
+        kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Go on with"
+        click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
+
+
+def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None:
+    counts = dict.fromkeys(("completed", "stopped", "failed", "running", "paused", "pending"), 0)
+    for trial in trials:
+        counts[trial.status] += 1
+    told = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+    steps = sum(trial.num_env_steps for trial in trials)
+    console.print(f"{counted(len(trials), 'trial')}: {told}; {counted(steps, 'env step')}")
+    for trial in trials:
+        if trial.status == "failed":
+            console.print(f"{trial.trial_id} failed: {_first_line(trial.error)}", style="red")
+    _print_trial_notes(console, trials)
+
+
+def _print_trial_notes(console: Console, trials: Sequence[TrialRecord]) -> None:
+    """Print what of trials was damaged; they went on from something else than their latest checkpoint or results."""
+    for trial in trials:
+        for note in trial.notes:
+            console.print(f"{trial.trial_id}: {note}", style="yellow")
+
+
+def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
+    """Print the sweeps of a storage folder."""
+    if as_json:
+        print_json(statuses)
+        return
+    console = make_console()
+    if not statuses:
+        console.print("There are no sweeps here yet.")
+        return
+    table = make_table("sweep", "state", "trials", "created")
+    for status in statuses:
+        table.add_row(status.sweep.name, _state(status), _counts(status), _local_time(status.sweep.created_at))
+    console.print(table)
+
+
+def _local_time(unix_time: float) -> str:
+    try:
+        return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_time))
+    except (ValueError, OverflowError, OSError):
+        return "-"
+
+
+def show_status(status: SweepStatus, *, as_json: bool) -> None:
+    """Print how far a sweep is."""
+    if as_json:
+        print_json(status)
+        return
+    facts = {
+        "sweep": status.sweep.name,
+        "state": _state(status),
+        "trials": f"{status.sweep.num_trials}: {_counts(status)}",
+        "run time": format_duration(status.sweep.run_time_s),
+    }
+    print_facts(make_console(), facts)
+
+
+def _state(status: SweepStatus) -> str:
+    # A sweep whose process was killed still calls itself running.
+    gone = status.sweep.state == "running" and not status.alive
+    return "interrupted" if gone else status.sweep.state
+
+
+def _counts(status: SweepStatus) -> str:
+    return ", ".join(f"{number} {name}" for name, number in status.counts.items() if number) or "none"
+
+
+def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
+    """Print one line a trial."""
+    if as_json:
+        print_json(trials)
+        return
+    from rich.text import Text
+
+    names = list(dict.fromkeys(name for trial in trials for name in trial.point))
+    columns = ["trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by"]
+    engines_differ = len({trial.engine for trial in trials}) > 1
+    copies = any(trial.changes for trial in trials)
+    table = make_table(*columns, *(["engine"] if engines_differ else []), *(["copied"] if copies else []))
+    for trial in trials:
+        table.add_row(
+            trial.trial_id,
+            Text(trial.status, style=_STATUS_STYLES.get(trial.status, "")),
+            *(format_value(trial.point.get(name)) for name in names),
+            f"{trial.num_env_steps:,}",
+            format_duration(trial.time_s),
+            format_score(trial.training_return),
+            format_score(trial.evaluation_return),
+            format_score(trial.best_evaluation_return),
+            Text(_first_line(trial.error) if trial.status == "failed" else (trial.stop_reason or "-")),
+            *([trial.engine] if engines_differ else []),
+            *([", ".join(change.source_trial_id for change in trial.changes) or "-"] if copies else []),
+        )
+    console = make_console()
+    console.print(table)
+    _print_trial_notes(console, trials)
+
+
+def show_best(best: BestRecord, *, as_json: bool) -> None:
+    """Print the winner, what it was chosen by and what it was confirmed at."""
+    if as_json:
+        print_json(best)
+    else:
+        _print_best(make_console(), best)
+
+
+def _print_best(console: Console, best: BestRecord) -> None:
+    point = ", ".join(f"{name} {format_value(value)}" for name, value in best.point.items())
+    where = f"{best.checkpoint.trial_id}, iteration {best.checkpoint.iteration}"
+    facts = {
+        "best": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
+        "chosen by": f"{best.selection_score:.1f} mean evaluation return",
+        "confirmed at": f"{_returns(best.confirmation)}; gap {best.optimism_gap:+.1f}",
+        "random policy": _returns(best.random),
+    }
+    print_facts(console, facts | _verdict(best.confirmation))
+
+
+def show_evaluation(policy: EvaluationRecord, random: EvaluationRecord, *, as_json: bool) -> None:
+    """Print the greedy episodes of a policy beside a random one's."""
+    if as_json:
+        print_json({"policy": policy, "random": random})
+        return
+    facts = {policy.policy: _returns(policy)}
+    if policy.policy != "random":
+        facts["random policy"] = _returns(random)
+    print_facts(make_console(), facts | {"seeds": span(policy.seeds)} | _verdict(policy))
+
+
+def span(seeds: Sequence[int]) -> str:
+    """The first and the last of them."""
+    return f"{seeds[0]} to {seeds[-1]}"
+
+
+def _returns(record: EvaluationRecord) -> str:
+    low, high = min(record.returns), max(record.returns)
+    spread = f"{record.mean_return:.1f} ± {record.std_return:.1f}"
+    return f"{spread} over {counted(record.num_episodes, 'episode')} ({low:g} to {high:g})"
+
+
+def _verdict(record: EvaluationRecord) -> dict[str, str]:
+    if record.solved is None:
+        return {record.env_id: "has no threshold to be solved at"}
+    return {record.env_id: f"{'solved' if record.solved else 'not solved'} (threshold {record.threshold:g})"}
+
+
+def show_paths(paths: Mapping[str, Path], *, as_json: bool) -> None:
+    """Print where files were written."""
+    from analysis.wording import shown_path
+
+    if as_json:
+        print_json(paths)
+    else:
+        print_facts(make_console(), {name: shown_path(path) for name, path in paths.items()})
+
+
+def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
+    """Print whether there was something to stop."""
+    if as_json:
+        print_json({"sweep": sweep, "was_running": was_running})
+    elif was_running:
+        click.echo(f"{sweep} stops after the iterations now running; `tune-jobs resume {sweep}` goes on with it.")
+    else:
+        click.echo(f"{sweep} is not running.")
+
+
+def show_presets(presets: Sequence[Preset], *, as_json: bool) -> None:
+    """Print one line a preset: what it is, what it reaches, and what that costs."""
+    if as_json:
+        print_json([preset._asdict() for preset in presets])
+        return
+    from rich.text import Text
+
+    console = make_console()
+    details = ("what", "expected", "env steps", "time on 2 cores")
+    table = make_table("preset", *details, wrapped=details)
+    for preset in presets:
+        # As texts, or a title in brackets would be read as a style.
+        cells = (preset.title, preset.expected, preset.env_steps, preset.time.removesuffix(" on 2 cores"))
+        table.add_row(preset.name, *(Text(cell) for cell in cells))
+    console.print(table)
+    console.print("Print one with `tune-jobs presets NAME`, run it with `tune-jobs launch NAME`.", style="dim")
+
+
+def show_preset(preset: Preset, *, as_json: bool) -> None:
+    """Print one preset's sweep file, to be copied and changed."""
+    if as_json:
+        print_json(preset._asdict())
+    else:
+        click.echo(preset.text, nl=False)
+
+
+def make_console() -> Console:
+    """Where tables are printed: they end at the terminal's width."""
+    from rich.console import Console
+
+    # A pipe or a log has no width: 80 columns would cut tables and paths for nothing.
+    width = None if sys.stdout.isatty() else 200
+    return Console(markup=False, highlight=False, emoji=False, width=width, soft_wrap=False)
+
+
+def make_table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Table:
+    """A table without rows; the columns of `wrapped` break where others are cut."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column, no_wrap=column not in wrapped)
+    return table
+
+
+def print_facts(console: Console, facts: Mapping[str, str]) -> None:
+    """Print names and what belongs to them, one a line."""
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="bold", no_wrap=True)
+    # Paths are to be copied whole: folded, never cut with an ellipsis.
+    grid.add_column(overflow="fold")
+    for name, value in facts.items():
+        grid.add_row(Text(name), Text(value))
+    console.print(grid)
+
+
+def _first_line(text: str | None) -> str:
+    return (text or "no error recorded").strip().splitlines()[0]

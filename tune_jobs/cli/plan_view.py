@@ -1,0 +1,107 @@
+"""What a dry run prints: the plan of a sweep."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from analysis.wording import counted
+from tune_jobs.cli.output import format_bytes, format_value, make_console, make_table, print_facts, print_json, span
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from tune_jobs.plan.sweep_plan import SweepPlan
+    from tune_jobs.spec.sweep_spec import SweepSpec
+
+_MAX_TRIALS_SHOWN = 24
+
+
+def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
+    """Print what a sweep would do."""
+    if as_json:
+        print_json({"spec": spec.model_dump(mode="json"), "plan": plan.to_json()})
+        return
+    console = make_console()
+    print_facts(console, _plan_facts(spec, plan))
+    for note in (*plan.notes, *(plan.packs.notes if plan.packs is not None else ())):
+        console.print(f"note: {note}", style="yellow")
+    console.print(_plan_table(plan))
+    hidden = len(plan.trials) - _MAX_TRIALS_SHOWN
+    if hidden > 0:
+        console.print(f"and {hidden:,} more; --json lists them all")
+    console.print("Nothing was started: this was a dry run.", style="dim")
+
+
+def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
+    machine, stop = plan.machine, spec.stop
+    returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
+    rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
+    rules += [] if stop.num_episodes is None else [counted(stop.num_episodes, "episode")]
+    rules += [
+        counted(stop.num_env_steps, "env step"),
+        counted(stop.num_iterations, "iteration"),
+        f"{stop.time_s:g} s",
+    ]
+    threshold = "" if plan.env.threshold is None else f" (solved at {plan.env.threshold:g})"
+    points = counted(plan.num_points, "point")
+    has = _resources(machine.num_cpus, machine.num_gpus)
+    return {
+        "environment": f"{plan.env.env_id}{threshold}",
+        "algorithm": spec.algorithm,
+        "trials": f"{len(plan.trials):,}: {points}, {counted(spec.seeds_per_point, 'seed')} each",
+        "engine": _engine_fact(plan),
+        "at once": f"{_at_once(plan)}; {machine.source} has {has}",
+        "a trial stops at": " or ".join(rules),
+        "search": _search_fact(spec),
+        "scheduler": spec.scheduler.type,
+        "env steps": f"at most {plan.max_env_steps:,} in all",
+        "disk": f"at most about {format_bytes(plan.max_disk_bytes)}",
+        "seeds": f"sweep {spec.seed}; evaluation {span(plan.evaluation_seeds)}; "
+        f"confirmation {span(plan.confirmation_seeds)}",
+    }
+
+
+def _engine_fact(plan: SweepPlan) -> str:
+    counts = plan.engines
+    told = next(iter(counts)) if len(counts) == 1 else ", ".join(f"{name} {count:,}" for name, count in counts.items())
+    packs = plan.packs
+    if packs is None:
+        return told
+    kind = (
+        f"{counted(packs.num_env_processes, 'process', 'processes')} a pack"
+        if packs.num_env_processes
+        else packs.env_kind
+    )
+    if packs.env_kind == "vectorised" and packs.env_step_us is not None:
+        return f"{told}; environments: {kind}, {packs.env_step_us:.3g} us a step"
+    return f"{told}; environments: {kind}" + (f" ({packs.why_env_kind})" if packs.why_env_kind else "")
+
+
+def _at_once(plan: SweepPlan) -> str:
+    packs = plan.packs
+    if packs is None:
+        return f"{plan.max_concurrent}, each on {_resources(plan.cpus_per_trial, plan.gpus_per_trial)}"
+    each = _resources(packs.cpus_per_pack, packs.gpus_per_pack)
+    trials = f"{packs.max_concurrent} in {counted(packs.num_packs, 'pack')} of up to {packs.slots}"
+    return f"{trials}, each pack on {each}"
+
+
+def _resources(cpus: float, gpus: float) -> str:
+    return f"{cpus:g} CPU{'s' * (cpus > 1)}" + (f" and {gpus:g} GPU{'s' * (gpus > 1)}" if gpus else "")
+
+
+def _search_fact(spec: SweepSpec) -> str:
+    if spec.search.type == "random":
+        return "random draws for each combination of the grids"
+    return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
+
+
+def _plan_table(plan: SweepPlan) -> Table:
+    # The first trial's point is known; where a searcher chooses the later ones, they have none yet.
+    names = list(plan.trials[0].point)
+    engines_differ = len(plan.engines) > 1
+    table = make_table("trial", "seed", *names, *(["engine"] if engines_differ else []))
+    for trial in plan.trials[:_MAX_TRIALS_SHOWN]:
+        values = [format_value(trial.point[name]) if trial.has_point else "by tpe" for name in names]
+        table.add_row(trial.trial_id, str(trial.seed), *values, *([trial.engine] if engines_differ else []))
+    return table

@@ -1,0 +1,1 @@
+"""What will run, on which engine, how large; refuses what cannot."""

@@ -1,0 +1,105 @@
+"""What has to be true of a sweep's environment and its other settings together; refused before anything starts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from policies.acting.baselines import BASELINES
+from policies.envs.failures import check_failure_penalty
+from policies.envs.make import EnvInfo
+from policies.envs.wrappers import FRAME_STACK, PIXELS
+from policies.errors import EnvError, SpecError
+from policies.hyperparams import ConstantHyperparams, Hyperparams
+from policies.portable.convolution import output_shape
+from policies.portable.file import action_problem
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+_EXAMPLE = "[[16, 8, 4], [32, 4, 2]]"
+
+
+def check_env_args(spec: SweepSpec) -> None:
+    """Refuse wrappers among the constructor's arguments: they have fields of their own.
+
+    Raises:
+        SpecError: One is there.
+    """
+    for name in (FRAME_STACK, PIXELS, "failure_penalty"):
+        if name in spec.env.args:
+            raise SpecError(
+                f"env.args.{name} is {spec.env.args[name]!r}, but {name} is no argument of an env's constructor.",
+                f"Write it as env.{name}, beside env.id.",
+            )
+
+
+def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperparams]) -> None:
+    """Check a sweep's penalty and networks against its environment.
+
+    Args:
+        spec: The sweep.
+        env: Its environment, with its wrappers.
+        hyperparams: Of every point.
+
+    Raises:
+        SpecError: A penalty without failure, an image encoder on a flat observation, or an image without one; a
+            constant action that the environment does not have.
+    """
+    _check_constant_actions(spec, env, hyperparams)
+    if spec.env.failure_penalty is not None:
+        try:
+            check_failure_penalty(env.env_id, env.failure, spec.env.failure_penalty)
+        except EnvError as error:
+            hint = error.hint.replace("failure_penalty", "env.failure_penalty")
+            raise SpecError(f"env.{error.message}", hint) from error
+    if spec.algorithm not in BASELINES:
+        _check_networks(spec, env, hyperparams)
+
+
+def _check_constant_actions(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperparams]) -> None:
+    """Refuse points of the baseline `constant` whose action the environment does not have."""
+    place = "space.action" if "action" in spec.space else "hyperparams.action"
+    for values in hyperparams:
+        if not isinstance(values, ConstantHyperparams):
+            continue
+        if problem := action_problem(values.action, cast("Any", env.action_space)):
+            raise SpecError(
+                f"{place}: {problem} ({env.env_id}: {env.action_space}).",
+                f"Set {place} to one of the actions, such as --set hyperparams.action={_some_action(env)}.",
+            )
+
+
+def _some_action(env: EnvInfo) -> str:
+    space: Any = env.action_space
+    if hasattr(space, "n"):
+        return str(int(space.start))
+    return json.dumps(np.clip(np.zeros(space.shape), space.low, space.high).ravel().tolist(), separators=(",", ":"))
+
+
+def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -> None:
+    shape = tuple(env.observation_space.shape or ())
+    domain = spec.space.get("conv_filters")
+    place = "hyperparams.conv_filters" if domain is None else "space.conv_filters"
+    # A search method may choose the points later: every value that it can choose counts.
+    searched = [] if domain is None else [value for _, value in domain.probes()]
+    for filters in [*searched, *(values.conv_filters for values in hyperparams)]:
+        if filters is None:
+            if env.observes_images and spec.rl_module is None:
+                raise SpecError(
+                    f"{env.env_id} has images of shape {shape} as observations, but {place} is null: a network for "
+                    "images begins with convolutions.",
+                    f"Set {place} to [channels, kernel, stride] of each layer, such as {_EXAMPLE}.",
+                )
+            continue
+        if not env.observes_images:
+            raise SpecError(
+                f"{place} is {[list(one) for one in filters]}, but the observations of {env.env_id} are flat, of shape "
+                f"{shape}: convolutions are for images.",
+                f"Leave {place} out, or observe images with env.{PIXELS}: true.",
+            )
+        try:
+            output_shape(shape, filters)
+        except SpecError as error:
+            raise SpecError(f"{place} does not go with {env.env_id}: {error.message}", error.hint) from error

@@ -1,0 +1,215 @@
+"""Hyperparameters of a sweep that can't act: refused if a search over one could change nothing, else told.
+
+When a hyperparameter is idle is the affair of `policies.idle.find`. Here: of which points, and what is said. A search is
+refused only where no value that its space may give could differ from another; a fixed value never is.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from policies.errors import SpecError
+from policies.hyperparams import DQNHyperparams, Hyperparams
+from policies.idle.find import NO_UPDATE, RULES, Limits, Rule, idle_rule
+from tune_jobs.plan.estimates import max_env_steps, max_iterations
+from tune_jobs.spec.domains import Domain, Listed, Range
+
+if TYPE_CHECKING:
+    from policies.envs.make import EnvInfo
+    from tune_jobs.spec.sweep_spec import SweepSpec
+
+_MOST_COMBINATIONS = 20_000
+"""Of other searched values that are looked at before a search is refused; beyond, it isn't."""
+_MOST_NAMED = 8
+"""So many points are named in a note; more are counted."""
+_LEAST_SHARE = 0.1
+"""Of the points, from which on it is told that values of a range act alike."""
+
+
+@dataclass(frozen=True)
+class _Points:
+    """What a sweep's points are known to be."""
+
+    spec: SweepSpec
+    env: EnvInfo
+    values: tuple[Hyperparams | None, ...]
+    """All hyperparameters of each; None: the search method chooses them when the trial starts."""
+    is_packed: tuple[bool, ...]
+
+    @functools.cached_property
+    def known(self) -> list[tuple[int, Hyperparams, Limits]]:
+        """(index, values, limits) of those that are known."""
+        return [
+            (index, values, self.limits(values, is_packed=is_packed))
+            for index, (values, is_packed) in enumerate(zip(self.values, self.is_packed, strict=True))
+            if values is not None
+        ]
+
+    def limits(self, values: Hyperparams, *, is_packed: bool) -> Limits:
+        """Of a trial with these values."""
+        return Limits(
+            num_env_steps=max_env_steps(self.spec, values),
+            num_iterations=max_iterations(self.spec, values),
+            max_episode_steps=self.env.max_episode_steps,
+            is_packed=is_packed,
+        )
+
+
+def idle_notes(
+    spec: SweepSpec,
+    env: EnvInfo,
+    values: Sequence[Hyperparams | None],
+    is_packed: Sequence[bool],
+    *,
+    may_refuse: bool = True,
+) -> tuple[str, ...]:
+    """What to say of hyperparameters that can't act, for the plan.
+
+    Args:
+        spec: The sweep.
+        env: Its environment.
+        values: All hyperparameters of each point; None: they are not known yet. At least one is.
+        is_packed: Whether a pack trains each point's trials.
+        may_refuse: Whether the sweep is new. One that is there goes on, whatever it searches.
+
+    Raises:
+        SpecError: A search can't change anything, and the sweep is new.
+    """
+    points = _Points(spec, env, tuple(values), tuple(is_packed))
+    names = [name for name in (*spec.space, *spec.hyperparams) if _is_looked_at(spec, name)]
+    searched = {name: _values_of(spec.space[name]) for name in names if name in spec.space}
+    never: dict[str, str] = {}
+    for name in names:
+        own = searched.get(name, [getattr(points.known[0][1], name)])
+        is_search = len(own) > 1
+        if (reason := _why_it_never_acts(points, name, own, is_search=is_search)) is not None:
+            never[name] = reason
+    refused = {name: reason for name, reason in never.items() if len(searched.get(name, ())) > 1}
+    if refused and may_refuse:
+        told = "; ".join(f"space.{name}: {reason}" for name, reason in refused.items())
+        raise SpecError(
+            f"{_listed(refused)} searched, but can't act in any point, so no trial would differ by it: {told}.",
+            "Take it out of space, or change what keeps it from acting.",
+        )
+    notes = [f"{_place(spec, name)} can't act: {reason}." for name, reason in never.items()]
+    for name in searched:
+        if name not in never:
+            notes += _partial_notes(points, name)
+    return (*_no_update_notes(points), *notes)
+
+
+def _listed(names: Mapping[str, Any]) -> str:
+    places = [f"space.{name}" for name in names]
+    return f"{', '.join(places)} {'is' if len(places) == 1 else 'are'}"
+
+
+def _is_looked_at(spec: SweepSpec, name: str) -> bool:
+    if spec.rl_module is not None and name.startswith("epsilon_"):
+        return False  # the module is a user's own, and explores as it likes
+    return bool(RULES[spec.algorithm][name])
+
+
+def _place(spec: SweepSpec, name: str) -> str:
+    return f"space.{name}" if name in spec.space else f"hyperparams.{name}"
+
+
+def _values_of(domain: Domain) -> list[Any]:
+    """Values that stand for all of a domain: rules change at most once between the ends of a range."""
+    if isinstance(domain, Listed):
+        return list(domain.values)
+    assert isinstance(domain, Range)
+    low, high = domain.bounds
+    ends = [int(low), int(high)] if domain.is_whole else [low, high]
+    return ends if low < high else ends[:1]
+
+
+def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_search: bool) -> str | None:
+    """Why no value of a hyperparameter acts, whatever the space gives the others; None: one may.
+
+    Args:
+        points: The sweep's.
+        name: Of the hyperparameter.
+        own: Its values.
+        is_search: Whether values that act alike count as idle, since there are no others; a single one acts.
+    """
+    if not is_search and (own[0] is None or own[0] is False):
+        return None  # switched off
+    spec = points.spec
+    rules = [rule for rule in RULES[spec.algorithm][name] if is_search or not (rule.of_value or rule is NO_UPDATE)]
+    reads = {read for rule in rules for read in rule.reads} - {name}
+    others = {read: _values_of(spec.space[read]) for read in spec.space if read in reads}
+    if not rules or math.prod(map(len, others.values())) * len(own) > _MOST_COMBINATIONS:
+        return None
+    base = points.known[0][1]
+    why: dict[Rule, str] = {}
+    for combination in itertools.product(*others.values()):
+        given = dict(zip(others, combination, strict=True))
+        found = [_first_rule(points, rules, base.model_copy(update={**given, name: value})) for value in own]
+        if any(one is None for one in found):
+            return None
+        classes = {rule for rule, _ in filter(None, found) if rule.of_value}
+        if len(classes) > 1:  # two kinds of values that act alike: one of each acts differently
+            return None
+        for rule, reason in filter(None, found):
+            why.setdefault(rule, reason)
+    return "; or ".join(why.values())
+
+
+def _first_rule(points: _Points, rules: Sequence[Rule], values: Hyperparams) -> tuple[Rule, str] | None:
+    limits = points.limits(values, is_packed=all(points.is_packed))
+    for rule in sorted(rules, key=lambda rule: rule.of_value):
+        if rule.holds(values, limits):
+            return rule, rule.reason(values, limits)
+    return None
+
+
+def _partial_notes(points: _Points, name: str) -> list[str]:
+    """Of a searched hyperparameter that acts in some points, or may."""
+    spec, by_rule = points.spec, dict[Rule, tuple[str, list[int]]]()
+    for index, found, limits in points.known:
+        if (rule := idle_rule(spec.algorithm, name, found, limits)) is not None:
+            by_rule.setdefault(rule, (rule.reason(found, limits), []))[1].append(index)
+    notes = []
+    for rule, (reason, indexes) in by_rule.items():
+        if rule is NO_UPDATE:
+            continue  # told once for all of them
+        if rule.of_value:
+            values = {repr(getattr(points.values[index], name)) for index in indexes}
+            is_rare = isinstance(spec.space[name], Range) and len(indexes) < _LEAST_SHARE * len(points.known)
+            if len(values) < 2 or is_rare:
+                continue
+            notes.append(f"space.{name}: its values act alike in {_which(points, indexes)}: {reason}.")
+        else:
+            notes.append(f"space.{name} can't act in {_which(points, indexes)}: {reason}.{_later(spec, name, rule)}")
+    return notes
+
+
+def _later(spec: SweepSpec, name: str, rule: Rule) -> str:
+    mutated = [other for other in rule.reads if other in spec.space and other != name]
+    if spec.scheduler.type != "pbt" or not mutated:
+        return ""
+    return f" A mutation of {', '.join(mutated)} may change that."
+
+
+def _no_update_notes(points: _Points) -> list[str]:
+    """Trials of DQN that never learn."""
+    found: dict[str, list[int]] = {}
+    for index, values, limits in points.known:
+        if isinstance(values, DQNHyperparams) and NO_UPDATE.holds(values, limits):
+            found.setdefault(NO_UPDATE.reason(values, limits), []).append(index)
+    return [f"In {_which(points, indexes)} {reason}." for reason, indexes in found.items()]
+
+
+def _which(points: _Points, indexes: Sequence[int]) -> str:
+    """Points in words."""
+    num = len(points.known)
+    what = "points" if num == len(points.values) else "points that are known"
+    if len(indexes) == num:
+        return f"all {what}" if len(points.values) > 1 else "the only point"
+    named = f" ({', '.join(map(str, indexes))})" if len(indexes) <= _MOST_NAMED else ""
+    return f"{len(indexes):,} of {num:,} {what}{named}"

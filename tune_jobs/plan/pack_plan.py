@@ -1,0 +1,149 @@
+"""How many packs there are, with how many trials at once in each: by CPUs, GPUs, the user's limit, and memory."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.plan.machine import Machine
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+MAX_SLOTS = 64
+"""Most trials of one pack at once."""
+
+MAX_AT_ONCE_TPE = 4
+"""Trials at once with search.type tpe, if there are not more CPUs.
+
+The model learns from trials that ended: of those that run it knows only that they are tried. A pack that took dozens at
+once would draw most points of a sweep before the model knows anything of the ones beside them, which is random search.
+Few at once cost little: the sweep is as many times longer as its proposals are better informed.
+"""
+
+# The other half is for the processes themselves, whatever else runs, and what the estimate leaves out.
+_SHARE_OF_MEMORY = 0.5
+
+_OTHERS = "other trials need the idle CPUs"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A trial that is to be packed."""
+
+    trial_id: str
+    key: tuple[Any, ...] | None
+    """See `packs.pack_key`; None: its point is not known."""
+    num_bytes: float
+    """Memory it takes, as an estimate."""
+    num_envs: int = 1
+    """Its sub-environments; where its point is not known, the fewest that it may have."""
+
+
+def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[Member], *, may_spread: bool) -> PackPlan:
+    """Plan the packs of a sweep.
+
+    Args:
+        spec: The sweep.
+        machine: What it runs on; one process of a trial fits on it.
+        members: The trials to be packed that have not ended, by index; at least one.
+        may_spread: Whether idle CPUs may step environments; false: other trials need them.
+    """
+    cpus, gpus = float(spec.resources.num_cpus or 1), spec.resources.num_gpus
+    num_packs, slots = _by_cpus(spec, machine.fitting(cpus, gpus), len(members))
+    num_packs, slots, notes = _by_memory(machine, members, num_packs, slots, cpus)
+    from policies.guard.guarded import measure_step
+    from policies.packed.envs.make import choose_kind
+
+    step = measure_step(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s)
+    # A pack's sub-environments are shared out over its processes: more of these than of those have nothing to do.
+    most = slots * min(member.num_envs for member in members)
+    spare, why_none = _spare_cpus(machine, num_packs, cpus, gpus, most) if may_spread else (0, _OTHERS)
+    choice = choose_kind(step, spare_cpus=spare, why_none=why_none)
+    num_processes = spare if choice.kind == "processes" else 0
+    return PackPlan(
+        num_packs=num_packs,
+        slots=slots,
+        cpus_per_pack=cpus + num_processes,
+        gpus_per_pack=gpus,
+        trial_ids=tuple(member.trial_id for member in _in_stacks(members)),
+        env_kind=choice.kind,
+        env_step_us=choice.step_us,
+        num_env_processes=num_processes,
+        notes=notes,
+        why_env_kind=choice.why,
+    )
+
+
+def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, int]:
+    """Packs and slots as CPUs, GPUs and the limits on trials at once allow."""
+    limit = math.inf if spec.resources.max_concurrent is None else spec.resources.max_concurrent
+    if spec.search.type == "tpe":
+        limit = min(limit, max(MAX_AT_ONCE_TPE, fitting))
+    num_packs = max(1, int(min(fitting, num_members, limit)))
+    share = math.ceil(num_members / num_packs)
+    # As many after one another as it takes, and as many each time: the last are not left to one pack.
+    slots = math.ceil(share / math.ceil(share / MAX_SLOTS))
+    return num_packs, max(1, int(min(slots, limit / num_packs)))
+
+
+def _by_memory(
+    machine: Machine, members: Sequence[Member], num_packs: int, slots: int, cpus: float
+) -> tuple[int, int, tuple[str, ...]]:
+    """As many packs and slots of those as memory allows, and the note that says so if they are fewer."""
+    largest = heapq.nlargest(slots, (member.num_bytes for member in members))
+    wanted = num_packs, slots
+    # Whatever trials meet in a pack: they are not more than its largest.
+    while (budget := _budget(machine, num_packs, cpus)) is not None and num_packs > 1 and largest[0] > budget:
+        num_packs -= 1
+    if budget is None:
+        return num_packs, slots, ()
+    slots = max(1, sum(total <= budget for total in itertools.accumulate(largest)))
+    if largest[0] > budget:
+        note = (
+            f"Packs are planned smaller: one trial may take {_shown(largest[0])} of memory, more than half of what "
+            f"{machine.source} has available, {_shown(budget)}. One pack trains one trial at a time."
+        )
+        return 1, 1, (note,)
+    if (num_packs, slots) == wanted:
+        return num_packs, slots, ()
+    note = (
+        f"Packs are planned smaller: {wanted[0]} x {wanted[1]} trials at once may take "
+        f"{_shown(wanted[0] * sum(largest))} of memory, and half of what {machine.source} has available is "
+        f"{_shown(machine.memory_bytes * _SHARE_OF_MEMORY if machine.memory_bytes else 0)}. "
+        f"{num_packs} x {slots} trials run at once."
+    )
+    return num_packs, slots, (note,)
+
+
+def _budget(machine: Machine, num_packs: int, cpus: float) -> float | None:
+    share = machine.memory_per_process(num_packs, cpus)
+    return None if share is None else share * _SHARE_OF_MEMORY
+
+
+def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most: int) -> tuple[int, str]:
+    """CPUs that each pack may have beside its own, so that as many packs still fit; and why there are none, if so."""
+    if most < 2:
+        return 0, "there is one sub-environment, which nothing can be shared out of"
+    spare = 0
+    while spare < most and machine.fitting(cpus + spare + 1, gpus) >= num_packs:
+        spare += 1
+    if spare or machine.num_cpus < num_packs * cpus + 1:
+        return spare, "no CPU is idle"
+    return 0, f"there is not an idle CPU for each of the {num_packs} packs"
+
+
+def _in_stacks(members: Sequence[Member]) -> list[Member]:
+    """Those of one key together, in the order in which keys are first met; those that have none yet last."""
+    stacks: dict[tuple[Any, ...] | None, list[Member]] = {}
+    for member in members:
+        stacks.setdefault(member.key, []).append(member)
+    unknown = stacks.pop(None, [])
+    return [member for stack in [*stacks.values(), unknown] for member in stack]
+
+
+def _shown(num_bytes: float) -> str:
+    return f"{num_bytes / 1e9:.1f} GB"

@@ -1,0 +1,368 @@
+"""What a sweep will do, before anything starts: trials, seeds, resources, upper bounds of env steps and disk.
+
+A plan is a function of the sweep and the machine alone, and its trials of the sweep alone: planning the same
+sweep with more samples gives the same trials first. What can't run is refused here, with the numbers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from pydantic import ValidationError
+
+from analysis.records import FINISHED, TrialRecord
+from analysis.wording import counted
+from policies.envs.make import EnvInfo
+from policies.errors import CannotRunError, SpecError
+from policies.guard.guard import guarding
+from policies.guard.guarded import check_env
+from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
+from tune_jobs.plan.engine_choice import Engine, PackPlan, choose_engines, pack_key
+from tune_jobs.plan.env_checks import check_env_args, check_env_rules
+from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
+from tune_jobs.plan.idle_notes import idle_notes
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.pack_plan import Member, plan_packs
+from tune_jobs.plan.user_code import check_rl_module
+from tune_jobs.search.points import largest_hyperparams, planned_points
+from tune_jobs.search.tpe import check_installed
+from tune_jobs.spec.domains import num_points
+from tune_jobs.spec.problems import details_of, dotted, explain
+from tune_jobs.spec.rules import idle_settings
+from tune_jobs.spec.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+NUM_CONFIRMATION_EPISODES = 100
+MAX_TRIALS = 100_000
+
+# What is made once, rounded up: videos, report, Ray Tune's own state.
+_SWEEP_BYTES = 20_000_000
+_FOR_EVER = "It would wait for ever."
+
+_Point = tuple[dict[str, Any] | None, Hyperparams | None]
+"""The sampled values, and all values; both None: the search method chooses them when the trial starts."""
+
+
+@dataclass(frozen=True)
+class TrialPlan:
+    """One trial to be run."""
+
+    trial_id: str
+    index: int
+    point_index: int
+    seed_index: int
+    seed: int
+    point: dict[str, Any]
+    """The sampled values alone."""
+    hyperparams: dict[str, Any]
+    """All values, validated, as JSON."""
+    has_point: bool = True
+    """False: the search method chooses the point when the trial starts; point and hyperparams are empty until then."""
+    engine: Engine = "rllib"
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """Everything a sweep will do."""
+
+    trials: tuple[TrialPlan, ...]
+    num_points: int
+    cpus_per_trial: int
+    gpus_per_trial: float
+    max_concurrent: int
+    """Trials at once, those in packs too."""
+    evaluation_seeds: tuple[int, ...]
+    confirmation_seeds: tuple[int, ...]
+    max_env_steps: int
+    """Upper bound over all trials, if none is retried; evaluation episodes don't count."""
+    max_disk_bytes: int
+    """Estimate of the most the sweep folder will hold."""
+    env: EnvInfo
+    machine: Machine
+    notes: tuple[str, ...] = ()
+    """What the sweep's author may not have meant, and which trials are not packed."""
+    packs: PackPlan | None = None
+    """Of the packed trials that have not ended; None: there are none."""
+
+    @property
+    def engines(self) -> dict[str, int]:
+        """Number of trials by engine."""
+        return dict(Counter(trial.engine for trial in self.trials))
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as JSON-like data, without the environment's spaces."""
+        apart = ("trials", "env", "machine", "packs")
+        data = {name: value for name, value in vars(self).items() if name not in apart}
+        env = {"id": self.env.env_id, "args": self.env.env_args, "threshold": self.env.threshold}
+        return data | {
+            "num_trials": len(self.trials),
+            "trials": [asdict(trial) for trial in self.trials],
+            "env": env,
+            "machine": asdict(self.machine),
+            "engines": self.engines,
+            "packs": None if self.packs is None else asdict(self.packs),
+        }
+
+
+def trial_id(index: int) -> str:
+    """Name of a trial, such as t0007; sorts by index up to 10,000 trials."""
+    return f"t{index:04d}"
+
+
+@guarding()
+def make_plan(
+    spec: SweepSpec, machine: Machine, records: Sequence[TrialRecord] = (), *, retry_failed: bool = False
+) -> SweepPlan:
+    """Plan a sweep for a machine.
+
+    Args:
+        spec: The sweep.
+        machine: What it runs on.
+        records: Of its trials that are there already: they go on with the engines they have.
+        retry_failed: Whether the failed ones of those run again.
+
+    Raises:
+        EnvError: The environment isn't registered, can't be made, or doesn't go with the algorithm.
+        SpecError: A point's values contradict each other or the environment, there are too many trials, something is
+            in a module that is not allowed, trials that are to be packed can't be, or a new sweep searches what can't
+            act.
+        CannotRunError: One trial needs more than the machine has, or the search method is not installed.
+    """
+    if spec.search.type == "tpe":
+        check_installed()
+    check_env_args(spec)
+    env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
+    check_rl_module(spec)
+    num_trials = _num_trials(spec)
+    if num_trials > MAX_TRIALS:
+        raise SpecError(
+            f"The sweep has {num_trials:,} trials; at most {MAX_TRIALS:,} can be planned.",
+            "Lower num_samples or seeds_per_point, or make the grids smaller.",
+        )
+    concurrent = _max_concurrent(spec, machine, num_trials)
+    points = _points(spec)
+    known = [values for _, values in points if values is not None]
+    check_env_rules(spec, env, known)
+    trials, engine_notes = _trials(spec, env, points, records)
+    first_trials = trials[:: spec.seeds_per_point]
+    idle = idle_notes(
+        spec,
+        env,
+        [values for _, values in points],
+        [trial.engine == "packed" for trial in first_trials],
+        may_refuse=not records,
+    )
+    sizes = _sizes(spec, known)
+    ended = {record.trial_id for record in records if record.status in FINISHED}
+    if retry_failed:
+        ended -= {record.trial_id for record in records if record.status == "failed"}
+    to_run = [trial for trial in trials if trial.trial_id not in ended]
+    members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
+    packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
+    if packs is not None:
+        all_are_packed = all(trial.engine == "packed" for trial in trials)
+        concurrent = packs.max_concurrent if all_are_packed else max(packs.max_concurrent, concurrent)
+    return SweepPlan(
+        trials=trials,
+        num_points=len(points),
+        cpus_per_trial=spec.cpus_per_trial,
+        gpus_per_trial=spec.resources.num_gpus,
+        max_concurrent=concurrent,
+        evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
+        confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
+        max_env_steps=spec.seeds_per_point * sum(_largest(sizes, lambda each: max_env_steps(spec, each))),
+        max_disk_bytes=_SWEEP_BYTES
+        + spec.seeds_per_point * sum(_largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
+        env=env,
+        machine=machine,
+        notes=(*_notes(spec, env, concurrent if packs is None else None), *idle_settings(spec), *idle, *engine_notes),
+        packs=packs,
+    )
+
+
+def _num_trials(spec: SweepSpec) -> int:
+    points = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+    return points * spec.seeds_per_point
+
+
+def _points(spec: SweepSpec) -> list[_Point]:
+    """Each point with all its hyperparameters."""
+    return [
+        (None, None) if point is None else (point, point_hyperparams(spec, point, index))
+        for index, point in enumerate(planned_points(spec))
+    ]
+
+
+def _trials(
+    spec: SweepSpec, env: EnvInfo, points: Sequence[_Point], records: Sequence[TrialRecord]
+) -> tuple[tuple[TrialPlan, ...], tuple[str, ...]]:
+    """The trials, and the notes on their engines."""
+    seeds = trial_seeds(spec.seed, len(points) * spec.seeds_per_point)
+    trials: list[TrialPlan] = []
+    for point_index, (point, values) in enumerate(points):
+        dumped = {} if values is None else values.model_dump(mode="json")
+        for seed_index in range(spec.seeds_per_point):
+            index = len(trials)
+            trials.append(
+                TrialPlan(
+                    trial_id(index),
+                    index,
+                    point_index,
+                    seed_index,
+                    seeds[index],
+                    point or {},
+                    dumped,
+                    point is not None,
+                )
+            )
+    choice = choose_engines(
+        spec,
+        env,
+        [(trial.trial_id, points[trial.point_index][1]) for trial in trials],
+        {record.trial_id: record.engine for record in records},
+        lambda index: _place(spec, points[trials[index].point_index][0], trials[index].point_index),
+    )
+    planned = (replace(trial, engine=engine) for trial, engine in zip(trials, choice.engines, strict=True))
+    return tuple(planned), choice.notes
+
+
+def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[Member]:
+    """Those of the trials that are packed; `memory` is of each point's trials."""
+    members = []
+    # Points that are chosen later have as many sub-environments as the others, or it is not known how many.
+    fewest_known = min((values.num_envs for _, values in points if values is not None), default=1)
+    for trial in to_run:
+        if trial.engine == "packed":
+            values = points[trial.point_index][1]
+            key = None if values is None else pack_key(values)
+            fewest = fewest_known if values is None else values.num_envs
+            members.append(Member(trial.trial_id, key, memory[trial.point_index], fewest))
+    return members
+
+
+def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]:
+    """For each point the hyperparameters whose trials are the largest it may have."""
+    if spec.scheduler.type == "pbt":
+        return [[values, *largest_hyperparams(spec, known)] for values in known]
+    unknown = spec.num_samples - len(known) if spec.search.type == "tpe" else 0
+    return [[values] for values in known] + ([largest_hyperparams(spec, known)] * unknown if unknown else [])
+
+
+def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], int]) -> list[int]:
+    """The largest measure of each point's; a list that stands for many points is gone through once."""
+    known: dict[int, int] = {}
+    for values in sizes:
+        if id(values) not in known:
+            known[id(values)] = max(map(measure, values))
+    return [known[id(values)] for values in sizes]
+
+
+def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int) -> Hyperparams:
+    """All values of a point's trials, validated.
+
+    Raises:
+        SpecError: They don't go together.
+    """
+    place = _place(spec, point, point_index)
+    try:
+        values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **point})
+    except ValidationError as error:
+        problems = "; ".join(f"{dotted(detail['loc'])} {explain(detail)}".strip() for detail in details_of(error))
+        raise SpecError(
+            f"The values of {place} don't go together: {problems}",
+            "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
+        ) from error
+    if isinstance(values, RandomHyperparams) and spec.resources.num_env_runners:
+        raise SpecError(
+            f"resources.num_env_runners is {spec.resources.num_env_runners}, but the baseline {spec.algorithm} plays "
+            "in one process.",
+            "Leave resources.num_env_runners out, or set num_envs to play in several sub-environments.",
+        )
+    num_streams = values.num_envs * max(1, spec.resources.num_env_runners)
+    if num_streams > SEEDS_PER_TRIAL:
+        raise SpecError(
+            f"The values of {place} make {num_streams} sub-environments (num_envs {values.num_envs}, "
+            f"resources.num_env_runners {spec.resources.num_env_runners}), more than the {SEEDS_PER_TRIAL} "
+            "that a trial has seeds for.",
+            "Lower num_envs or resources.num_env_runners.",
+        )
+    return values
+
+
+def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int) -> str:
+    """What messages call a point."""
+    if point is None:
+        shown = f"chosen by {spec.search.type}"
+    else:
+        shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
+    return f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
+
+
+def _max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
+    """How many trials run at once; refuses a trial that would wait for ever."""
+    cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
+    _refuse_too_large(spec, machine)
+    # Env runners are placed one by one and may lie on other nodes; the rest of a trial is one process on one
+    # node.
+    whole = cpus if spec.resources.num_env_runners == 0 else 0
+    limits = [machine.fitting(whole, gpus), machine.num_cpus // cpus, num_trials]
+    if spec.resources.max_concurrent is not None:
+        limits.append(spec.resources.max_concurrent)
+    return max(1, int(min(limits)))
+
+
+def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
+    cpus, gpus, runners = spec.cpus_per_trial, spec.resources.num_gpus, spec.resources.num_env_runners
+    made_of = (
+        f" (1 process and {counted(runners, 'env runner')})" if runners and spec.resources.num_cpus is None else ""
+    )
+    if cpus > machine.num_cpus:
+        hint = machine.more
+        if machine.num_cpus >= 1:
+            most = int(machine.num_cpus)
+            setting = f"num_env_runners to at most {most - 1}" if runners else f"num_cpus to at most {most}"
+            hint = f"set resources.{setting}, or {hint}"
+        raise CannotRunError(
+            f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
+            f"{hint[0].upper()}{hint[1:]}.",
+        )
+    if gpus > machine.num_gpus:
+        raise CannotRunError(
+            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {_FOR_EVER}",
+            "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
+        )
+    main = cpus - runners
+    if machine.nodes and not any(main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes):
+        nodes = ", ".join(f"{node_cpus:g} and {node_gpus:g}" for node_cpus, node_gpus in machine.nodes)
+        raise CannotRunError(
+            f"One trial's process needs {counted(main, 'CPU')} and {gpus:g} GPU{'s' * (gpus != 1)} on one node; no "
+            f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {_FOR_EVER}",
+            "Lower resources.num_cpus or resources.num_gpus.",
+        )
+
+
+def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
+    """`concurrent`: trials at once; None: packs hold as many as are wanted, or have a note of their own."""
+    notes = []
+    if (
+        spec.search.type == "random"
+        and spec.num_samples > 1
+        and not any(domain.is_random for domain in spec.space.values())
+    ):
+        notes.append(
+            f"The space has no random domain, so num_samples {spec.num_samples} repeats every point; "
+            "seeds_per_point does that and averages over the seeds."
+        )
+    target = spec.stop.training_return
+    if env.threshold is not None and target is not None and target < env.threshold:
+        notes.append(
+            f"stop.training_return {target:g} is below {env.env_id}'s threshold {env.threshold:g}: "
+            "trials may end before they solve it."
+        )
+    wanted = spec.resources.max_concurrent
+    if wanted is not None and concurrent is not None and concurrent < min(wanted, _num_trials(spec)):
+        notes.append(f"resources.max_concurrent is {wanted}, but only {counted(concurrent, 'trial')} can run at once.")
+    return notes

@@ -1,0 +1,101 @@
+"""A user's own classes in a sweep: an environment or an RLModule, given to a Python call or named as `module:Name`.
+
+What a sweep file names is imported only from modules that were allowed (see `policies.envs.modules`). A class that a
+Python call was given is code that runs in this process already, so its module is allowed by that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from policies.acting.baselines import BASELINES
+from policies.envs.ids import module_of
+from policies.envs.modules import allow_modules, import_allowed, path_of
+from policies.errors import SpecError
+from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+Source = str | Path | Mapping[str, Any] | SweepSpec
+"""A sweep file, a preset's name, a mapping with a sweep file's keys, or a spec."""
+
+
+def load_source(source: Source, overrides: Sequence[str] = (), rl_module: type[Any] | str | None = None) -> SweepSpec:
+    """Read and validate a sweep that a Python call was given, with classes of the caller's own in it.
+
+    Args:
+        source: In a mapping, `env`, `env.id` and `rl_module` may be classes.
+        overrides: As `load_spec`.
+        rl_module: An RLModule class, or `module:Class` in a module that is allowed by this; None: the source's.
+
+    Raises:
+        SpecError: The sweep is wrong, or a class is where no other process finds it.
+    """
+    if isinstance(source, SweepSpec):
+        source = dict(source)
+    if isinstance(source, Mapping):
+        source = _with_names(source)
+    if rl_module is not None:
+        if isinstance(rl_module, str) and (module := module_of(rl_module)) is not None:
+            allow_modules([module])
+        named = rl_module if isinstance(rl_module, str) else path_of(rl_module, "RLModule")
+        overrides = (*overrides, f"rl_module={named}")
+    return load_spec(source, overrides)
+
+
+def _with_names(source: Mapping[str, Any]) -> dict[str, Any]:
+    named = dict(source)
+    env = named.get("env")
+    if isinstance(env, Mapping):
+        named["env"] = {**env, "id": _env_name(env["id"])} if "id" in env else env
+    else:
+        named["env"] = _env_name(env)
+    if isinstance(named.get("rl_module"), type):
+        named["rl_module"] = path_of(named["rl_module"], "RLModule")
+    return {key: value for key, value in named.items() if key in source}
+
+
+def _env_name(env: Any) -> Any:
+    """A class's name; whatever else it is, it is checked as part of the spec."""
+    if not isinstance(env, type):
+        return env
+    if not issubclass(env, gym.Env):
+        raise SpecError(
+            f"env is the class {env.__qualname__}, which is no gymnasium.Env.",
+            "Derive it from gymnasium.Env, or give a Gymnasium id such as 'CartPole-v1'.",
+        )
+    return path_of(env, "environment")
+
+
+def modules_of(spec: SweepSpec) -> tuple[str, ...]:
+    """The modules of a user's own that a sweep needs: what `sweep.json` allows its trials."""
+    return tuple(sorted({module for path in (spec.env.id, spec.rl_module or "") if (module := module_of(path))}))
+
+
+def check_rl_module(spec: SweepSpec) -> None:
+    """Check that a sweep's RLModule may be imported and is one.
+
+    Raises:
+        SpecError: It is not allowed, not there, or none; or the algorithm has no network.
+    """
+    if spec.rl_module is None:
+        return
+    if spec.algorithm in BASELINES:
+        raise SpecError(
+            f"rl_module is {spec.rl_module}, but algorithm {spec.algorithm} has no network.",
+            "Leave rl_module out, or set algorithm to ppo or dqn.",
+        )
+    try:
+        found = import_allowed(spec.rl_module)
+    except SpecError as error:
+        raise SpecError(f"rl_module is {spec.rl_module}. {error.message}", error.hint) from error
+    # By name, because importing RLlib takes seconds; its checkpoints need a class, not a function that makes one.
+    bases = found.__mro__ if isinstance(found, type) else ()
+    if not any(base.__name__ == "RLModule" and base.__module__.startswith("ray.rllib.") for base in bases):
+        raise SpecError(
+            f"rl_module is {spec.rl_module}, which is no RLModule class but {found!r}.",
+            "Derive it from RLlib's RLModule, or from one of policies.networks.rl_modules.",
+        )

@@ -1,0 +1,1 @@
+"""What a run changes of the process it is in: signals, streams, names of packages."""

@@ -1,0 +1,197 @@
+"""Signals while a sweep is launched, resumed or extended: they end it in order, wherever it is.
+
+Ctrl-C (SIGINT), SIGTERM and a terminal that went away (SIGHUP) mean the same. While trials run, the first one asks
+them to save a checkpoint and stop; the second ends them. Everywhere else the first one ends what is being done. In
+both cases the records are written, Ray is shut down and the locks are freed before `SweepInterrupted` is raised.
+
+A SIGHUP is never a second one: for one terminal that goes, a shell and the system may both send it, and who sends
+SIGTERM may send it too. A SIGHUP that this process ignores stays ignored: nohup means it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import TYPE_CHECKING, ParamSpec
+
+from policies.errors import CannotRunError
+
+if TYPE_CHECKING:
+    from tune_jobs.sweeps.drive import SweepResult
+
+_Arguments = ParamSpec("_Arguments")
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class SweepInterrupted(KeyboardInterrupt):
+    """A launch, resume or extend was ended by Ctrl-C, SIGTERM or SIGHUP; what was done is saved.
+
+    A `KeyboardInterrupt`, so that it ends the script that launched, also a loop over launches with an
+    `except Exception` in it.
+
+    Args:
+        result: What there is of the sweep; None: it had not begun, and what was there before is as it was.
+    """
+
+    def __init__(self, result: SweepResult | None = None) -> None:
+        super().__init__("The sweep was interrupted.")
+        self.result = result
+
+
+class Interruption:
+    """What signals do at the moment, and whether one came.
+
+    Args:
+        has_acted: Whether one ended what was before.
+    """
+
+    def __init__(self, *, has_acted: bool = False) -> None:
+        self.came = False
+        """Whether a signal came."""
+        self._has_acted = has_acted
+        """Whether one asked or raised, and was not only noted."""
+        self._num_shields = 0
+        self._ask: Callable[[], None] | None = None
+
+    def take(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 (the signature of a handler)
+        """The handler: ask, note or raise.
+
+        Raises:
+            KeyboardInterrupt: Nobody is to be asked (any more), and nothing is under way that must not be cut short.
+        """
+        self.came = True
+        if self._num_shields:
+            return
+        ask, self._ask = self._ask, None
+        is_echo = number == signal.SIGHUP and self._has_acted
+        self._has_acted = True
+        if ask is not None:
+            # Nobody is impatient yet: what comes while it is asked was sent together with this one.
+            with self.shielded():
+                ask()
+        elif not is_echo:
+            raise KeyboardInterrupt
+
+    @contextlib.contextmanager
+    def asking(self, ask: Callable[[], None]) -> Iterator[None]:
+        """Let the first signal in the block call a function, and the second raise KeyboardInterrupt."""
+        self._ask = ask
+        try:
+            yield
+        finally:
+            self._ask = None
+
+    def shield(self) -> None:
+        """Let signals only be noted from now on."""
+        self._num_shields += 1
+
+    @contextlib.contextmanager
+    def shielded(self) -> Iterator[None]:
+        """Let signals in the block only be noted: it writes or frees something, and is soon over."""
+        self.shield()
+        try:
+            yield
+        finally:
+            self._num_shields -= 1
+
+
+# One sweep at a time: who drives one owns the process's signals, its standard output and its connection to Ray.
+_only_one = threading.Lock()
+_current = Interruption()
+
+
+def current() -> Interruption:
+    """Of the sweep that this process runs."""
+    return _current
+
+
+def run_alone(call: Callable[_Arguments, SweepResult]) -> Callable[_Arguments, SweepResult]:
+    """Make a function that runs a sweep the only one of its process, end in order at a signal, and leave no traces.
+
+    Raises:
+        SweepInterrupted: A signal came; the records are written.
+        CannotRunError: Another thread of this process runs a sweep.
+    """
+
+    @functools.wraps(call)
+    def run(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> SweepResult:
+        # It needs NumPy, which a program that only asks for help does not.
+        from tune_jobs.process.state import given_back
+
+        with taking_signals() as interruption:
+            with contextlib.ExitStack() as stack:
+                stack.enter_context(given_back())
+                # What comes while the process is put back as it was has nothing left to cut short.
+                stack.callback(interruption.shield)
+                try:
+                    result = call(*args, **kwargs)
+                except KeyboardInterrupt as error:
+                    raise SweepInterrupted from error
+            if interruption.came:
+                raise SweepInterrupted(dataclasses.replace(result, interrupted=True))
+            return result
+
+    return run
+
+
+@contextlib.contextmanager
+def taking_signals() -> Iterator[Interruption]:
+    """Handle this process's signals while the block runs a sweep; in another thread than the main one, none.
+
+    Raises:
+        CannotRunError: Another thread of this process runs a sweep.
+    """
+    global _current  # noqa: PLW0603 (a process has one set of handlers)
+    interruption = Interruption()
+    if not _only_one.acquire(blocking=False):
+        raise CannotRunError(
+            "Another thread of this process is running a sweep; one process runs one at a time.",
+            "Wait until it is done, or launch this one in a process of its own.",
+        )
+    try:
+        _current = interruption
+        with _handled(interruption):
+            yield interruption
+    finally:
+        _current = Interruption(has_acted=interruption.came)
+        _only_one.release()
+
+
+def end_in_order() -> None:
+    """From now on let SIGTERM and SIGHUP do what Ctrl-C does: for a program of ours, whatever it is doing."""
+    for number in _SIGNALS:
+        if not _is_ignored(number):
+            signal.signal(number, _take_now)
+
+
+def _take_now(number: int, frame: FrameType | None) -> None:
+    """The handler outside of sweeps: what comes after one may be an echo of what ended it."""
+    _current.take(number, frame)
+
+
+def _is_ignored(number: int) -> bool:
+    return number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
+
+
+@contextlib.contextmanager
+def _handled(interruption: Interruption) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {}
+    try:
+        for number in _SIGNALS:
+            handler = signal.getsignal(number)
+            # None: it was not set from Python, and could not be set again.
+            if handler is not None and not _is_ignored(number):
+                before[number] = handler
+                signal.signal(number, interruption.take)
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

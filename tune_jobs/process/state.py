@@ -1,0 +1,130 @@
+"""What running a sweep changes of its process, and gives back: the script or notebook around it goes on as before.
+
+Ray and Ray Tune set environment variables, handlers of signals and exceptions, loggers and limits, and leave them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import logging
+import os
+import random
+import resource
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from policies.envs.modules import allowed_again
+from policies.standard_streams import standard_streams
+
+# What a user's own module sets when it is imported is not among them: it would not be set again.
+_VARIABLES = ("RAY_", "TUNE_", "GRPC_", "PYTHONPATH", "PYTHONBREAKPOINT", "SDL_", "PYGAME_HIDE_SUPPORT_PROMPT")
+
+
+@contextlib.contextmanager
+def given_back() -> Iterator[None]:
+    """Give back what the block changes of this process."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(standard_streams())
+        stack.enter_context(warnings.catch_warnings())
+        stack.enter_context(allowed_again())
+        for keep in (_variables, _hooks, _signal_handlers, _loggers, _random_numbers, _file_limit):
+            stack.enter_context(keep())
+        yield
+
+
+@contextlib.contextmanager
+def _variables() -> Iterator[None]:
+    before = _our_variables()
+    try:
+        yield
+    finally:
+        for name in _our_variables().keys() - before.keys():
+            os.environ.pop(name, None)
+        os.environ.update(before)
+
+
+def _our_variables() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
+
+
+@contextlib.contextmanager
+def _hooks() -> Iterator[None]:
+    hook, thread_hook, dumps = sys.excepthook, threading.excepthook, faulthandler.is_enabled()
+    try:
+        yield
+    finally:
+        sys.excepthook, threading.excepthook = hook, thread_hook
+        if not dumps:
+            faulthandler.disable()
+
+
+@contextlib.contextmanager
+def _signal_handlers() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            # None: it was not set from Python, and cannot be set again from there.
+            if handler is not None and signal.getsignal(number) != handler:
+                signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _loggers() -> Iterator[None]:
+    """Those there are: what importing ray sets up for its own stays, as it would with any import."""
+    factory = logging.getLogRecordFactory()
+    names = [None, *logging.root.manager.loggerDict]
+    before = {name: _settings(logging.getLogger(name)) for name in names}
+    try:
+        yield
+    finally:
+        logging.setLogRecordFactory(factory)
+        for name, (level, handlers, propagate, disabled) in before.items():
+            logger = logging.getLogger(name)
+            if logger.level != level:
+                logger.setLevel(level)
+            logger.handlers[:] = handlers
+            logger.propagate, logger.disabled = propagate, disabled
+
+
+def _settings(logger: logging.Logger) -> tuple[int, list[logging.Handler], bool, bool]:
+    return logger.level, list(logger.handlers), logger.propagate, logger.disabled
+
+
+@contextlib.contextmanager
+def _random_numbers() -> Iterator[None]:
+    """The state of the generators that are everybody's; of torch's only where it is loaded already."""
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (other people's)
+    torch: Any = sys.modules.get("torch")
+    drawn = None if torch is None else (torch.get_rng_state(), torch.get_num_threads())
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002
+        if drawn is not None:
+            torch.set_rng_state(drawn[0])
+            if torch.get_num_threads() != drawn[1]:
+                torch.set_num_threads(drawn[1])
+
+
+@contextlib.contextmanager
+def _file_limit() -> Iterator[None]:
+    """Ray raises how many files this process, and what it starts, may have open."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)

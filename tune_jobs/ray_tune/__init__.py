@@ -1,0 +1,1 @@
+"""Everything that is Ray or Ray Tune."""

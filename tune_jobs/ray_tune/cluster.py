@@ -1,0 +1,296 @@
+"""Where a sweep runs: this machine, a Ray cluster it is part of, or one it reaches as a Ray client.
+
+The same sweep runs on all of them; what differs is how Ray is joined and how it is known that every node reaches the
+storage.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import signal
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import AuthenticationError, GetTimeoutError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from policies.envs.modules import module_folders
+from policies.errors import CannotRunError, TuneJobsError
+from policies.files import write_atomic
+from tune_jobs.plan.machine import Machine
+from tune_jobs.process.interruption import current
+from tune_jobs.ray_tune.address import recorded_cluster
+from tune_jobs.ray_tune.connected_ray import (
+    alive_nodes,
+    check_connected_to,
+    cluster_machine,
+    connected_machine,
+    is_client,
+)
+from tune_jobs.ray_tune.environment import prepare_environment, provide_token
+from tune_jobs.ray_tune.processes import ending_if_it_fails
+from tune_jobs.ray_tune.reaper import reaping
+from tune_jobs.store.places import within
+from tune_jobs.sweeps.live_table import quiet
+
+# Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
+_OBJECT_STORE_BYTES = 256 * 1024**2
+# A node's first process imports torch and RLlib for it, from a disk that may be slow and cold.
+_PROBE_TIMEOUT_S = 180.0
+_MAX_JOIN_ATTEMPTS = 4
+_QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A joined cluster."""
+
+    address: str | None
+    is_client: bool
+    """Joined by `ray://`: the trials' driver has to run on the cluster."""
+    machine: Machine
+
+
+@contextlib.contextmanager
+def connect(address: str | None, machine: Machine | None = None) -> Iterator[Connection]:
+    """Join a cluster, or start Ray on this machine, for the time of the block.
+
+    A connection that the caller already has is used and kept, if it is to the wanted address or none is given.
+
+    Args:
+        address: None: this machine; `auto`, `host:port` or `ray://host:port`.
+        machine: What to start Ray with on this machine.
+
+    Raises:
+        CannotRunError: Nothing answers at the address, its Ray differs, Ray does not start, or the caller is connected
+            to another one.
+    """
+    prepare_environment()
+    if ray.is_initialized():
+        check_connected_to(address)
+        yield Connection(address, is_client(), connected_machine())
+        return
+    logger = logging.getLogger("ray")
+    level = logger.level
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            stack.enter_context(reaping())
+        try:
+            with ending_if_it_fails(), _keeping_sigterm(), _deaf_to_hangups():
+                if address is None:
+                    _start(machine)
+                else:
+                    _join(address)
+            source = "this machine" if address is None else f"the cluster at {address}"
+            yield Connection(address, is_client(), cluster_machine(source))
+        finally:
+            # Ray half shut down would be in the way of the next one, and its processes would live on.
+            with current().shielded():
+                ray.shutdown()
+                logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _keeping_sigterm() -> Iterator[None]:
+    """Let SIGTERM do afterwards, and in the block, what it did before.
+
+    Ray 2.60's `init` sets a handler that ends the process at once. And its native code puts another one before Python's
+    (Abseil's, for failures): it calls Python's, and aborts the process 3 s later, whatever that is saving then.
+    """
+    utils = ray._private.utils  # noqa: SLF001 (nothing public keeps it from that)
+    original = utils.set_sigterm_handler
+    utils.set_sigterm_handler = lambda _: None
+    try:
+        yield
+    finally:
+        utils.set_sigterm_handler = original
+        handler = signal.getsignal(signal.SIGTERM)
+        if threading.current_thread() is threading.main_thread() and handler is not None:
+            # For Python nothing has changed; it sets what the system calls anew all the same.
+            signal.signal(signal.SIGTERM, handler)
+            if current().came:
+                # It may have come while theirs was set.
+                signal.alarm(0)
+
+
+@contextlib.contextmanager
+def _deaf_to_hangups() -> Iterator[None]:
+    """Processes that are started in the block get no SIGHUP: a terminal that goes sends it to all that run in it.
+
+    Ray 2.60 does so with SIGINT. It would be gone before the trials have saved; here the signal waits for the end of
+    the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start(machine: Machine | None) -> None:
+    # A local sweep sends nothing anywhere; who wants Ray's usage statistics sets the variable.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    provide_token()
+    resources: dict[str, Any] = {}
+    if machine is not None:
+        resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
+    try:
+        with _finding_own_modules():
+            # "local": a cluster of this sweep's own, even where one happens to run already.
+            ray.init(
+                address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
+            )
+    except Exception as error:
+        raise CannotRunError(
+            f"Ray cannot be started on this machine: {_first_line(error)}",
+            "See the Ray logs in /tmp/ray/session_latest/logs.",
+        ) from error
+
+
+@contextlib.contextmanager
+def _finding_own_modules() -> Iterator[None]:
+    """Let the processes that Ray starts find the modules of the user's own where this process found them.
+
+    Ray itself gives them this process's working directory and the main script's folder, but not the rest of its path.
+    """
+    before = os.environ.get("PYTHONPATH")
+    folders = [*module_folders(), *([before] if before else [])]
+    if folders:
+        os.environ["PYTHONPATH"] = os.pathsep.join(folders)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["PYTHONPATH"] = before
+        else:
+            os.environ.pop("PYTHONPATH", None)
+
+
+def _join(address: str) -> None:
+    # Ray's native code prints a warning for each of its attempts.
+    with tempfile.NamedTemporaryFile(prefix="tune-jobs-join-") as file:
+        try:
+            with quiet(Path(file.name)):
+                _init_patiently(address)
+        except Exception as error:
+            said = Path(file.name).read_text(encoding="utf-8", errors="replace")
+            if "InvalidAuthToken" in said or isinstance(error, AuthenticationError):
+                raise CannotRunError(
+                    f"The Ray cluster at {address} does not accept this machine's token.",
+                    "Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the cluster's token.",
+                ) from error
+            raise CannotRunError(
+                f"The Ray cluster at {address} cannot be joined: {_first_line(error)}",
+                "Its Ray and Python must be of this machine's versions, and its token (RAY_AUTH_TOKEN) the same. "
+                "host:port is for machines that are nodes of the cluster; others join by ray://HOST:10001.",
+            ) from error
+    joined = ray.get_runtime_context().gcs_address if address == "auto" else None
+    if joined is not None and not os.environ.get("RAY_ADDRESS") and joined != recorded_cluster():
+        # Ray 2.60 prefers a lone cluster among this machine's processes: another sweep's own, which ends with it.
+        ray.shutdown()
+        raise CannotRunError(
+            f"`auto` found the Ray at {joined}, but `ray start` last joined {recorded_cluster()}.",
+            f"Say which with --address, for example --address {recorded_cluster()}.",
+        )
+
+
+def _init_patiently(address: str) -> None:
+    for attempt in range(1, _MAX_JOIN_ATTEMPTS + 1):
+        try:
+            ray.init(address=address, **_QUIET)
+            return
+        except ConnectionError as error:
+            # Ray 2.60's client proxy forks a server for each client, and one in twenty dies at once in gRPC's fork
+            # handlers (ray issue 63202), unless the head was started with GRPC_ENABLE_FORK_SUPPORT=0.
+            if "Starting Ray client server failed" not in str(error) or attempt == _MAX_JOIN_ATTEMPTS:
+                raise
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def check_storage(folder: Path) -> None:
+    """Check, from a worker on every node, that it reads and writes the very folder that is seen here.
+
+    Raises:
+        CannotRunError: A node does not, or has another version of tune-jobs; the message names it.
+    """
+    token = secrets.token_hex(8)
+    probe = within(folder, ".probe")
+    probe.mkdir(parents=True, exist_ok=True)
+    write_atomic(probe / "question", token)
+    try:
+        tasks = {}
+        for node in alive_nodes():
+            strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
+            remote = ray.remote(num_cpus=0, max_retries=0)(_answer).options(scheduling_strategy=strategy)
+            name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"
+            tasks[name] = (remote.remote(str(probe), node["NodeID"]), probe / node["NodeID"])
+        for name, (task, answer) in tasks.items():
+            _check_answer(name, task, answer, token)
+    finally:
+        for path in probe.iterdir():
+            path.unlink(missing_ok=True)
+        probe.rmdir()
+
+
+def _answer(probe: str, node_id: str) -> tuple[str, str]:
+    """On a node: read the question, leave an answer; returns both what was read and the version there."""
+    question = Path(probe, "question").read_text(encoding="utf-8")
+    write_atomic(Path(probe, node_id), question)
+    return question, version("tune-jobs")
+
+
+def _check_answer(name: str, task: Any, answer: Path, token: str) -> None:
+    folder = answer.parent.parent
+    storage_hint = "Choose storage that every node reaches (a network file system) with --storage."
+    try:
+        question, their_version = ray.get(task, timeout=_PROBE_TIMEOUT_S)
+    except GetTimeoutError as error:
+        raise CannotRunError(
+            f"Node {name} did not answer within {_PROBE_TIMEOUT_S:.0f} s.",
+            "Check the node with `ray status`, and that its file systems respond.",
+        ) from error
+    except Exception as error:
+        cause = getattr(error, "cause", None) or error
+        if isinstance(cause, ImportError) or "ModuleNotFoundError" in str(error):
+            raise CannotRunError(
+                f"Node {name} has no tune-jobs that works: {_last_line(error)}",
+                "Install the same version on every node, or use its image.",
+            ) from error
+        if isinstance(cause, FileNotFoundError):
+            raise CannotRunError(f"Node {name} does not see the sweep folder {folder}.", storage_hint) from error
+        raise CannotRunError(
+            f"Node {name} cannot use the sweep folder {folder}: {_last_line(cause)}", storage_hint
+        ) from error
+    if question != token or not _holds(answer, token):
+        raise CannotRunError(f"Node {name} sees another folder under the name {folder}.", storage_hint)
+    if their_version != version("tune-jobs"):
+        raise CannotRunError(
+            f"Node {name} has tune-jobs {their_version}, {socket.gethostname()} has {version('tune-jobs')}.",
+            "Install the same version everywhere.",
+        )
+
+
+def _last_line(error: Exception) -> str:
+    if isinstance(error, TuneJobsError):
+        return error.message
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
+
+
+def _holds(path: Path, content: str) -> bool:
+    try:
+        return path.read_text(encoding="utf-8") == content
+    except OSError:
+        return False

@@ -1,0 +1,121 @@
+"""The Ray that this process is connected to: whose it is, and what it has to run on."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from dataclasses import replace
+from typing import Any
+
+import ray
+
+from policies.errors import CannotRunError
+from tune_jobs.plan.machine import Machine
+
+# What was just given back is told a little later.
+_FREED_WITHIN_S = 5.0
+_POLL_INTERVAL_S = 0.1
+_DEFAULT_CLIENT_PORT = "10001"
+
+
+def is_client() -> bool:
+    """Whether it was joined by `ray://`."""
+    return bool(ray.util.client.ray.is_connected())
+
+
+def alive_nodes() -> list[dict[str, Any]]:
+    """Its nodes, as Ray describes them."""
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
+def cluster_machine(source: str) -> Machine:
+    """The CPUs, GPUs and memory of the joined cluster's nodes."""
+    resources = [node["Resources"] for node in alive_nodes()]
+    nodes = tuple((float(node.get("CPU", 0)), float(node.get("GPU", 0))) for node in resources)
+    num_cpus = sum(cpus for cpus, _ in nodes)
+    # What a node had free when its Ray started, less the object store.
+    shares = [node.get("memory", 0.0) / node["CPU"] for node in resources if node.get("CPU")]
+    return Machine(
+        num_cpus=num_cpus,
+        num_gpus=sum(gpus for _, gpus in nodes),
+        source=source,
+        nodes=nodes,
+        memory_bytes=min(shares) * num_cpus if shares and min(shares) > 0 else None,
+    )
+
+
+def connected_machine() -> Machine:
+    """What is free of a Ray that the caller had joined or started: its own actors hold the rest, and may for ever."""
+    machine = cluster_machine("the Ray that this process is connected to")
+    machine = replace(machine, more="connect to one that has more, or free what is in use")
+    if is_client():
+        # Ray's client cannot ask what each node has left.
+        return machine
+    deadline = time.monotonic() + _FREED_WITHIN_S
+    while (free := _free()) != machine.nodes and time.monotonic() < deadline:
+        time.sleep(_POLL_INTERVAL_S)
+    if free == machine.nodes:
+        return machine
+    num_cpus, num_gpus = sum(cpus for cpus, _ in free), sum(gpus for _, gpus in free)
+    source = f"{machine.source} (of its {machine.num_cpus:g} CPUs and {machine.num_gpus:g} GPUs, the rest is in use)"
+    share = num_cpus / machine.num_cpus if machine.num_cpus else 0.0
+    memory = None if machine.memory_bytes is None else machine.memory_bytes * share
+    return replace(machine, num_cpus=num_cpus, num_gpus=num_gpus, nodes=free, source=source, memory_bytes=memory)
+
+
+def _free() -> tuple[tuple[float, float], ...]:
+    """CPUs and GPUs that nobody holds, node by node."""
+    known = ray._private.state.available_resources_per_node()  # noqa: SLF001 (what is public adds all nodes up)
+    left = [known.get(node["NodeID"], {}) for node in alive_nodes()]
+    return tuple((float(node.get("CPU", 0)), float(node.get("GPU", 0))) for node in left)
+
+
+def check_connected_to(address: str | None) -> None:
+    """Check that the Ray which this process is connected to is the wanted one.
+
+    Args:
+        address: As `cluster.connect`; None and `auto` want no certain one.
+
+    Raises:
+        CannotRunError: It is another one.
+    """
+    if address is None or address == "auto":
+        return
+    here = _client_address() if is_client() else ray.get_runtime_context().gcs_address
+    scheme, _, rest = address.rpartition("://")
+    wanted = f"{rest}:{_DEFAULT_CLIENT_PORT}" if scheme and ":" not in rest else rest
+    if bool(scheme) != is_client() or not _is_same(wanted, here):
+        raise CannotRunError(
+            f"This process is connected to the Ray at {'ray://' if is_client() else ''}{here}, not to {address}.",
+            "Leave the address out to run there, or call ray.shutdown() first.",
+        )
+
+
+def _client_address() -> str:
+    return str(ray.util.client.ray.get_context().client_worker._conn_str)  # noqa: SLF001 (told nowhere else)
+
+
+def _is_same(wanted: str, connected: str) -> bool:
+    """Whether two `host:port` are one, under whichever of its names the host is called."""
+    (host, _, port), (other_host, _, other_port) = wanted.rpartition(":"), connected.rpartition(":")
+    if port != other_port:
+        return False
+    ours, theirs = _numbers_of(host), _numbers_of(other_host)
+    return host == other_host or bool(ours & theirs) or (_are_here(ours) and _are_here(theirs))
+
+
+def _numbers_of(host: str) -> set[str]:
+    with contextlib.suppress(OSError):
+        return {str(found[4][0]) for found in socket.getaddrinfo(host.strip("[]"), None)}
+    return set()
+
+
+def _are_here(numbers: set[str]) -> bool:
+    """Whether one of these addresses is this machine's: only such a one can be bound."""
+    for number in numbers:
+        family = socket.AF_INET6 if ":" in number else socket.AF_INET
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.bind((number, 0))
+            return True
+    return False

@@ -1,0 +1,81 @@
+"""The driver of a sweep as an actor on the cluster: for clients that join by `ray://`.
+
+A Ray client cannot run Ray Tune's loop itself. The actor runs it and writes the records to the shared storage; the
+client asks it for what has changed, and shows the same table. The client holds the sweep's lock, the actor its driver
+lock: when a client is killed, Ray ends the actor only half a minute later, and nobody may resume the sweep before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import Any
+
+import ray
+from ray.exceptions import RayActorError
+
+from analysis.records import TrialRecord
+from policies.errors import CannotRunError
+from tune_jobs.ray_tune.run_trials import RunJob, run_trials
+from tune_jobs.store.record_keeper import Listener
+from tune_jobs.store.sweep_store import SweepStore
+
+_POLL_INTERVAL_S = 0.5
+# A little of a resource that only the head has: nodes come and go, and the sweep would end with the actor's.
+_ON_THE_HEAD = {"node:__internal_head__": 0.001}
+
+
+class RemoteDriver:
+    """Runs one job; its two methods are called at the same time."""
+
+    def __init__(self) -> None:
+        self._changed: dict[str, TrialRecord] = {}
+        self._lock = threading.Lock()
+
+    def run(self, job: RunJob) -> None:
+        """Run the job to its end.
+
+        Raises:
+            CannotRunError: Another driver runs this sweep.
+        """
+        with SweepStore(job.sweep_folder).driver_lock():
+            run_trials(job, self._take)
+
+    def _take(self, record: TrialRecord) -> None:
+        with self._lock:
+            self._changed[record.trial_id] = record
+
+    def changes(self) -> list[TrialRecord]:
+        """The records that changed since the last call."""
+        with self._lock:
+            changed, self._changed = self._changed, {}
+        return list(changed.values())
+
+
+def run_trials_remotely(job: RunJob, listener: Listener) -> None:
+    """As `runner.run_trials`, with the loop in an actor on the joined cluster.
+
+    Raises:
+        CannotRunError: The actor or the connection to the cluster was lost.
+    """
+    driver: Any = ray.remote(num_cpus=0, max_concurrency=2, resources=_ON_THE_HEAD)(RemoteDriver).remote()
+    try:
+        running = driver.run.remote(job)
+        ended = False
+        while not ended:
+            time.sleep(_POLL_INTERVAL_S)
+            # Asked before the changes are fetched, so that the last ones are not missed.
+            ended = bool(ray.wait([running], timeout=0)[0])
+            for record in ray.get(driver.changes.remote()):
+                listener(record)
+        ray.get(running)
+    except (RayActorError, ConnectionError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise CannotRunError(
+            f"The sweep's driver on the cluster was lost: {reason}",
+            f"What is done is kept; go on with `tune-jobs resume {job.sweep_folder}`, once the cluster is well.",
+        ) from error
+    finally:
+        with contextlib.suppress(Exception):
+            ray.kill(driver)

@@ -1,0 +1,292 @@
+"""Who trains in which pack: hands out trials, ends those that the scheduler ends, and takes up what a dead pack left.
+
+Ray Tune's trials are the packs here. Tune calls its scheduler with a pack's reports before it lets the pack go on, so
+what is decided then acts in the pack's very next step. The sweep's own scheduler compares the members: each is a trial
+to it, whichever pack it is in.
+
+A pack whose process died is started again, and its members go on from their latest checkpoints. One of them may be what
+ends the process: a member that was in a pack that died twice goes on alone, and only what it does alone counts against
+its retries.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ray.tune.experiment import Trial
+from ray.tune.schedulers import FIFOScheduler, TrialScheduler
+
+from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.ray_tune.early_stopping import grace_env_steps
+from tune_jobs.ray_tune.trainable import compared_by
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.candidates import candidates
+from tune_jobs.store.pack_files import Assignment, PackFiles
+from tune_jobs.store.progress import Progress
+from tune_jobs.store.record_keeper import RecordKeeper
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.training.pack_loop import MemberReport
+
+if TYPE_CHECKING:
+    from ray.tune.execution.tune_controller import TuneController
+
+_DEATHS_IN_COMPANY = 2
+"""A member that was in so many packs when they died goes on alone."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Member:
+    """What Tune's schedulers need of a trial."""
+
+    trial_id: str
+    status: str = Trial.RUNNING
+
+
+class _Controller:
+    """What Tune's schedulers need of the controller."""
+
+    def get_live_trials(self) -> list[Any]:
+        """Nobody waits for a place that a scheduler could make by pausing a member."""
+        return []
+
+
+class _Pack:
+    def __init__(self, files: PackFiles) -> None:
+        self.files = files
+        self.members: dict[str, None] = {}
+        self.ending: set[str] = set()
+        """Members that the scheduler has ended, and the pack lets go before it trains on."""
+        self.is_up = False
+
+    @property
+    def staying(self) -> tuple[str, ...]:
+        """Those that it trains on with."""
+        return tuple(trial_id for trial_id in self.members if trial_id not in self.ending)
+
+
+class PackDriver:
+    """Drives the packs of a run.
+
+    Args:
+        store: The sweep.
+        spec: Its spec.
+        plan: How many packs, and how many trials in each at once.
+        trial_ids: The trials to run, in the order in which they are handed out.
+        scheduler: Compares them and ends the worse.
+        keeper: Keeps their records.
+        choose: Called with a trial that is handed out, to choose its point; None: all points are known.
+    """
+
+    def __init__(
+        self,
+        store: SweepStore,
+        spec: SweepSpec,
+        plan: PackPlan,
+        trial_ids: Sequence[str],
+        *,
+        scheduler: TrialScheduler,
+        keeper: RecordKeeper,
+        choose: Callable[[str], None] | None = None,
+    ) -> None:
+        self._store = store
+        self._slots = plan.slots
+        self._max_retries = spec.max_retries
+        self._grace = grace_env_steps(spec.scheduler, spec.stop.num_env_steps)
+        self._scheduler = scheduler
+        self._controller: Any = _Controller()
+        self._keeper = keeper
+        self._choose = choose
+        self._waiting = deque(trial_ids)
+        self._alone: deque[str] = deque()
+        self._known: set[str] = set()
+        self._num_failures: Counter[str] = Counter()
+        self._num_deaths: Counter[str] = Counter()
+        num_packs = min(plan.num_packs, len(trial_ids))
+        self._packs = {f"p{i:02d}": _Pack(PackFiles(store.folder, f"p{i:02d}")) for i in range(num_packs)}
+        for index, pack in enumerate(self._packs.values()):
+            # Fewer than there is room for are spread evenly.
+            self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))
+            self._write(pack)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # As `RecordKeeper`: Tune's pickle of it is never read back.
+        return {}
+
+    @property
+    def pack_ids(self) -> tuple[str, ...]:
+        """The packs' names."""
+        return tuple(self._packs)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether there is nothing to do any more."""
+        # As long as somebody waits, no pack is empty, unless the sweep is asked to stop.
+        return not any(pack.members for pack in self._packs.values())
+
+    def log_tail(self, pack_id: str) -> str:
+        """The end of what a pack's process printed."""
+        return self._packs[pack_id].files.log_tail()
+
+    def started(self, pack_id: str) -> None:
+        """A pack's process runs."""
+        pack = self._packs[pack_id]
+        pack.is_up = True
+        for trial_id in pack.members:
+            self._keeper.started(trial_id)
+
+    def take(self, pack_id: str, reports: Sequence[MemberReport], *, node: str, pid: int) -> bool:
+        """Take a pack's reports and decide what it does next; returns whether there is nothing to do for it."""
+        pack = self._packs[pack_id]
+        for report in reports:
+            if report.progress is not None:
+                self._progressed(pack, report.trial_id, report.progress, node, pid)
+            elif report.lost:
+                self._lost(pack, report.trial_id)
+            else:
+                self._failed(pack, report)
+        self._fill(pack, self._slots)
+        self._write(pack)
+        return not pack.members
+
+    def died(self, pack_id: str, error: str) -> None:
+        """A pack's process died, or what concerns no single member went wrong; it is started again."""
+        pack = self._packs[pack_id]
+        pack.is_up = False
+        in_company = len(pack.members) > 1
+        for trial_id in list(pack.ending):
+            self._stopped(pack, trial_id)
+        for trial_id in list(pack.members):
+            if in_company:
+                self._num_deaths[trial_id] += 1
+            else:
+                self._num_failures[trial_id] += 1
+            is_over = self._num_failures[trial_id] > self._max_retries
+            self._keeper.failed(trial_id, error, retried=not is_over)
+            if is_over:
+                self._leave(pack, trial_id)
+            elif in_company and self._num_deaths[trial_id] >= _DEATHS_IN_COMPANY:
+                self._leave(pack, trial_id)
+                self._alone.append(trial_id)
+        self._fill(pack, self._slots)
+        self._write(pack)
+
+    def lost(self, pack_id: str) -> None:
+        """A pack's process ended because another one is the pack: no failure of its members; it is started again."""
+        pack = self._packs[pack_id]
+        pack.is_up = False
+        for trial_id in pack.members:
+            self._keeper.lost(trial_id)
+
+    def closed(self, pack_id: str) -> None:
+        """Tune has ended a pack: it has nothing to do, or the sweep stops and it did not save in time."""
+        pack = self._packs[pack_id]
+        pack.is_up = False
+        for trial_id in list(pack.members):
+            self._keeper.ended(trial_id)
+            self._leave(pack, trial_id)
+
+    def _progressed(self, pack: _Pack, trial_id: str, progress: Progress, node: str, pid: int) -> None:
+        if progress.status == "stopped":
+            reason = f"scheduler, at {progress.num_env_steps} env steps"
+            progress = dataclasses.replace(progress, stop_reason=reason)
+        self._keeper.progressed(trial_id, progress, node=node, pid=pid)
+        member, compared = _Member(trial_id), compared_by(progress, self._grace)
+        if progress.status == "running":
+            if trial_id in pack.ending:
+                return
+            decision = self._scheduler.on_trial_result(self._controller, member, compared)
+            if decision == TrialScheduler.STOP:
+                # As Tune does with a trial that is stopped.
+                self._scheduler.on_trial_complete(self._controller, member, compared)
+                pack.ending.add(trial_id)
+            return
+        if progress.status in ("completed", "failed"):
+            self._scheduler.on_trial_complete(self._controller, member, compared)
+        self._keeper.ended(trial_id)
+        self._leave(pack, trial_id)
+
+    def _failed(self, pack: _Pack, report: MemberReport) -> None:
+        """A member failed by itself; unless it is over, the pack has opened it again."""
+        trial_id = report.trial_id
+        if trial_id in pack.ending:
+            self._stopped(pack, trial_id)
+            return
+        self._num_failures[trial_id] += 1
+        self._keeper.failed(trial_id, report.error or "", retried=report.retried, reached=report.reached)
+        if not report.retried or self._store.stop_requested():
+            self._leave(pack, trial_id)
+        else:
+            self._keeper.started(trial_id)
+
+    def _lost(self, pack: _Pack, trial_id: str) -> None:
+        """A pack has let a member go that another process took up: no failure, and what that one did is on disk."""
+        if trial_id in pack.ending:
+            self._stopped(pack, trial_id)
+            return
+        self._keeper.lost(trial_id)
+        self._leave(pack, trial_id)
+        self._waiting.append(trial_id)
+
+    def _stopped(self, pack: _Pack, trial_id: str) -> None:
+        """A member that was to be ended is gone without a word: its checkpoints are those on disk."""
+        checkpoints = tuple(candidates(self._store.trial(trial_id)))
+        self._keeper.change(trial_id, checkpoints=checkpoints)
+        self._keeper.ended(trial_id)
+        self._leave(pack, trial_id)
+
+    def _leave(self, pack: _Pack, trial_id: str) -> None:
+        pack.members.pop(trial_id, None)
+        pack.ending.discard(trial_id)
+
+    def _fill(self, pack: _Pack, num_members: int) -> None:
+        """Give a pack further trials; one that is to go on alone only if it is empty, and nobody else with it."""
+        if self._store.stop_requested():
+            return
+        staying = pack.staying
+        if self._alone and not staying:
+            self._give(pack, self._alone.popleft())
+            return
+        if any(self._num_deaths[trial_id] >= _DEATHS_IN_COMPANY for trial_id in staying):
+            return
+        for _ in range(num_members - len(staying)):
+            if self._waiting:
+                self._give(pack, self._waiting.popleft())
+
+    def _give(self, pack: _Pack, trial_id: str) -> None:
+        if trial_id not in self._known:
+            self._known.add(trial_id)
+            if self._choose is not None:
+                self._choose(trial_id)
+            self._scheduler.on_trial_add(self._controller, _Member(trial_id))
+        pack.members[trial_id] = None
+        if pack.is_up:
+            self._keeper.started(trial_id)
+
+    def _write(self, pack: _Pack) -> None:
+        failures = {name: self._num_failures[name] for name in pack.staying if self._num_failures[name]}
+        with self._keeper.owned():
+            pack.files.write(Assignment(pack.staying, failures))
+
+
+class PackScheduler(FIFOScheduler):  # type: ignore[misc]
+    """Lets Tune ask the driver what a pack does next."""
+
+    def __init__(self, driver: PackDriver) -> None:
+        super().__init__()
+        self._driver = driver
+
+    def on_trial_result(
+        self,
+        tune_controller: TuneController,  # noqa: ARG002 - Tune's signature
+        trial: Trial,
+        result: dict[str, Any],
+    ) -> str:
+        """Hand the reports on; see `TrialScheduler`."""
+        is_done = self._driver.take(
+            str(trial.config["pack_id"]), result["reports"], node=result["node"], pid=result["pid"]
+        )
+        return str(TrialScheduler.STOP if is_done else TrialScheduler.CONTINUE)

@@ -1,0 +1,138 @@
+"""The Ray Tune Trainable of a pack: one process that trains many trials at once, for as long as there are any.
+
+Tune gives it a sweep folder and a pack id. Whom to train it reads from `packs/<pack>.json` before every step; what to
+train is in the sweep folder, so a pack that is started again goes on from what its members left there.
+"""
+
+from __future__ import annotations
+
+import functools
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from ray import tune
+
+from policies.acting.evaluate import Evaluator
+from policies.envs.faults import note_signals
+from policies.envs.modules import allow_modules
+from tune_jobs.ray_tune.trainable import (
+    REPORT_INTERVAL_S,
+    TaskReader,
+    TrialLog,
+    end_with_driver,
+    owner_of_run,
+    this_node,
+    watchdog,
+)
+from tune_jobs.store.ownership import Owner
+from tune_jobs.store.pack_files import PackFiles
+from tune_jobs.training.pack_loop import PackLoop
+from tune_jobs.training.protocol import PackEngine
+
+if TYPE_CHECKING:
+    from policies.acting.evaluate import Episodes
+    from policies.acting.policy import Policy
+    from policies.packed.envs.make import EnvKind
+
+
+def make_pack_engine(env_kind: EnvKind, num_env_processes: int) -> PackEngine:
+    """The engine that trains packs.
+
+    Args:
+        env_kind: How its environments step; see `PackPlan`.
+        num_env_processes: Processes that step them.
+    """
+    # Imported in the pack's process only: the driver imports this module too, and needs no torch.
+    from tune_jobs.training.packed import PackedEngine
+
+    return PackedEngine(env_kind=env_kind, num_env_processes=num_env_processes)
+
+
+class PackTrainable(tune.Trainable):  # type: ignore[misc]
+    """Runs a pack; `config` holds `sweep_folder`, `pack_id`, `env_kind` and `num_env_processes`."""
+
+    def setup(self, config: dict[str, Any]) -> None:
+        """Remember the pack; it is built in the first step, so that every error comes from there."""
+        self._config = config
+        self._files = PackFiles(Path(config["sweep_folder"]), config["pack_id"])
+        run = owner_of_run(config)
+        self._owner = Owner.take(self._files.owner_path, run)
+        end_with_driver(config, self._owner)
+        note_signals()
+        self._log = TrialLog()
+        self._file: IO[bytes] = self._log.open(self._files.log_path)
+        self._files.begin_log()
+        self._engine: PackEngine | None = None
+        self._evaluator: Evaluator | None = None
+        self._loop: PackLoop | None = None
+        self._node = this_node()
+
+    def step(self) -> dict[str, Any]:
+        """Let go who is to end, take in who is new, and train until there is something to decide.
+
+        Raises:
+            Exception: What concerns no single member; it is in the pack's log too.
+        """
+        try:
+            if self._loop is None:
+                self._loop = self._open()
+            self._arrange(self._loop)
+            reports = self._loop.advance(REPORT_INTERVAL_S, until_evaluated=self._is_scheduled)
+        except Exception:
+            traceback.print_exc()
+            raise
+        # When there is nothing left to do is the driver's decision.
+        return {"done": False, "reports": reports, "node": self._node}
+
+    def make_engine(self) -> PackEngine:
+        """The engine of this pack."""
+        return make_pack_engine(self._config["env_kind"], self._config["num_env_processes"])
+
+    def evaluate(self, evaluator: Evaluator, policies: Sequence[Policy]) -> Sequence[Episodes | Exception]:
+        """Greedy episodes of each policy, or why there are none."""
+        from policies.packed.evaluation import evaluate_many
+
+        return evaluate_many(evaluator, policies)
+
+    def _open(self) -> PackLoop:
+        self._reader = reader = TaskReader(Path(self._config["sweep_folder"]))
+        spec = reader.spec
+        allow_modules(reader.sweep.allowed_modules)
+        self._is_scheduled = spec.scheduler.type != "none"
+        self._engine = self.make_engine()
+        with watchdog(spec.iteration_timeout_s, self._file):
+            self._evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, reader.sweep.evaluation_seeds)
+        return PackLoop(
+            self._engine,
+            self._evaluator,
+            self.evaluate,
+            stop_requested=reader.store.stop_requested,
+            max_retries=spec.max_retries,
+            watch=functools.partial(watchdog, file=self._file),
+            under=self._owner,
+        )
+
+    def _arrange(self, loop: PackLoop) -> None:
+        """Make the members those that are assigned.
+
+        Raises:
+            OwnershipLostError: Another process is this pack by now, and reads the same assignment.
+        """
+        self._owner.check()
+        assignment = self._files.read()
+        for trial_id in loop.trial_ids:
+            if trial_id not in assignment.trial_ids:
+                loop.end(trial_id)
+        for trial_id in assignment.trial_ids:
+            if trial_id not in loop.trial_ids:
+                loop.add(self._reader.read(trial_id), assignment.num_failures.get(trial_id, 0))
+
+    def cleanup(self) -> None:
+        """Free everything; the process may end."""
+        if self._engine is not None:
+            self._engine.close()
+        if self._evaluator is not None:
+            self._evaluator.close()
+        self._log.close()

@@ -1,0 +1,396 @@
+"""Runs a sweep's trials with Ray Tune, and keeps their records up to date.
+
+Tune decides which trial runs where and when; what a trial is and how far it got is in the sweep folder, written here
+(`trial.json`) and by the trials' own processes. Tune's own folder is a cache that every run begins anew.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+from ray import tune
+from ray.exceptions import RayActorError, RayTaskError
+from ray.tune.experiment import Trial
+from ray.tune.schedulers import TrialScheduler
+
+from analysis.records import CheckpointRecord
+from policies.errors import TuneJobsError, said_by
+from policies.parents import this_process
+from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.process.interruption import current
+from tune_jobs.ray_tune.early_stopping import build_scheduler, waits_for_others
+from tune_jobs.ray_tune.environment import prepare_environment
+from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
+from tune_jobs.ray_tune.pack_trainable import PackTrainable
+from tune_jobs.ray_tune.population import PopulationScheduler
+from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
+from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
+from tune_jobs.ray_tune.trainable import TrialTrainable
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.copies import remove_uncounted_copies
+from tune_jobs.store.logs import died_by
+from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.store.places import remove_folder, within
+from tune_jobs.store.progress import Progress
+from tune_jobs.store.record_keeper import Listener, RecordKeeper
+from tune_jobs.store.sweep_store import SweepStore
+
+# How long running trials may take to save a checkpoint once they were asked to stop; then they are ended.
+STOP_GRACE_S = 20.0
+
+
+@dataclass(frozen=True)
+class RunJob:
+    """What to run."""
+
+    sweep_folder: Path
+    trial_ids: tuple[str, ...]
+    cpus_per_trial: float
+    gpus_per_trial: float
+    max_concurrent: int
+    packs: PackPlan | None = None
+    """How those of its trials are run that are packed; None: none is."""
+    run: str | None = None
+    """The token of the run, as `Owner` has it; None: the job takes the sweep up itself."""
+
+
+def run_trials(job: RunJob, listener: Listener) -> None:
+    """Run these trials to their end, or until the sweep is asked to stop. Failed trials raise nothing.
+
+    Args:
+        job: What to run; Ray must be connected.
+        listener: Called with a trial's record whenever it changes, in this thread.
+
+    Raises:
+        OwnershipLostError: Another process runs the sweep by now; nothing was written over its records.
+        CannotRunError: A part of Ray died; the records are written.
+    """
+    prepare_environment()
+    store = SweepStore(job.sweep_folder)
+    owner_path = within(store.folder, OWNER_FILE)
+    owner = Owner.take(owner_path) if job.run is None else Owner(owner_path, job.run)
+    with owner.held():
+        remove_folder(store.tune_folder)
+        for trial_id in job.trial_ids:
+            remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
+    wanted = set(job.trial_ids)
+    packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
+    others = [name for name in job.trial_ids if name not in set(packed)]
+    with RayWatch.of_this_process() as watch:
+        run = _Run(job, store, listener, owner, watch)
+        watch.when_stuck = functools.partial(_give_up, run)
+        try:
+            if packed:
+                run.packs(packed)
+            # One after the other: a pack uses all the CPUs it is given all the time.
+            if others and not (packed and store.stop_requested()):
+                run.single_trials(others)
+        except (RayDiedError, Exception) as error:
+            if isinstance(error, RayDiedError):
+                raise ray_died(store.name, error) from error
+            # What Ray raises when a part of it is gone says little of it.
+            try:
+                watch.check_after(error)
+            except RayDiedError as death:
+                raise ray_died(store.name, death) from error
+            raise
+        finally:
+            with current().shielded():
+                run.keeper.close()
+                owner.release()
+
+
+class _Run:
+    """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
+
+    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Owner, watch: RayWatch) -> None:
+        self._job = job
+        self._watch = watch
+        self._store = self.store = store
+        # What each process is told: which sweep, for which run, and who is gone when it is to end.
+        self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
+        self._spec = stored_spec(store.read_record())
+        self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
+        self._scheduler = self._build_scheduler()
+        chooser = PointChooser(self._spec, self.keeper.all_records, self.keeper.change)
+        self._chooser = chooser if self._spec.search.type == "tpe" else None
+
+    def _build_scheduler(self) -> TrialScheduler:
+        if self._spec.scheduler.type == "pbt":
+            return PopulationScheduler(self._spec, self._store, self.keeper.record, self.keeper.change)
+        return build_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
+
+    def packs(self, trial_ids: Sequence[str]) -> None:
+        """Run trials in packs; Tune's trials are the packs."""
+        plan = self._job.packs
+        assert plan is not None
+        choose = None if self._chooser is None else self._chooser.prepare
+        driver = PackDriver(
+            self._store, self._spec, plan, trial_ids, scheduler=self._scheduler, keeper=self.keeper, choose=choose
+        )
+        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch)
+        bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
+        tune.Tuner(
+            tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
+            param_space={
+                **self._config,
+                "pack_id": tune.grid_search(list(driver.pack_ids)),
+                "env_kind": plan.env_kind,
+                "num_env_processes": plan.num_env_processes,
+            },
+            tune_config=tune.TuneConfig(
+                scheduler=PackScheduler(driver), trial_name_creator=_pack_id, trial_dirname_creator=_pack_id
+            ),
+            # The driver decides which of a dead pack's trials are tried again, and the run ends when none is left.
+            run_config=self._run_config("packs", events, -1, lambda: driver.is_finished),
+        ).fit()
+
+    def single_trials(self, trial_ids: Sequence[str]) -> None:
+        """Run trials one by one, as many at once as fit."""
+        spec, job = self._spec, self._job
+        param_space: dict[str, Any] = dict(self._config)
+        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch)
+        searcher = None
+        if self._chooser is not None:
+            searcher = PointSearcher(trial_ids, self._chooser)
+        else:
+            param_space["trial_id"] = tune.grid_search(list(trial_ids))
+        tune.Tuner(
+            tune.with_resources(TrialTrainable, _resources(spec, job)),
+            param_space=param_space,
+            tune_config=tune.TuneConfig(
+                search_alg=searcher,
+                num_samples=1 if searcher is None else len(trial_ids),
+                scheduler=self._scheduler,
+                # Without it Tune runs one trial at a time where there is a searcher.
+                max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
+                reuse_actors=True,
+                trial_name_creator=_trial_id,
+                trial_dirname_creator=_trial_id,
+            ),
+            run_config=self._run_config("run", events, spec.max_retries),
+        ).fit()
+
+    def _run_config(
+        self, name: str, events: tune.Callback, max_failures: int, is_finished: Callable[[], bool] = lambda: False
+    ) -> tune.RunConfig:
+        return tune.RunConfig(
+            name=name,
+            storage_path=str(self._store.tune_folder),
+            stop=_StopWhenAsked(self._store, self.keeper, is_finished, self._watch),
+            verbose=0,
+            failure_config=tune.FailureConfig(max_failures=max_failures),
+            # Trials write their own checkpoints; Tune's are pointers, made when it pauses one.
+            checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=0, checkpoint_at_end=False),
+            callbacks=[events],
+        )
+
+
+def _trial_id(trial: Trial) -> str:
+    return str(trial.config["trial_id"])
+
+
+def _pack_id(trial: Trial) -> str:
+    return str(trial.config["pack_id"])
+
+
+def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
+    """One bundle for the trial's process, one for each env runner; together `cpus_per_trial`."""
+    num_runners = spec.resources.num_env_runners
+    main = {"CPU": job.cpus_per_trial - num_runners}
+    if job.gpus_per_trial:
+        main["GPU"] = job.gpus_per_trial
+    return tune.PlacementGroupFactory([main] + [{"CPU": 1}] * num_runners, strategy="PACK")
+
+
+class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
+    """Ends the run when there is nothing to do, or once the running trials have saved, or took too long to."""
+
+    def __init__(
+        self, store: SweepStore, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch
+    ) -> None:
+        self._watch = watch
+        self._store = store
+        self._keeper = keeper
+        self._is_finished = is_finished
+        self._asked_at: float | None = None
+
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
+        return False
+
+    def stop_all(self) -> bool:
+        """Whether to end the run now; Tune asks all the time.
+
+        Raises:
+            RayDiedError: It can't go on.
+        """
+        self._watch.check()
+        if self._is_finished():
+            return True
+        if self._asked_at is None:
+            if not self._store.stop_requested():
+                return False
+            self._asked_at = time.monotonic()
+        return not self._keeper.running or time.monotonic() - self._asked_at > STOP_GRACE_S
+
+
+class _TrialEvents(tune.Callback):  # type: ignore[misc]
+    """Tells the keeper of records what Tune does with the trials."""
+
+    def __init__(self, store: SweepStore, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
+        self._store = store
+        self._keeper = keeper
+        self._timeout_s = timeout_s
+        self._watch = watch
+
+    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """A process took the trial."""
+        self._keeper.started(_trial_id(trial))
+
+    def on_trial_result(
+        self,
+        iteration: int,
+        trials: list[Trial],
+        trial: Trial,
+        result: dict[str, Any],
+        **info: Any,
+    ) -> None:
+        """A report, about once a second and after each evaluation."""
+        fields = dict(result["progress"])
+        fields["checkpoints"] = tuple(CheckpointRecord.model_validate(item) for item in fields["checkpoints"])
+        self._keeper.progressed(_trial_id(trial), Progress(**fields), node=result["node"], pid=result["pid"])
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        """Schedulers pause trials and tell no one; a paused trial has saved its checkpoint and needs no waiting for."""
+        for trial in trials:
+            trial_id = _trial_id(trial)
+            if trial.status == Trial.PAUSED and trial_id in self._keeper.running:
+                self._keeper.paused(trial_id)
+        self._keeper.flush()
+
+    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """Tune is done with the trial: its own end, the scheduler's decision, or the end of the run."""
+        self._keeper.ended(_trial_id(trial))
+
+    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """A failure that will be retried."""
+        self._failed(trial, retried=True)
+
+    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """A failure that will not."""
+        self._failed(trial, retried=False)
+
+    def _failed(self, trial: Trial, *, retried: bool) -> None:
+        trial_id, error = _trial_id(trial), _error_of(trial)
+        if _was_lost(error):
+            self._keeper.lost(trial_id)
+            return
+        self._watch.check_after(error)
+        message = describe_failure(error, self._store.trial(trial_id).log_tail(), timeout_s=self._timeout_s)
+        self._keeper.failed(trial_id, message, retried=retried)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tune pickles its callbacks into a file that is never read back here; listeners and open files can't be.
+        return {}
+
+
+class _PackEvents(tune.Callback):  # type: ignore[misc]
+    """Tells the driver of the packs what becomes of their processes."""
+
+    def __init__(self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
+        self._watch = watch
+        self._driver = driver
+        self._keeper = keeper
+        self._timeout_s = timeout_s
+
+    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """The pack's process runs."""
+        self._driver.started(_pack_id(trial))
+
+    def on_trial_result(
+        self,
+        iteration: int,
+        trials: list[Trial],
+        trial: Trial,
+        result: dict[str, Any],
+        **info: Any,
+    ) -> None:
+        """Nothing: the scheduler has taken it; Tune need not keep it."""
+        del result["reports"]
+
+    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
+        """The packs have been told to go on: time for what they need not wait for."""
+        self._keeper.flush()
+
+    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """No process for the pack any more: it has nothing to do, or the run ends."""
+        self._driver.closed(_pack_id(trial))
+
+    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """The pack's process died; Tune starts another one."""
+        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), _error_of(trial)
+        if _was_lost(error):
+            self._driver.lost(pack_id)
+            return
+        self._watch.check_after(error)
+        self._driver.died(pack_id, describe_failure(error, tail, timeout_s=self._timeout_s, what="pack"))
+
+    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
+        """It died too often."""
+        self.on_trial_recover(iteration, trials, trial)
+        self._driver.closed(_pack_id(trial))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
+
+
+def _give_up(run: _Run, death: RayDiedError) -> None:
+    """Save, and end this process: its main thread waits for Ray, which would end it in less than a minute.
+
+    In the background, as the main thread can't; that one changes nothing meanwhile.
+    """
+    from tune_jobs.sweeps.drive import end_process
+
+    run.keeper.close()
+    end_process(run.store, ray_died(run.store.name, death))
+
+
+def _error_of(trial: Trial) -> BaseException | None:
+    # Trial.get_pickled_error looks where Tune syncs to, and nothing has been synced yet; this is where it writes.
+    path = trial.pickled_error_file
+    if not path or not Path(path).is_file():
+        return None
+    error: BaseException = cloudpickle.loads(Path(path).read_bytes())
+    return error
+
+
+def _was_lost(error: BaseException | None) -> bool:
+    """Whether a process ended because another one has what it worked on: no failure of a trial."""
+    return isinstance(getattr(error, "cause", None), OwnershipLostError)
+
+
+def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float, what: str = "trial") -> str:
+    """What made a trial or a pack fail, in a line, and the end of its log.
+
+    Args:
+        error: What Ray Tune tells.
+        tail: Of the log, as `logs.log_tail` gives it.
+        timeout_s: The sweep's `iteration_timeout_s`.
+        what: Whose process it was.
+    """
+    if isinstance(error, RayTaskError):
+        cause = error.cause if isinstance(error.cause, BaseException) else error
+        message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {said_by(cause)}"
+    elif isinstance(error, RayActorError):
+        why = died_by(tail, timeout_s) or ("its node was taken away" if error.preempted else "")
+        message = f"The process of the {what} died{f': {why}' if why else ''}."
+    else:
+        message = said_by(error) if error is not None else "Unknown error."
+    return f"{message}\n{tail}".strip()

@@ -1,0 +1,96 @@
+"""Points chosen when a trial starts, and a Ray Tune searcher that starts a sweep's trials one by one."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ray.tune.search import Searcher
+
+from analysis.records import TrialRecord
+from tune_jobs.plan.sweep_plan import point_hyperparams
+from tune_jobs.search.tpe import propose_point
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+class PointChooser:
+    """Chooses the points of trials that have none, when they are about to start, and of the other seeds of the point.
+
+    Args:
+        spec: The sweep.
+        records: All records of the sweep, newest.
+        change: Changes fields of a trial's record, on disk too.
+    """
+
+    def __init__(
+        self, spec: SweepSpec, records: Callable[[], Sequence[TrialRecord]], change: Callable[..., None]
+    ) -> None:
+        self._spec = spec
+        self._given: set[str] = set()
+        self._records = records
+        self._change = change
+
+    def prepare(self, name: str) -> None:
+        """See to it that a trial has a point; it starts now.
+
+        Raises:
+            SpecError: No valid point is found.
+        """
+        self._given.add(name)
+        # A trial that was given to a process runs, though it may not have reported so.
+        records = [
+            record.model_copy(update={"status": "running"})
+            if record.status == "pending" and record.trial_id in self._given
+            else record
+            for record in self._records()
+        ]
+        record = next(record for record in records if record.trial_id == name)
+        if not record.has_point:
+            self._choose(record.point_index, records)
+
+    def _choose(self, point_index: int, records: Sequence[TrialRecord]) -> None:
+        spec = self._spec
+        known = [record for record in records if record.point_index == point_index and record.has_point]
+        if known:
+            # Another seed has it already: the driver was killed before it could write it down for this one.
+            self._write(point_index, records, known[0].point)
+            return
+        point = propose_point(spec, records, point_index, lambda point: point_hyperparams(spec, point, point_index))
+        self._write(point_index, records, point)
+
+    def _write(self, point_index: int, records: Sequence[TrialRecord], point: dict[str, Any]) -> None:
+        hyperparams = point_hyperparams(self._spec, point, point_index).model_dump(mode="json")
+        for record in records:
+            if record.point_index == point_index and not record.has_point:
+                self._change(record.trial_id, point=point, hyperparams=hyperparams, has_point=True)
+
+
+class PointSearcher(Searcher):  # type: ignore[misc]
+    """Gives Tune the trials in order, each with a point.
+
+    Tune asks only when a trial can start (`max_concurrent_trials`), so every choice knows all that has ended.
+
+    Args:
+        trial_ids: The trials to run.
+        chooser: Chooses their points.
+    """
+
+    def __init__(self, trial_ids: Sequence[str], chooser: PointChooser) -> None:
+        super().__init__()
+        self._waiting = deque(trial_ids)
+        self._chooser = chooser
+
+    def suggest(self, trial_id: str) -> dict[str, Any] | str:  # noqa: ARG002 - Tune's own id
+        """The next trial's config, as `TrialTrainable` takes it."""
+        if not self._waiting:
+            return str(Searcher.FINISHED)
+        name = self._waiting.popleft()
+        self._chooser.prepare(name)
+        return {"trial_id": name}
+
+    def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:  # noqa: FBT001, FBT002 - Tune's signature
+        """Nothing: the records say how a trial ended."""
+
+    def save_to_dir(self, checkpoint_dir: str, session_str: str = "default") -> None:
+        """Nothing: Tune's state is a cache."""

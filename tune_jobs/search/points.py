@@ -1,0 +1,63 @@
+"""The points of a sweep as far as they are known before it starts, and the largest trials that unknown ones may be."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from policies.errors import SpecError
+from policies.hyperparams import Hyperparams, as_sizes
+from tune_jobs.spec.domains import Domain, Listed, Range, draw_point, draw_points
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+_MAX_COMBINATIONS = 10_000
+_DECIDE_SIZE = (
+    "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers",
+    "replay_capacity",
+)  # fmt: skip
+"""Hyperparameters on which a trial's env steps, disk space and memory depend."""
+
+
+def planned_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
+    """The point of each index; None: the search method chooses it when its trial starts."""
+    if spec.search.type == "random":
+        return list(draw_points(spec.space, spec.num_samples, spec.seed))
+    num_random = min(spec.search.num_startup_trials, spec.num_samples)
+    known = [draw_point(spec.space, index, spec.seed) for index in range(num_random)]
+    return [*known, *[None] * (spec.num_samples - num_random)]
+
+
+def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[Hyperparams]:
+    """Values whose trials are at least as large as those of any point of the space; they need not go together.
+
+    Args:
+        spec: The sweep.
+        known: Of the points that are known; at least one.
+
+    Raises:
+        SpecError: There are too many combinations to look at.
+    """
+    ends = {name: _ends(domain) for name, domain in spec.space.items() if name in _DECIDE_SIZE}
+    if "hidden_sizes" in ends:
+        ends["hidden_sizes"] = [as_sizes(value) for value in ends["hidden_sizes"]]
+    combinations = math.prod(map(len, ends.values()))
+    if combinations > _MAX_COMBINATIONS:
+        raise SpecError(
+            f"The listed values of {', '.join(ends)} have {combinations:,} combinations; at most {_MAX_COMBINATIONS:,} "
+            "can be looked at to find the largest trial.",
+            "List fewer values, or give ranges.",
+        )
+    return [
+        known[0].model_copy(update=dict(zip(ends, values, strict=True))) for values in itertools.product(*ends.values())
+    ]
+
+
+def _ends(domain: Domain) -> list[Any]:
+    if isinstance(domain, Range):
+        return list(domain.bounds)
+    assert isinstance(domain, Listed)
+    if all(isinstance(value, int | float) for value in domain.values):
+        return [min(domain.values), max(domain.values)]
+    return list(domain.values)

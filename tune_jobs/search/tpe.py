@@ -1,0 +1,178 @@
+"""Points proposed by a model of the trials that ended: TPE (Bergstra et al. 2011), as Optuna implements it.
+
+The model is built anew from the trial records for every point, so a sweep that is resumed or extended goes on with all
+it knows, and nothing is kept beside the records. What it is told of a point:
+
+- ended: the mean over its seeds of the best evaluation return, which is what the selection goes by;
+- ended early by a scheduler: the same, and how far it got. Such points count as worse than those that ended by
+  themselves, those that got further as better (Optuna's pruned trials);
+- failed, or without one finite evaluation: worse than all others;
+- still running: as a bad one, so that trials that run at the same time are spread out (the constant liar).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.records import FINISHED, TrialRecord
+from policies.errors import CannotRunError, SpecError
+from tune_jobs.spec.domains import Domain, Listed, Range, draw_point
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+if TYPE_CHECKING:
+    import optuna
+
+_SPAWN_KEY = 5  # 0 to 4 belong to points, seeds and mutations
+_ATTEMPTS = 100
+
+Check = Callable[[dict[str, Any]], object]
+
+
+def check_installed() -> None:
+    """Check that Optuna is there.
+
+    Raises:
+        CannotRunError: It isn't; the hint says how to install it.
+    """
+    if importlib.util.find_spec("optuna") is None:
+        raise CannotRunError(
+            "search.type is tpe, which needs Optuna, and that is not installed.",
+            "Install it with `pip install 'tune-jobs[tpe]'`, or set search.type to random.",
+        )
+
+
+def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: int, check: Check) -> dict[str, Any]:
+    """Choose the point that is tried next.
+
+    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, it is the
+    random one of its index.
+
+    Args:
+        spec: The sweep.
+        records: All its trials.
+        point_index: Of the point that is wanted.
+        check: Raises SpecError for a point whose values don't go together; then another is proposed.
+
+    Raises:
+        SpecError: None of many proposals is valid.
+        CannotRunError: Optuna is not installed.
+    """
+    check_installed()
+    import optuna
+
+    known = _known_trials(spec, records)
+    if sum(trial.state.is_finished() for trial in known) < spec.search.num_startup_trials:
+        return draw_point(spec.space, point_index, spec.seed)
+    words = np.random.SeedSequence(spec.seed, spawn_key=(_SPAWN_KEY, point_index)).generate_state(1)
+    with warnings.catch_warnings():
+        # Of arguments that are new in Optuna 4.
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        sampler = optuna.samplers.TPESampler(
+            seed=int(words[0]), n_startup_trials=0, multivariate=True, constant_liar=True
+        )
+    verbosity = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        study = optuna.create_study(direction="maximize", sampler=sampler)
+        study.add_trials(known)
+        return _first_valid(study, spec.space, check)
+    finally:
+        optuna.logging.set_verbosity(verbosity)
+
+
+def _first_valid(study: optuna.Study, space: Mapping[str, Domain], check: Check) -> dict[str, Any]:
+    import optuna
+
+    distributions = {name: _distribution(domain) for name, domain in space.items()}
+    for _ in range(_ATTEMPTS):
+        trial = study.ask(fixed_distributions=distributions)
+        point = {name: _from_optuna(domain, trial.params[name]) for name, domain in space.items()}
+        try:
+            check(point)
+        except SpecError as error:
+            last_error = error
+            # Without a value it counts as worse than all others.
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        else:
+            return point
+    raise last_error
+
+
+def _known_trials(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[optuna.trial.FrozenTrial]:
+    """The points that are chosen, as Optuna's trials."""
+    import optuna
+
+    points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
+    for record in records:
+        if record.has_point:
+            points[record.point_index].append(record)
+    distributions = {name: _distribution(domain) for name, domain in spec.space.items()}
+    states = optuna.trial.TrialState
+    known = []
+    for index in sorted(points):
+        members = points[index]
+        told: dict[str, Any] = {"state": states.RUNNING}
+        if all(record.status in FINISHED for record in members):
+            score, level = _score(members), _level(spec, members)
+            if score is None:
+                told = {"state": states.PRUNED}
+            elif level is None:
+                told = {"state": states.COMPLETE, "value": score}
+            else:
+                told = {"state": states.PRUNED, "intermediate_values": {level: score}}
+        elif all(record.status == "pending" for record in members):
+            continue  # planned, and not begun
+        point = members[0].point
+        params = {name: _to_optuna(domain, point[name]) for name, domain in spec.space.items()}
+        known.append(optuna.trial.create_trial(params=params, distributions=distributions, **told))
+    return known
+
+
+def _score(members: Sequence[TrialRecord]) -> float | None:
+    """Mean over a point's seeds; None if one of them failed or was never scored."""
+    scores = [None if record.status == "failed" else record.best_evaluation_return for record in members]
+    known = [score for score in scores if score is not None]
+    return sum(known) / len(known) if len(known) == len(scores) else None
+
+
+def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:
+    """How far the first trial of a point that a scheduler ended came, in steps of its rungs; None: it ended none."""
+    steps = [record.num_env_steps for record in members if record.status == "stopped"]
+    if not steps:
+        return None
+    # Trials end a rung at somewhat different env steps, and must not be told apart by these.
+    rungs = math.log(max(1.0, min(steps) / spec.grace_env_steps), spec.scheduler.reduction_factor)
+    return int(rungs + 1e-9)
+
+
+def _distribution(domain: Any) -> optuna.distributions.BaseDistribution:
+    """A domain in Optuna's terms: lists and multiples of q by index, as Optuna has no log scale with steps."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if isinstance(domain, Listed):
+        return CategoricalDistribution(tuple(range(len(domain.values))))
+    assert isinstance(domain, Range)
+    if domain.is_whole or domain.q is not None:
+        return IntDistribution(*domain.factors, log=domain.is_log)
+    return FloatDistribution(*domain.bounds, log=domain.is_log)
+
+
+def _from_optuna(domain: Any, value: Any) -> Any:
+    if isinstance(domain, Listed):
+        return domain.values[value]
+    assert isinstance(domain, Range)
+    return domain.at_factor(value) if domain.is_whole or domain.q is not None else float(value)
+
+
+def _to_optuna(domain: Any, value: Any) -> Any:
+    if isinstance(domain, Listed):
+        return domain.index_of(value)
+    assert isinstance(domain, Range)
+    return round(value / (domain.q or 1)) if domain.is_whole or domain.q is not None else float(value)

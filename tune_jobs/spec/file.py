@@ -1,0 +1,281 @@
+"""Reading a sweep file: YAML, presets, `--set`, and all that is wrong with them in one message."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import TypeAdapter
+
+from analysis.records import SweepRecord
+from policies.arguments import checked
+from policies.errors import CheckpointError, SpecError, shortened
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
+from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError, did_you_mean
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.yaml import parse_yaml
+
+# What the characters that are read may take up at most, at 4 bytes each.
+_MAX_BYTES = 4 * MAX_CHARACTERS
+_SECTIONS_OF_TEXT = {"env": "id", "scheduler": "type", "search": "type"}
+"""Sections that may be written as one text, and the field that it stands for."""
+
+
+class Preset(NamedTuple):
+    """A sweep file that ships with the package; all but name and text stand in the comment it begins with."""
+
+    name: str
+    title: str
+    """One line."""
+    source: str
+    """Where its settings come from."""
+    shows: str
+    expected: str
+    """The score that it reaches."""
+    env_steps: str
+    time: str
+    """On 2 cores."""
+    description: str
+    """The rest of the comment."""
+    text: str
+    """The whole file."""
+
+
+_PRESET_LABELS = {
+    "Source": "source", "Shows": "shows", "Expected": "expected", "Env steps": "env_steps", "Time": "time",
+}  # fmt: skip
+
+
+def list_presets() -> list[Preset]:
+    """The presets, by name."""
+    folder = resources.files("tune_jobs").joinpath("presets")
+    files = [file for file in folder.iterdir() if file.name.endswith(".yaml")]
+    presets = [read_preset(file.name.removesuffix(".yaml"), file.read_text(encoding="utf-8")) for file in files]
+    return sorted(presets)
+
+
+def read_preset(name: str, text: str) -> Preset:
+    """A preset from its file's text: a title, then labelled lines, then more; what is missing is empty.
+
+    Args:
+        name: The file's name without its ending.
+        text: The file. Its first lines are `# <title>`, `# Source: ...`, `# Shows: ...`, `# Expected: ...`,
+            `# Env steps: ...`, `# Time: ... on 2 cores`, and free comment lines.
+    """
+    comment = re.match(r"(?:#.*\n)*", text)
+    title, *lines = [line.lstrip("#").strip() for line in (comment.group() if comment else "").splitlines()] or [""]
+    fields = dict.fromkeys(_PRESET_LABELS.values(), "")
+    rest: list[str] = []
+    for line in lines:
+        label, _, value = line.partition(": ")
+        if label in _PRESET_LABELS and not rest:
+            fields[_PRESET_LABELS[label]] = value.strip()
+        else:
+            rest.append(line)
+    return Preset(name=name, title=title, **fields, description=" ".join(rest).strip(), text=text)
+
+
+def find_preset(name: str) -> Preset:
+    """The preset of a name.
+
+    Raises:
+        SpecError: There is none; the message names the nearest.
+    """
+    presets = {preset.name: preset for preset in list_presets()}
+    if name not in presets:
+        raise SpecError(
+            f"There is no preset {name!r}.{did_you_mean(name, presets)}",
+            f"The presets are: {', '.join(presets)}.",
+        )
+    return presets[name]
+
+
+@checked
+def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] = ()) -> SweepSpec:
+    """Read and validate a sweep.
+
+    Args:
+        source: Path of a sweep file, name of a preset, or the content of a sweep file as a mapping.
+        overrides: `a.b=value` assignments, as given to `--set`; the value is YAML. An empty value takes the
+            field out.
+
+    Returns:
+        The sweep, valid by itself.
+
+    Raises:
+        SpecError: No such file or preset, no YAML, or a wrong sweep; the message lists every problem.
+    """
+    label, data = _read(source)
+    if overrides:
+        set_paths = [_apply_override(data, override) for override in overrides]
+        data = to_plain(data, f"{label} with --set")
+    else:
+        set_paths = []
+    try:
+        return SweepSpec.model_validate(data)
+    except WrongSpecError as error:
+        found = error.problems
+    told = [Problem(path, f"{text}{' (from --set)' if _is_set(path, set_paths) else ''}") for path, text in found]
+    raise WrongSpecError.of(label, told)
+
+
+def stored_spec(record: SweepRecord) -> SweepSpec:
+    """The spec that a sweep was launched with.
+
+    Raises:
+        CheckpointError: The sweep's record holds none that this version accepts.
+    """
+    try:
+        # Another version may have fields that are null, and that this one doesn't know.
+        return SweepSpec.model_validate({key: value for key, value in record.spec.items() if value is not None})
+    except WrongSpecError as error:
+        told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
+        raise CheckpointError(
+            f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
+            "Restore it from a backup, or use the version of tune-jobs that stands in it.",
+        ) from error
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the sweep file, for editors: all fields, and the hyperparameters of each algorithm."""
+    schema = SweepSpec.model_json_schema(mode="validation")
+    definitions: dict[str, Any] = schema["$defs"]
+    domain_schema = TypeAdapter(Domain).json_schema(ref_template="#/$defs/{model}")
+    definitions |= domain_schema.pop("$defs")
+    definitions["Domain"] = domain_schema
+    rules = []
+    for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items():
+        fixed = model.model_json_schema(ref_template="#/$defs/{model}")
+        definitions[model.__name__] = fixed
+        searched = {
+            name: {"$ref": "#/$defs/Domain", "description": field.get("description", "")}
+            for name, field in fixed["properties"].items()
+        }
+        then = {
+            "hyperparams": {"anyOf": [{"$ref": f"#/$defs/{model.__name__}"}, {"type": "null"}]},
+            "space": {"type": ["object", "null"], "properties": searched, "additionalProperties": False},
+        }
+        condition = {"properties": {"algorithm": {"const": algorithm}}, "required": ["algorithm"]}
+        rules.append({"if": condition, "then": {"properties": then}})
+    properties = schema["properties"]
+    properties["hyperparams"] = {"description": properties["hyperparams"]["description"]}
+    properties["space"] = {"description": properties["space"]["description"]}
+    for section, key in _SECTIONS_OF_TEXT.items():
+        text = definitions[properties[section]["$ref"].rpartition("/")[2]]["properties"][key]
+        properties[section] = {
+            "anyOf": [{"type": "string"} | text, {"$ref": properties[section]["$ref"]}],
+            "description": properties[section]["description"],
+        }
+    for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
+        # A section whose lines are all commented out is null.
+        told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}
+        properties[name] = {"anyOf": [properties[name], {"type": "null"}], **told}
+    whole: dict[str, Any] = _with_limits({**schema, "title": "tune-jobs sweep file", "allOf": rules})
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | whole
+
+
+_LIMITS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+
+
+def _with_limits(schema: Any) -> Any:
+    """A schema with limits in JSON Schema's words: pydantic 2.14 leaves its own where a validator comes before them."""
+    if isinstance(schema, list):
+        return [_with_limits(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {_LIMITS.get(key, key): _with_limits(value) for key, value in schema.items()}
+
+
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """What a source is called in messages, and its content as plain JSON-like data."""
+    if isinstance(source, Mapping):
+        label, data = "sweep", source
+    else:
+        label, text = _read_text(source)
+        data = parse_yaml(text, label)
+    if not isinstance(data, Mapping):
+        kind = "is empty" if data is None else f"holds a {type(data).__name__}"
+        raise SpecError(f"{label}: {kind}, not the fields of a sweep", SPEC_HINT)
+    plain: dict[str, Any] = to_plain(data, label)
+    return label, plain
+
+
+def _read_text(source: str | Path) -> tuple[str, str]:
+    path = Path(source)
+    if not path.is_file():
+        presets = {preset.name: preset for preset in list_presets()}
+        if str(source) in presets:
+            return f"preset {source}", presets[str(source)].text
+        if path.is_dir():
+            raise SpecError(f"{source} is a folder, not a sweep file", "Name the .yaml file, or a preset.")
+        suggestion = did_you_mean(str(source), presets)
+        raise SpecError(
+            f"There is no sweep file {str(source)!r} and no preset of that name.{suggestion}",
+            f"Name a .yaml file, or one of the presets: {', '.join(presets)}.",
+        )
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise SpecError(f"{path}: is larger than {_MAX_BYTES:,} bytes", "Name a sweep file; those are short.")
+        return path.name, content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise SpecError(
+            f"{path}: can't be read: line {line} is no UTF-8, from byte {error.object[error.start]:#04x} on",
+            "Name a text file, and save it as UTF-8.",
+        ) from error
+    except OSError as error:
+        raise SpecError(f"{path}: can't be read: {error}", "Name a text file that you may read.") from error
+
+
+def _apply_override(data: dict[str, Any], override: str) -> str:
+    """Set one field in place; returns its dotted path."""
+    path, equals, text = override.partition("=")
+    path = path.strip()
+    if not equals or not all(path.split(".")):
+        raise SpecError(
+            f"--set {override}: this is no assignment",
+            "Write --set a.b=value, such as --set stop.num_env_steps=50000.",
+        )
+    *parents, last = path.split(".")
+    section = data
+    for index, parent in enumerate(parents):
+        child = section.get(parent)
+        if child is None or (isinstance(child, str) and parent in _SECTIONS_OF_TEXT and index == 0):
+            # `env: CartPole-v1` is short for a mapping, which --set env.args... has to go into.
+            child = {} if child is None else {_SECTIONS_OF_TEXT[parent]: child}
+            section[parent] = child
+        if not isinstance(child, dict):
+            here = ".".join(parents[: index + 1])
+            raise SpecError(
+                f"--set {override}: {here} is {shortened(child)}, which has no fields", f"Set {here} itself."
+            )
+        section = child
+    if text.strip():
+        section[last] = parse_yaml(text, f"--set {override if len(override) <= 80 else path}")
+    elif last in section or _is_known(path):
+        section.pop(last, None)
+    else:
+        section[last] = None  # there is no such field, which is told with all that is wrong
+    return path
+
+
+def _is_known(path: str) -> bool:
+    """Whether a sweep file may have a field."""
+    section, *names = path.split(".")
+    if section in ("hyperparams", "space") and names:
+        return any(names[0] in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values())
+    field = SweepSpec.model_fields.get(section)
+    inner = getattr(field.annotation, "model_fields", {}) if field is not None else {}
+    return field is not None and (not names or names[0] in inner)
+
+
+def _is_set(path: str, set_paths: Sequence[str]) -> bool:
+    """Whether a problem's path lies at or below a path that --set gave."""
+    return any(re.match(rf"{re.escape(given)}(?:$|[.\[])", path) for given in set_paths)

@@ -1,0 +1,104 @@
+"""What pydantic finds wrong with a sweep, told by the sweep file's own fields: where they are, what they take."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from policies.errors import shortened
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.problems import Detail, Problem, details_of, did_you_mean, dotted, explain
+from tune_jobs.spec.sweep_spec import NAME_RULE, SweepSpec, hyperparam_problems
+
+
+def problems_of(error: ValidationError, data: Any) -> list[Problem]:
+    """What is wrong with a sweep, given what pydantic says of it and what it was made from."""
+    problems = [_from_detail(detail) for detail in details_of(error)]
+    # A wrong field kept pydantic from the checks that look at the whole: they are made on what is right.
+    return problems + (_hyperparam_problems(data) if isinstance(data, Mapping) else [])
+
+
+def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
+    algorithm, fixed, space = data.get("algorithm"), data.get("hyperparams"), data.get("space")
+    if algorithm not in list(HYPERPARAMS_BY_ALGORITHM):  # a list, as what stands there may be unhashable
+        return []
+    adapter: TypeAdapter[Any] = TypeAdapter(Domain)
+    domains = {}
+    for name, value in space.items() if isinstance(space, Mapping) else ():
+        try:
+            domains[name] = adapter.validate_python(value)
+        except ValidationError:
+            continue  # already among the problems; only its name is left to check
+    known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    unknown = {name: None for name in space if name not in known} if isinstance(space, Mapping) else {}
+    problems = hyperparam_problems(algorithm, fixed if isinstance(fixed, Mapping) else {}, domains)
+    unseen = hyperparam_problems(algorithm, {name: None for name in unknown if name not in domains}, {})
+    return problems + [Problem(path.replace("hyperparams.", "space.", 1), text) for path, text in unseen]
+
+
+_FORMS = {
+    "name": f"use {NAME_RULE}",
+    "rl_module": "write module:Class",
+    "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
+    "search": "give random or tpe, or a mapping of its fields",
+    "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
+}
+"""How fields are written that may have several forms, or one that no type describes."""
+
+
+def _from_detail(detail: Detail) -> Problem:
+    location = _without_tags(detail["loc"])
+    path = dotted(location)
+    if detail["type"] == "extra_forbidden":
+        return Problem(path, _unknown_key(location))
+    if detail["type"] == "missing":
+        options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
+        return Problem(path, f"is missing{f': give {options}' if options else ''}")
+    if path in _FORMS:
+        return Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")
+    if detail["type"] == "model_type":
+        fields = ", ".join(_section(location).model_fields)
+        return Problem(path, f"{shortened(detail['input'])} is not allowed: give a mapping of its fields ({fields})")
+    return Problem(path, explain(detail))
+
+
+def _without_tags(location: Iterable[int | str]) -> list[int | str]:
+    """Pydantic names the kind of a domain twice, as the union's member and as its field."""
+    parts: list[int | str] = []
+    for part in location:
+        if not (parts and part == parts[-1] and parts[0] == "space" and len(parts) == 3):
+            parts.append(part)
+    return parts
+
+
+def _unknown_key(location: Sequence[int | str]) -> str:
+    name, model = str(location[-1]), _section(location[:-1])
+    # A field that exists elsewhere under just this name is meant more likely than a similar one here.
+    suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
+    listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
+    return f"there is no field {name!r} here.{suggestion}{listed}"
+
+
+def _section(location: Sequence[int | str]) -> type[BaseModel]:
+    model: Any = SweepSpec
+    for part in location:
+        model = model.model_fields[str(part)].annotation
+    found: type[BaseModel] = model
+    return found
+
+
+def _other_place(name: str) -> str:
+    """A hint for a field that exists, but in another section."""
+    places = [
+        f"{section}.{name}"
+        for section, field in SweepSpec.model_fields.items()
+        if isinstance(field.annotation, type)
+        and issubclass(field.annotation, BaseModel)
+        and name in field.annotation.model_fields
+    ]
+    if any(name in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values()):
+        places += [f"hyperparams.{name}", f"space.{name}"]
+    return f" Did you mean {' or '.join(places)}?" if places else ""

@@ -1,0 +1,129 @@
+"""Settings of search method and scheduler that don't go with each other, or with the rest of a sweep."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from policies.errors import SpecError
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, RandomHyperparams
+from tune_jobs.search.mutation import FIXED_IN_A_POPULATION
+from tune_jobs.spec.domains import Grid, num_points
+
+if TYPE_CHECKING:
+    from tune_jobs.spec.sweep_spec import SweepSpec
+
+Found = list[tuple[str, str]]
+"""(dotted path in the sweep file, what is wrong there)."""
+
+
+def search_problems(spec: SweepSpec) -> Found:
+    """What is wrong with a sweep's search method and scheduler."""
+    found: Found = []
+    if spec.search.type == "tpe":
+        found += _tpe_problems(spec)
+    if spec.scheduler.type in ("pbt", "hyperband") and spec.resources.max_concurrent is not None:
+        text = (
+            f"{spec.resources.max_concurrent} does not go with scheduler.type {spec.scheduler.type}, which pauses "
+            "trials until others have come as far: limit how many run by resources.num_cpus"
+        )
+        found.append(("resources.max_concurrent", text))
+    if spec.scheduler.type == "pbt":
+        found += _population_problems(spec)
+    elif spec.scheduler.perturb_every_env_steps is not None:
+        text = f"is for pbt alone, and scheduler.type is {spec.scheduler.type}: take out one, or set the other"
+        found.append(("scheduler.perturb_every_env_steps", text))
+    return found
+
+
+_USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
+    "scheduler": {
+        "grace_env_steps": ("asha", "hyperband", "median"),
+        "reduction_factor": ("asha", "hyperband"),
+        "quantile_fraction": ("pbt",),
+        "resample_probability": ("pbt",),
+    },
+    "search": {"num_startup_trials": ("tpe",)},
+}
+"""Which types of search and scheduler a field is for; `perturb_every_env_steps` is refused with others than pbt."""
+
+
+def idle_settings(spec: SweepSpec) -> list[str]:
+    """What to say of settings of search and scheduler that were changed and can't act, for the plan."""
+    notes = []
+    for section, fields in _USED_BY.items():
+        given = getattr(spec, section)
+        for name, types in fields.items():
+            if given.type not in types and getattr(given, name) != type(given).model_fields[name].default:
+                notes.append(f"{section}.{name} can't act: {section}.type is {given.type}, not {' or '.join(types)}.")
+    return notes
+
+
+def check_extendable(spec: SweepSpec) -> None:
+    """Check that more samples are other points than those there are.
+
+    Raises:
+        SpecError: The space has nothing random to draw, and no search method or scheduler chooses values.
+    """
+    chosen = spec.search.type != "random" or spec.scheduler.type == "pbt"
+    if not chosen and not any(domain.is_random for domain in spec.space.values()):
+        why = "its space has grids alone" if spec.space else "it has no space"
+        raise SpecError(
+            f"The sweep cannot be extended: {why}, so more samples would be the same points again.",
+            "Launch a new sweep: with a larger seeds_per_point for more seeds, with more grid values for more points.",
+        )
+
+
+def _learns(spec: SweepSpec) -> bool:
+    return not issubclass(HYPERPARAMS_BY_ALGORITHM[spec.algorithm], RandomHyperparams)
+
+
+def _tpe_problems(spec: SweepSpec) -> Found:
+    if not _learns(spec):
+        return [("search.type", f"tpe needs an algorithm that learns, and {spec.algorithm} does not: use random")]
+    found: Found = []
+    if not spec.space:
+        found.append(("search.type", "tpe has nothing to search: space is empty"))
+    if spec.scheduler.type in ("pbt", "hyperband"):
+        why = {
+            "pbt": "pbt changes the values that tpe would learn from: use search.type random",
+            "hyperband": "hyperband waits for whole groups of trials, tpe starts one after another: use asha",
+        }
+        found.append(("search.type", f"tpe does not go with scheduler.type {why[spec.scheduler.type]}"))
+    if spec.space and spec.num_samples <= spec.search.num_startup_trials:
+        text = (
+            f"{spec.num_samples} is not more than search.num_startup_trials, {spec.search.num_startup_trials}: all "
+            "points would be random. With tpe it is the number of points, grids are lists to choose from"
+        )
+        found.append(("num_samples", text))
+    return found
+
+
+def _population_problems(spec: SweepSpec) -> Found:
+    found: Found = []
+    if not _learns(spec):
+        return [("scheduler.type", f"pbt needs an algorithm that learns, and {spec.algorithm} does not")]
+    if not spec.space:
+        found.append(("scheduler.type", "pbt has nothing to change: space is empty"))
+    for name in spec.space:
+        if name in FIXED_IN_A_POPULATION:
+            text = (
+                f"can't be changed within a trial, which pbt (scheduler.type) would do: fix {name} under hyperparams, "
+                "or use another scheduler"
+            )
+            found.append((f"space.{name}", text))
+    size = num_points(spec.space, spec.num_samples)
+    if spec.space and size < 2:
+        name = "num_samples" if not any(isinstance(domain, Grid) for domain in spec.space.values()) else "space"
+        found.append((name, f"gives {size} trial, and pbt (scheduler.type) compares at least 2"))
+    if spec.seeds_per_point > 1:
+        text = (
+            f"{spec.seeds_per_point} does not go with pbt, which gives each trial values of its own: raise num_samples"
+        )
+        found.append(("seeds_per_point", text))
+    if spec.perturb_every_env_steps >= spec.stop.num_env_steps:
+        text = (
+            f"{spec.perturb_every_env_steps} is not less than stop.num_env_steps, {spec.stop.num_env_steps}: "
+            "no trial would ever be changed"
+        )
+        found.append(("scheduler.perturb_every_env_steps", text))
+    return found

@@ -1,0 +1,108 @@
+"""What the log of a process says of its end: its last lines, or where it hung.
+
+One process after the other appends to a log. Each begins with a line of its own, by which the last one is found. One
+that hangs is ended by faulthandler, which writes the frames of all its threads: of dozens of lines those of one matter.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from policies.envs.faults import Frame, frame_of_env
+from policies.files import open_regular
+
+_TAIL_BYTES = 200_000
+_TIMEOUT_MARK = "Timeout ("
+_FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
+# Where a trial's own thread is, and where code of this package calls that of an environment.
+_LOOPS = (
+    "/tune_jobs/ray_tune/trainable.py",
+    "/tune_jobs/training/trial_loop.py",
+    "/tune_jobs/training/pack_loop.py",
+    "/tune_jobs/ray_tune/pack_trainable.py",
+)
+_CALLERS = (
+    "/policies/packed/envs/sub_envs.py",
+    "/policies/envs/checked.py",
+    "/policies/acting/evaluate.py",
+    "/policies/envs/make.py",
+)
+
+
+def log_mark(what: str) -> str:
+    """How the first line of each process begins, in the log of something such as "trial t0003"."""
+    return f"-- {what}, process "
+
+
+def begin_log(what: str) -> None:
+    """Print what tells the output of this process, which goes to the log, from that of earlier ones."""
+    print(f"{log_mark(what)}{os.getpid()}", flush=True)
+
+
+def log_tail(path: Path, what: str = "", num_lines: int = 15) -> str:
+    """The lines that say how the last process of a log ended.
+
+    Args:
+        path: The log.
+        what: Whose it is, as `begin_log` was told; empty: nobody's first line is looked for.
+        num_lines: At most so many lines, after one that says that the process was ended because it hung.
+
+    Returns:
+        The frames of the thread that hung, or the last lines; empty if there is no log.
+    """
+    try:
+        with open_regular(path) as file:
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            lines = file.read().decode("utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    mark = log_mark(what)
+    begun = max((index for index, line in enumerate(lines) if what and line.startswith(mark)), default=0)
+    lines = lines[begun:]
+    hung = max((index for index, line in enumerate(lines) if line.startswith(_TIMEOUT_MARK)), default=None)
+    if hung is None:
+        return "\n".join(lines[-num_lines:])
+    return "\n".join([lines[hung], *_hung_thread(lines[hung + 1 :])[:num_lines]])
+
+
+def hang_in(tail: str) -> tuple[bool, Frame | None]:
+    """Whether a log's tail is of a process that hung, and the environment's frame, or else the innermost one."""
+    first, *lines = tail.splitlines() or [""]
+    frames = [
+        Frame(found["file"], int(found["line"]), found["name"]) for line in lines if (found := _FRAME.match(line))
+    ]
+    return first.startswith(_TIMEOUT_MARK), _frame_of_env(frames) if frames else None
+
+
+def died_by(tail: str, timeout_s: float) -> str:
+    """What ended a process that hung, in words; empty if it did not hang.
+
+    Args:
+        tail: As `log_tail` gives it.
+        timeout_s: The sweep's `iteration_timeout_s`.
+    """
+    has_hung, frame = hang_in(tail)
+    if not has_hung:
+        return ""
+    place = "" if frame is None else f". It hung at {frame}"
+    return f"an iteration took longer than iteration_timeout_s ({timeout_s:g} s){place}"
+
+
+def _hung_thread(lines: list[str]) -> list[str]:
+    """Of the frames of all threads those of the trial's own; faulthandler writes the main thread last."""
+    threads: list[list[str]] = [[]]
+    for line in lines:
+        if line.startswith(("Thread 0x", "Current thread 0x")):
+            threads.append([])
+        if line.strip():
+            threads[-1].append(line)
+    own = [thread for thread in threads if any(f'{name}"' in line for line in thread for name in _LOOPS)]
+    return (own or threads)[-1]
+
+
+def _frame_of_env(frames: list[Frame]) -> Frame:
+    """The env's own, if it was called; else the innermost."""
+    callers = [index for index, frame in enumerate(frames) if frame.file.endswith(_CALLERS)]
+    return (frame_of_env(frames[: callers[0]]) if callers else None) or frames[0]

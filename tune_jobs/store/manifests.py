@@ -1,0 +1,143 @@
+"""Manifests: what a checkpoint folder holds, what it scored, and whether both are as they were written.
+
+A manifest names every file of the folder with its size and hash, and since format 2 carries the hash of itself, so that
+an edited score is found. It is no signature: who may write to the folder can write another manifest with its hash. The
+score is in `results.jsonl` too, and `tune_jobs.store.candidates` compares them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from analysis.records import CheckpointRecord
+from policies.errors import CheckpointError, NotFoundError
+from policies.files import refuse_others, sha256_file, write_plain
+from tune_jobs.store.places import refuse_link
+from tune_jobs.store.record_files import dump_sealed, parse_record, read_json
+
+MANIFEST = "manifest.json"
+_POLICY_FILES = ("policy.json", "policy.safetensors")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_HINT = "Use another checkpoint of the trial, or restore the file from a backup."
+
+
+def write_manifest(folder: Path, record: CheckpointRecord) -> None:
+    """Write the manifest of a checkpoint folder that is filled and not seen yet, and wait until all is on disk."""
+    files = {
+        name: {"bytes": path.stat().st_size, "sha256": sha256_file(path)} for name, path in _files_in(folder).items()
+    }
+    write_plain(folder / MANIFEST, dump_sealed(record, files=files))
+    for path in [*folder.rglob("*"), folder]:
+        _sync(path)
+
+
+def read_manifest(checkpoint: Path) -> CheckpointRecord:
+    """The record in a checkpoint's manifest.
+
+    Raises:
+        NotFoundError: The folder or its manifest is missing.
+        CheckpointError: The manifest is damaged, or was changed after it was written.
+    """
+    return _read(checkpoint)[0]
+
+
+def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
+    """Check every file of a checkpoint against its manifest, before anything in it is read.
+
+    Raises:
+        NotFoundError: The folder is missing.
+        CheckpointError: A file is missing, differs in size or hash, or is not in the manifest; the message names it.
+    """
+    record, data = _read(checkpoint)
+    files = _described_files(checkpoint / MANIFEST, data.get("files"))
+    found = _files_in(checkpoint)
+    for name in sorted(found.keys() - files.keys()):
+        raise CheckpointError(
+            f"Checkpoint {checkpoint} holds the file {name}, which its {MANIFEST} does not name.",
+            "Remove the file if you know it, or use another checkpoint of the trial.",
+        )
+    for name, (size, digest) in files.items():
+        if name not in found:
+            raise CheckpointError(
+                f"Checkpoint {checkpoint} lacks the file {name}.", "Use another checkpoint of the trial."
+            )
+        if found[name].stat().st_size != size or sha256_file(found[name]) != digest:
+            raise CheckpointError(
+                f"Checkpoint {checkpoint}: the file {name} is not the one that was written (its SHA-256 differs).",
+                _HINT,
+            )
+    return record
+
+
+def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
+    if not checkpoint.is_dir():
+        raise NotFoundError(f"No checkpoint folder at {checkpoint}.", "List a sweep's with `tune-jobs trials SWEEP`.")
+    path = checkpoint / MANIFEST
+    refuse_link(path)
+    if not path.is_file():
+        raise CheckpointError(
+            f"Checkpoint {checkpoint} has no {MANIFEST}: it is not one, or was not written whole.",
+            "Use another checkpoint of the trial, or delete this folder.",
+        )
+    data = read_json(path, "checkpoint manifest", is_sealed=True)
+    return parse_record(data, path, CheckpointRecord, "checkpoint manifest"), data
+
+
+def _described_files(manifest: Path, files: Any) -> dict[str, tuple[int, str]]:
+    """Size and hash by name, once it is certain that they are that, and that what every checkpoint has is named."""
+    if not isinstance(files, dict):
+        raise CheckpointError(f"{manifest}: files is {_shown(files)}, not a mapping of names.", _HINT)
+    described = {}
+    for name, entry in files.items():
+        path = PurePosixPath(name)
+        # As `write_manifest` writes them; so none can lead out of the folder, nor be another's second name.
+        if path.is_absolute() or ".." in path.parts or str(path) != name or "\0" in name or not path.parts:
+            raise CheckpointError(f"{manifest}: files names {name[:80]!r}, which is no file in the folder.", _HINT)
+        size, digest = (entry.get("bytes"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
+        if type(size) is not int or not isinstance(digest, str) or _SHA256.fullmatch(digest) is None:
+            raise CheckpointError(f"{manifest}: files.{name} is {_shown(entry)}, not a size and a SHA-256.", _HINT)
+        described[name] = (size, digest)
+    for name in _POLICY_FILES:
+        if name not in described:
+            raise CheckpointError(f"{manifest}: files does not name {name}, which every checkpoint has.", _HINT)
+    if len(described) == len(_POLICY_FILES):
+        raise CheckpointError(f"{manifest}: files names nothing that training could go on from.", _HINT)
+    return described
+
+
+def _files_in(folder: Path) -> dict[str, Path]:
+    """The files of a checkpoint by name, without its manifest.
+
+    Raises:
+        CheckpointError: Something in it is a symbolic link, or neither a file nor a folder.
+    """
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        refuse_link(path)
+        name = path.relative_to(folder).as_posix()
+        if not path.is_dir() and name != MANIFEST:
+            try:
+                refuse_others(path.stat(), path)
+            except OSError as error:
+                raise CheckpointError(f"Checkpoint {folder}: of {name}, {error.strerror}.", _HINT) from error
+            files[name] = path
+    return files
+
+
+def _shown(value: Any) -> str:
+    return "missing" if value is None else repr(value)[:80]
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on disk."""
+    # Network file systems may not sync folders.
+    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,150 @@
+"""What of a trial's folder can be gone on with; what is damaged is set aside, never deleted, and never silently.
+
+Results that can't be read go to `results.damaged`, checkpoints and copies to `damaged/`; only the owner does it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from pathlib import Path
+
+from analysis.records import FORMAT_VERSION, CheckpointRecord
+from policies.errors import CheckpointError, NotFoundError
+from policies.files import RefusedFileError, open_to_append, read_regular
+from tune_jobs.store.places import within
+from tune_jobs.store.record_files import seal
+from tune_jobs.store.results_file import ResultsFile, read_results
+from tune_jobs.store.sweep_store import MANIFEST, TrialStore, verify_checkpoint
+
+DAMAGED_FOLDER = "damaged"
+DAMAGED_RESULTS = "results.damaged"
+
+
+def write_log(path: Path, text: str) -> None:
+    """Append to a trial's log what concerns this trial, whatever the process prints elsewhere."""
+    line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
+    with open_to_append(path) as file:
+        # What an env raised may be no text that UTF-8 has.
+        file.write(line.encode(errors="backslashreplace"))
+
+
+def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
+    """Read a trial's results, and set aside what of them cannot be read.
+
+    The lines stay in results.jsonl until the trial writes what it goes on with.
+
+    Returns:
+        What can be read, and what to tell of the rest.
+
+    Raises:
+        CheckpointError: They cannot be read now.
+    """
+    try:
+        found = read_results(trial.results_path)
+    except CheckpointError as error:
+        if not isinstance(error.__cause__, RefusedFileError):
+            raise
+        target = set_aside(trial, trial.results_path)
+        return ResultsFile(), [f"{error.message} It is kept as {target}; the trial goes on without it."]
+    unreadable = [bad.content for bad in found.bad] + ([found.tail] if found.tail else [])
+    if unreadable:
+        with trial.owned(), open_to_append(within(trial.folder, DAMAGED_RESULTS)) as file:
+            file.write(b"".join(content + b"\n" for content in unreadable))
+    if found.tail:
+        # What every kill may leave, and no damage: it is done again.
+        write_log(
+            trial.log_path, f"{trial.trial_id}: results.jsonl ended within a line; it is kept in {DAMAGED_RESULTS}"
+        )
+    return found, [f"results.jsonl: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
+
+
+def take_up_checkpoints(trial: TrialStore) -> tuple[list[CheckpointRecord], list[str]]:
+    """The checkpoints a trial goes on with, the last of them verified; damaged ones are set aside.
+
+    Of the older ones only the manifests are read: the files are checked before they are used.
+
+    Returns:
+        The checkpoints, oldest first, and what to tell of those that were set aside.
+
+    Raises:
+        CheckpointError: One is of a newer format, or cannot be read now: nothing says that it is damaged.
+    """
+    known: list[CheckpointRecord] = []
+    damaged: list[tuple[Path, NotFoundError]] = []
+    for iteration in trial.checkpoint_iterations():
+        try:
+            known.append(trial.checkpoint(iteration))
+        except NotFoundError as error:
+            damaged.append((_damaged(trial.checkpoint_folder(iteration), error), error))
+    while known:
+        folder = trial.checkpoint_folder(known[-1].iteration)
+        try:
+            verify_checkpoint(folder)
+            break
+        except NotFoundError as error:
+            damaged.append((_damaged(folder, error), error))
+            known.pop()
+    start = f"checkpoint {known[-1].iteration:06d}" if known else "its start: no older one is whole"
+    notes = [
+        f"checkpoint {folder.name} is damaged and kept as {set_aside(trial, folder)}; "
+        f"the trial goes on from {start}. {error.message}"
+        for folder, error in damaged
+    ]
+    return known, notes
+
+
+def take_up_copy(trial: TrialStore, folder: Path) -> tuple[Path | None, list[str]]:
+    """Another trial's checkpoint that this one goes on from, verified; None, and set aside, if it is damaged."""
+    try:
+        verify_checkpoint(folder)
+    except NotFoundError as error:
+        target = set_aside(trial, _damaged(folder, error), prefix="copied-")
+        note = (
+            f"the copied checkpoint {folder.name} is damaged and kept as {target}; the trial goes on from its own "
+            f"latest checkpoint, with the values it was given. {error.message}"
+        )
+        return None, [note]
+    return folder, []
+
+
+def set_aside(trial: TrialStore, folder: Path, prefix: str = "") -> str:
+    """Move a folder to where nobody takes it for a checkpoint, or what is no file to where nobody takes it for one.
+
+    Returns:
+        Where it lies now, from the trial's folder.
+    """
+    target = within(trial.folder, DAMAGED_FOLDER, f"{prefix}{folder.name}")
+    number = 1
+    while target.exists():
+        number += 1
+        target = target.with_name(f"{prefix}{folder.name}-{number}")
+    with trial.owned():
+        target.parent.mkdir(exist_ok=True)
+        if folder.exists():
+            folder.replace(target)
+    return f"{DAMAGED_FOLDER}/{target.name}"
+
+
+def latest_damaged(trial: TrialStore) -> int:
+    """Of the checkpoints of a trial that were set aside, the latest one's iteration; 0: there is none."""
+    names = [folder.name.partition("-")[0] for folder in (trial.folder / DAMAGED_FOLDER).glob("[0-9]*")]
+    return max((int(name) for name in names if name.isdecimal()), default=0)
+
+
+def _damaged(folder: Path, error: NotFoundError) -> Path:
+    """The checkpoint's folder, if what is wrong with it is damage.
+
+    Raises:
+        NotFoundError: It is not, or may pass.
+    """
+    if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError | RefusedFileError):
+        raise error
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        manifest = json.loads(read_regular(within(folder, MANIFEST)))
+        # A version beyond ours is no flipped bit if the seal holds.
+        if manifest["format_version"] > FORMAT_VERSION and manifest["sha256"] == seal(manifest):
+            raise error
+    return folder

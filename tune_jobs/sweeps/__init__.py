@@ -1,0 +1,1 @@
+"""The verbs that command line and Python share: launch, resume, extend, look up, conclude."""

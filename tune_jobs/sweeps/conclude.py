@@ -1,0 +1,390 @@
+"""What happens to a sweep's trials afterwards: best, evaluate, video, report. None of it starts Ray."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord
+from analysis.selection import NoUsableTrialError, score_trial
+from policies.acting.baselines import BASELINES, ConstantPolicy
+from policies.acting.policy import Policy, RandomPolicy, load_policy, policy_from_portable
+from policies.envs.modules import allow_modules
+from policies.envs.wrappers import FRAME_STACK, PIXELS
+from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
+from policies.guard.guard import CALL_TIMEOUT_S, guarding
+from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
+from policies.hyperparams import ConstantHyperparams
+from policies.portable.file import PolicyNetwork, read_policy, save_policy
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.seeds import confirmation_seeds
+from tune_jobs.store.candidates import choose, leave_out, read_trials
+from tune_jobs.store.places import refuse_links_in
+from tune_jobs.store.sweep_store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
+from tune_jobs.sweeps.storage import expanded, storage_folder
+
+# The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
+FRESH_SEED = 2**31
+
+
+def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepStore:
+    """A sweep by its folder, or by its name in the storage folder.
+
+    Raises:
+        NotFoundError: There is none.
+    """
+    as_folder = SweepStore(expanded(sweep))
+    if as_folder.exists():
+        return as_folder
+    root = storage_folder(storage)
+    store = SweepStore(root / str(sweep))
+    if store.exists():
+        return store
+    known = [item.name for item in list_sweep_stores(root)]
+    close = difflib.get_close_matches(str(sweep), known, n=1)
+    guess = f" Did you mean {close[0]!r}?" if close else ""
+    raise NotFoundError(
+        f"No sweep {str(sweep)!r} in {root}.{guess}",
+        "List the sweeps with `tune-jobs list`; name another storage folder with --storage.",
+    )
+
+
+def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
+    """Every trial's results, by trial id; none, with a warning, of a trial whose file cannot be read at all."""
+    found = {}
+    for record in store.read_trials():
+        try:
+            found[record.trial_id] = store.trial(record.trial_id).read_iterations()
+        except CheckpointError as error:
+            leave_out(error)
+            found[record.trial_id] = []
+    return found
+
+
+@guarding()
+def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
+    """Select the winner, confirm it on seeds it was not chosen on, and copy its policy to best/.
+
+    Raises:
+        NoUsableTrialError: No trial can win; the message says why.
+        CheckpointError: The record of the sweep or of a trial is damaged.
+        EnvError: The environment raised an error, hung, or ended its process.
+    """
+    sweep = _trusted(store).read_record()
+    spec = stored_spec(sweep)
+    selection, portable = choose(store, read_trials(store))
+    seeds = confirmation_seeds(spec.seed, num_episodes)
+    policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
+    env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
+    random = random_policy(env_id, env_args, timeout_s)
+    record = BestRecord(
+        checkpoint=selection.checkpoint,
+        point=selection.trial.point_at(selection.checkpoint.iteration),
+        seed=selection.trial.seed,
+        selection_score=selection.score,
+        confirmation=run_evaluation(policy, env_id, env_args, seeds, timeout_s),
+        random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
+    )
+    save_policy(portable, store.best_folder)
+    store.write_best(record)
+    return record
+
+
+@guarding()
+def run_evaluation(
+    policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int], timeout_s: float = CALL_TIMEOUT_S
+) -> EvaluationRecord:
+    """Greedy episodes of a policy, one a seed; `timeout_s` is how long one call of the environment may take."""
+    episodes = evaluate_policy(policy, env_id=env_id, env_args=env_args, seeds=seeds, timeout_s=timeout_s)
+    return EvaluationRecord(
+        policy=policy.description,
+        env_id=env_id,
+        env_args=env_args,
+        seeds=episodes.seeds,
+        returns=episodes.returns,
+        lengths=episodes.lengths,
+        threshold=check_env(env_id, env_args, timeout_s=timeout_s).threshold,
+    )
+
+
+def random_policy(env_id: str, env_args: dict[str, Any], timeout_s: float = CALL_TIMEOUT_S) -> RandomPolicy:
+    """What trained policies are held against, in an environment."""
+    env = check_env(env_id, env_args, timeout_s=timeout_s)
+    return RandomPolicy(env.observation_space, env.action_space, env_id=env.env_id, env_args=env.env_args)
+
+
+@dataclass(frozen=True)
+class PolicySource:
+    """A policy, where it acts, and where it came from."""
+
+    policy: Policy
+    env_id: str
+    env_args: dict[str, Any]
+    store: SweepStore | None = None
+    """The sweep, where the policy is a sweep's best."""
+    timeout_s: float = CALL_TIMEOUT_S
+    """How long one call of the environment may take."""
+
+
+@guarding()
+def find_policy(
+    source: str | Path,
+    storage: str | Path | None = None,
+    env_id: str | None = None,
+    action: int | Sequence[float] | None = None,
+) -> PolicySource:
+    """A policy by any of its names.
+
+    Args:
+        source: A sweep (its best; chosen now if it has not been), `SWEEP/TRIAL` (its best checkpoint), a checkpoint
+            folder, a policy file, or a baseline: `random` or `constant`.
+        storage: Where sweeps are looked for by name.
+        env_id: Where it acts; needed for a baseline, else the environment it was trained in.
+        action: What `constant` does; None: the action 0.
+
+    Raises:
+        NotFoundError: There is no such thing.
+        CheckpointError: It is damaged.
+        SpecError: A baseline without an environment or with an action it does not have; an action for another policy.
+    """
+    text = str(source)
+    if text in BASELINES:
+        return _baseline(text, env_id, action)
+    _refuse_action(text, action)
+    path = expanded(text)
+    store: SweepStore | None = None
+    timeout_s = CALL_TIMEOUT_S
+    if (path / MANIFEST).is_file():
+        verify_checkpoint(path)
+        policy = load_policy(path)
+    elif path.is_file() or (path / "policy.json").is_file():
+        policy = load_policy(path)
+    else:
+        store, trial_id = _sweep_and_trial(text, storage)
+        timeout_s = stored_spec(store.read_record()).iteration_timeout_s
+        if trial_id is None:
+            if not (store.best_folder / "evaluation.json").is_file():
+                choose_best(store)
+            policy = load_policy(store.best_folder)
+        else:
+            checkpoint = store.checkpoint_folder(best_checkpoint(store, trial_id))
+            verify_checkpoint(checkpoint)
+            policy = load_policy(checkpoint)
+            store = None
+    if env_id is not None and env_id != policy.env_id:
+        # Its constructor's arguments are the other environment's; what the policy observes is its own.
+        wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS)}
+        return PolicySource(policy, env_id, wrappers, timeout_s=timeout_s)
+    return PolicySource(policy, policy.env_id, dict(policy.env_args), store, timeout_s)
+
+
+def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | None) -> PolicySource:
+    if env_id is None:
+        raise SpecError(
+            f"A {name} policy has no environment of its own.", "Name one with --env, such as --env CartPole-v1."
+        )
+    if name == "random":
+        _refuse_action(name, action)
+        return PolicySource(random_policy(env_id, {}), env_id, {})
+    if action is None:
+        action = ConstantHyperparams().action
+    chosen = action if isinstance(action, int) else tuple(float(number) for number in action)
+    env = check_env(env_id, {})
+    policy = ConstantPolicy(env.observation_space, env.action_space, chosen, env_id=env.env_id, env_args=env.env_args)
+    return PolicySource(policy, env_id, {})
+
+
+@guarding()
+def evaluate(
+    source: PolicySource, num_episodes: int, first_seed: int | None
+) -> tuple[EvaluationRecord, EvaluationRecord]:
+    """Greedy episodes of a policy, and of a random one on the same seeds; see `sweeps.evaluate`."""
+    first = FRESH_SEED if first_seed is None else first_seed
+    seeds = range(first, first + num_episodes)
+    env_id, env_args, timeout_s = source.env_id, source.env_args, source.timeout_s
+    record = run_evaluation(source.policy, env_id, env_args, seeds, timeout_s)
+    return record, run_evaluation(random_policy(env_id, env_args, timeout_s), env_id, env_args, seeds, timeout_s)
+
+
+def _refuse_action(source: str, action: int | Sequence[float] | None) -> None:
+    if action is not None:
+        raise SpecError(
+            f"The action {action!r} was given for {source!r}; only 'constant' takes one.", "Leave the action out."
+        )
+
+
+def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[SweepStore, str | None]:
+    try:
+        return _trusted(find_sweep(text, storage)), None
+    except NotFoundError:
+        sweep, _, trial_id = text.rpartition("/")
+        if not sweep:
+            raise
+        try:
+            return _trusted(find_sweep(sweep, storage)), trial_id
+        except NotFoundError as error:
+            raise NotFoundError(
+                f"No sweep, trial, checkpoint or policy file {text!r}: {error.message}", error.hint
+            ) from error
+
+
+def _trusted(store: SweepStore) -> SweepStore:
+    """The sweep, with the modules allowed that its launcher did: its policies and environment may be from there."""
+    allow_modules(store.read_record().allowed_modules)
+    return store
+
+
+def best_checkpoint(store: SweepStore, trial_id: str) -> CheckpointRecord:
+    """The checkpoint of one trial with the highest evaluation return.
+
+    Raises:
+        NotFoundError: No such trial, or it has no evaluated checkpoint.
+    """
+    trials = {record.trial_id: record for record in read_trials(store)}
+    if trial_id not in trials:
+        raise NotFoundError(
+            f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)}.",
+            f"List them with `tune-jobs trials {store.name}`.",
+        )
+    # A trial that failed later may still be looked at, though it cannot win.
+    found = score_trial(trials[trial_id].model_copy(update={"status": "completed"}))
+    if found is None:
+        raise NotFoundError(
+            f"Trial {trial_id} of sweep {store.name} has no checkpoint with a score.",
+            f"See why with `tune-jobs trials {store.name}`.",
+        )
+    return found.checkpoint
+
+
+def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Path:
+    """A verified checkpoint folder: a sweep's best, `SWEEP/TRIAL`'s best, or the given folder.
+
+    Raises:
+        NotFoundError: There is no such checkpoint.
+        CheckpointError: It is damaged.
+    """
+    folder = expanded(source)
+    if not (folder / MANIFEST).is_file():
+        store, trial_id = _sweep_and_trial(str(source), storage)
+        if trial_id is not None:
+            record = best_checkpoint(store, trial_id)
+        elif (store.best_folder / "evaluation.json").is_file():
+            record = store.read_best().checkpoint
+        else:
+            record = choose_best(store).checkpoint
+        folder = store.checkpoint_folder(record)
+    verify_checkpoint(folder)
+    return folder
+
+
+def find_trained_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, PolicyNetwork]:
+    """A verified checkpoint that can be trained on, and the network that was saved in it.
+
+    Raises:
+        NotFoundError: There is no such checkpoint.
+        CheckpointError: It is damaged, or a baseline's, which RLlib has no part in.
+    """
+    folder = find_checkpoint(source, storage)
+    saved = read_policy(folder)
+    if saved.algorithm in BASELINES:
+        raise CheckpointError(
+            f"{folder} is of the baseline {saved.algorithm}, which is no RLlib algorithm: there is nothing to restore.",
+            "Load its policy with load_policy, or restore a trial of ppo or dqn.",
+        )
+    return folder, saved.network
+
+
+@guarding()
+def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
+    """Film a random policy (before) and the winner (after) on one seed, alone and side by side, into best/.
+
+    Returns:
+        before_mp4, after_mp4, after_gif and before_after_mp4.
+    """
+    source = find_policy(store.folder)
+    best = store.read_best()
+    chosen = best.confirmation.seeds[0] if seed is None else seed
+    before = random_policy(source.env_id, source.env_args, source.timeout_s)
+    names = {
+        "before_mp4": "before.mp4",
+        "after_mp4": "after.mp4",
+        "after_gif": "after.gif",
+        "before_after_mp4": "before_after.mp4",
+    }
+    paths = {key: store.best_folder / name for key, name in names.items()}
+    # A baseline has not been trained: it is shown as what it is.
+    trained = not isinstance(source.policy, RandomPolicy | ConstantPolicy)
+    first = "before training: random" if trained else before.description
+    second = f"after training: {best.checkpoint.trial_id}" if trained else source.policy.description
+    record_comparison(
+        before,
+        source.policy,
+        env_id=source.env_id,
+        env_args=source.env_args,
+        seed=chosen,
+        captions=(first, second),
+        left_mp4=paths["before_mp4"],
+        right_mp4=paths["after_mp4"],
+        right_gif=paths["after_gif"],
+        both_mp4=paths["before_after_mp4"],
+        timeout_s=source.timeout_s,
+    )
+    return paths
+
+
+def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]:
+    """Film one episode of any policy: MP4 and GIF, named by `output` with the two endings."""
+    mp4, gif = output.with_suffix(".mp4"), output.with_suffix(".gif")
+    record_video(
+        source.policy, env_id=source.env_id, env_args=source.env_args, seeds=seed, mp4=mp4, gif=gif,
+        timeout_s=source.timeout_s,
+    )  # fmt: skip
+    return {"mp4": mp4, "gif": gif}
+
+
+@guarding()
+def make_report(store: SweepStore, why_no_best: TuneJobsError | None = None) -> Path:
+    """Write the sweep's tables, figures and HTML report; works without a winner, and says why there is none.
+
+    Args:
+        store: The sweep.
+        why_no_best: Why its winner could not be confirmed just now; None: it was, or nobody tried.
+    """
+    from analysis.report import build_report
+
+    best = None
+    if why_no_best is None:
+        try:
+            best = _known_best(store)
+        except (EnvError, NoUsableTrialError) as error:
+            why_no_best = error
+    if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
+        why_no_best = None
+    videos = {
+        key: path
+        for key, name in (("before", "before.mp4"), ("after", "after.mp4"))
+        if (path := store.best_folder / name).is_file()
+    }
+    refuse_links_in(store.report_folder)  # which it writes to
+    return build_report(
+        store.folder,
+        sweep=store.read_record(),
+        trials=read_trials(store),
+        results=read_results(store),
+        best=best,
+        why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
+        videos=videos if why_no_best is None else {},
+    )
+
+
+def _known_best(store: SweepStore) -> BestRecord:
+    """The confirmed winner, confirmed now if it has not been."""
+    try:
+        return store.read_best()
+    except NotFoundError as error:
+        if isinstance(error, CheckpointError):
+            leave_out(error)
+        return choose_best(store)

@@ -1,0 +1,380 @@
+"""Driving a sweep whose lock is held: its records at the start, its trials, and what comes after them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
+from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
+from tune_jobs.plan.machine import Machine, local_machine
+from tune_jobs.plan.sweep_plan import SweepPlan, TrialPlan
+from tune_jobs.plan.user_code import modules_of
+from tune_jobs.process.interruption import current
+from tune_jobs.ray_tune.address import check_address
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.leftovers import remove_leftovers
+from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.monitor import SweepMonitor
+
+if TYPE_CHECKING:
+    from tune_jobs.ray_tune.cluster import Connection
+
+_PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a launch, resume or extend left."""
+
+    folder: Path
+    sweep: SweepRecord
+    trials: list[TrialRecord]
+    best: BestRecord | None = None
+    why_no_best: str | None = None
+    artifacts: dict[str, Path] = field(default_factory=dict)
+    """Where each result lies: policy, before_mp4, after_mp4, after_gif, before_after_mp4, report."""
+    interrupted: bool = False
+    notes: tuple[str, ...] = ()
+    """What could not be made (a video of an environment that can't be drawn, say), and why."""
+    finish_failed: bool = False
+    """Whether no winner could be confirmed, or the environment failed where it was filmed."""
+
+    @property
+    def exit_code(self) -> int:
+        """130 if it was interrupted, 3 if a trial failed or what comes after the trials did, else 0."""
+        if self.interrupted:
+            return 130
+        return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
+
+
+def write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None) -> None:
+    """Write the records of a new sweep."""
+    for trial in plan.trials:
+        store.trial(trial.trial_id).write_record(pending_record(trial))
+    # Last: a folder without it is no sweep, so nobody sees half of one.
+    store.write_record(
+        SweepRecord(
+            name=store.name,
+            state="running",
+            spec=spec.model_copy(update={"name": store.name}).model_dump(mode="json"),
+            evaluation_seeds=plan.evaluation_seeds,
+            confirmation_seeds=plan.confirmation_seeds,
+            num_trials=len(plan.trials),
+            created_at=time.time(),
+            versions=_versions(),
+            git_commit=_git_commit(),
+            address=address,
+            allowed_modules=modules_of(spec),
+        )
+    )
+
+
+def pending_record(trial: TrialPlan) -> TrialRecord:
+    """The record of a trial that has not begun."""
+    return TrialRecord(
+        trial_id=trial.trial_id,
+        index=trial.index,
+        point_index=trial.point_index,
+        seed_index=trial.seed_index,
+        seed=trial.seed,
+        point=trial.point,
+        hyperparams=trial.hyperparams,
+        has_point=trial.has_point,
+        engine=trial.engine,
+    )
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def _git_commit() -> str | None:
+    """The commit of the working directory's repository, so that a sweep can be traced to a user's own code."""
+    try:
+        done = subprocess.run(
+            ["git", "rev-parse", "HEAD"],  # noqa: S607 (git as the user has it)
+            capture_output=True, text=True, timeout=5, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None if done.returncode == 0 else None
+
+
+def connected(address: str | None, here: Machine | None) -> AbstractContextManager[Connection]:
+    """Join a cluster or start Ray here; see `cluster.connect`. Imports ray only when it is called.
+
+    Raises:
+        SpecError: The address is none.
+        CannotRunError: Nothing listens there.
+    """
+    if address is not None:
+        check_address(address)
+    from tune_jobs.ray_tune.cluster import connect
+
+    return connect(address, here)
+
+
+def machine_here() -> Machine:
+    """What a sweep without an address runs on: the Ray that this process is connected to, else this machine."""
+    ray: Any = sys.modules.get("ray")
+    # A ray that is only being imported has no such function yet.
+    if ray is None or not getattr(ray, "is_initialized", bool)():
+        return local_machine()
+    from tune_jobs.ray_tune.connected_ray import connected_machine
+
+    return connected_machine()
+
+
+@contextlib.contextmanager
+def settled(store: SweepStore) -> Iterator[None]:
+    """However the block ends, leave no sweep behind that says it runs; its lock has to be held."""
+    is_ours = True
+    try:
+        yield
+    except OwnershipLostError:
+        is_ours = False
+        raise
+    finally:
+        # What cannot be read or written here was not before either: that error is told, or nothing was to be changed.
+        with current().shielded(), contextlib.suppress(TuneJobsError):
+            if is_ours and store.exists():
+                store.clear_stop_request()
+                remove_leftovers(store)
+                _close_if_open(store)
+
+
+def run_sweep(
+    store: SweepStore,
+    plan: SweepPlan,
+    *,
+    address: str | None,
+    machine: Machine | None,
+    finish: bool,
+    progress: str,
+) -> SweepResult:
+    """Run the unfinished trials of a sweep whose lock is held, then what comes after.
+
+    A KeyboardInterrupt ends it with what there is: the records are written, whatever was begun.
+    """
+    try:
+        return _run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
+    except KeyboardInterrupt:
+        with current().shielded():
+            current().came = True
+            _close_if_open(store)
+            return SweepResult(store.folder, store.read_record(), store.read_trials(), interrupted=True)
+
+
+def _run_sweep(
+    store: SweepStore,
+    plan: SweepPlan,
+    *,
+    address: str | None,
+    machine: Machine | None,
+    finish: bool,
+    progress: str,
+) -> SweepResult:
+    # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
+    run = Owner.take(store.folder / OWNER_FILE)
+    todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
+    if todo:
+        if current().came:
+            # While the records were written, which nothing cuts short.
+            raise KeyboardInterrupt
+        record = store.read_record()
+        started = record.started_at or time.time()
+        store.write_record(record.model_copy(update={"state": "running", "started_at": started, "ended_at": None}))
+        spec = stored_spec(record)
+        monitor = SweepMonitor(
+            store.name,
+            store.read_trials(),
+            max_env_steps_per_trial=spec.stop.num_env_steps,
+            max_concurrent=plan.max_concurrent,
+        )
+        try:
+            _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
+        finally:
+            run.release()
+        _close_if_open(store)
+    from tune_jobs.store.candidates import read_trials
+
+    records = read_trials(store)
+    interrupted = any(trial.status not in FINISHED for trial in records)
+    result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
+    if interrupted or not finish:
+        return result
+    return replace(result, interrupted=True) if current().came else _finished(store, result)
+
+
+def _run_trials(
+    store: SweepStore,
+    plan: SweepPlan,
+    todo: tuple[str, ...],
+    monitor: SweepMonitor,
+    run: Owner,
+    *,
+    address: str | None,
+    machine: Machine | None,
+    progress: str,
+) -> None:
+    from tune_jobs.sweeps.live_table import shown
+
+    def ask() -> None:
+        monitor.stopping = True
+        store.request_stop()
+
+    started = time.time()
+    with _noted(), shown(monitor, progress, store.driver_log, plan.notes):
+        from tune_jobs.ray_tune.run_trials import RunJob, run_trials
+
+        job = RunJob(
+            store.folder,
+            todo,
+            plan.cpus_per_trial,
+            plan.gpus_per_trial,
+            plan.max_concurrent,
+            packs=plan.packs,
+            run=run.token,
+        )
+        with current().asking(ask), connected(address, machine) as connection:
+            try:
+                if connection.is_client:
+                    from tune_jobs.ray_tune.driver_actor import run_trials_remotely
+
+                    run_trials_remotely(job, monitor.update)
+                else:
+                    run_trials(job, monitor.update)
+            except CannotRunError:
+                # A signal that went to Ray's processes too, as one to a whole group does, is not Ray's failure.
+                if not current().came:
+                    raise
+            finally:
+                # Before Ray is shut down: where a part of it died, that takes long, and may end this process.
+                with current().shielded(), run.held():
+                    _close(store, started)
+
+
+def end_process(store: SweepStore, error: CannotRunError) -> NoReturn:
+    """Write down how the run ended, say why, and end this process as it stands; from any thread."""
+    from tune_jobs.sweeps.live_table import say_at_last
+
+    with contextlib.suppress(TuneJobsError):
+        _close(store)
+    say_at_last(f"error: {error}")
+    os._exit(error.exit_code)
+
+
+@contextlib.contextmanager
+def _noted() -> Iterator[None]:
+    """End the block at a KeyboardInterrupt; it is raised again when everything is saved."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        current().came = True
+
+
+def _close_if_open(store: SweepStore) -> None:
+    """As `_close`, where Ray did not come so far that the run began."""
+    with current().shielded():
+        if store.read_record().state == "running":
+            _close(store)
+
+
+def _close(store: SweepStore, started: float | None = None) -> None:
+    """Write down how the run that began then ended; None: it had not begun."""
+    interrupted = False
+    for trial in store.read_trials():
+        if trial.status not in FINISHED:
+            interrupted = True
+            if trial.status == "running":
+                store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "paused"}))
+    record = store.read_record()
+    now = time.time()
+    store.write_record(
+        record.model_copy(
+            update={
+                "state": "interrupted" if interrupted else "completed",
+                "ended_at": now,
+                "run_time_s": record.run_time_s + (0.0 if started is None else now - started),
+            }
+        )
+    )
+
+
+def _finished(store: SweepStore, result: SweepResult) -> SweepResult:
+    """Choose, confirm and film the winner, and write the report; what can't be made is noted, not raised."""
+    made = _Finish(store)
+    with _noted():
+        made.make_all()
+    return replace(
+        result,
+        best=made.best,
+        why_no_best=made.why_no_best,
+        finish_failed=made.failed,
+        artifacts=made.artifacts,
+        notes=tuple(made.notes),
+        interrupted=made.stopped or current().came,
+    )
+
+
+class _Finish:
+    """What comes after the trials, as far as it was made."""
+
+    def __init__(self, store: SweepStore) -> None:
+        self._store = store
+        self.best: BestRecord | None = None
+        self._why: TuneJobsError | None = None
+        self.artifacts: dict[str, Path] = {}
+        self.notes: list[str] = []
+        self.stopped = False
+        """Whether another process asked to stop before all was made."""
+        self.failed = False
+        """Whether no winner could be confirmed, or the environment failed where it was filmed."""
+
+    @property
+    def why_no_best(self) -> str | None:
+        """What kept a winner from being chosen."""
+        return None if self._why is None else str(self._why)
+
+    def make_all(self) -> None:
+        """Make everything, or what can be made."""
+        from tune_jobs.sweeps import conclude as finish
+
+        try:
+            self.best = finish.choose_best(self._store)
+            self.artifacts["policy"] = self._store.best_folder / "policy.json"
+        except TuneJobsError as error:
+            self._why = error
+        self.failed = self._why is not None
+        if self.best is not None:
+            self._attempt("video", lambda: finish.make_videos(self._store))
+        self._attempt("report", lambda: {"report": finish.make_report(self._store, self._why)})
+
+    def _attempt(self, what: str, make: Callable[[], dict[str, Path]]) -> None:
+        # Another process may have asked: `stop` ends this too.
+        self.stopped = self.stopped or self._store.stop_requested()
+        if self.stopped:
+            return
+        try:
+            self.artifacts.update(make())
+        except TuneJobsError as error:
+            self.notes.append(f"No {what}: {error}")
+            # Else it could not have gone well: not every environment can be drawn.
+            self.failed = self.failed or isinstance(error, EnvFailedError)

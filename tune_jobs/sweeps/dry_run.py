@@ -1,0 +1,71 @@
+"""What a launch would do: the checks of `sweeps.launch` in their order, and nothing that stays."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from policies.arguments import checked
+from tune_jobs.plan.machine import local_machine
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
+from tune_jobs.plan.user_code import Source, load_source
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drive import connected
+from tune_jobs.sweeps.storage import choose_store, stem_of, storage_folder
+
+
+@checked
+def planned(
+    source: Source,
+    overrides: Sequence[str] = (),
+    *,
+    name: str | None = None,
+    storage: str | Path | None = None,
+    address: str | None = None,
+) -> tuple[SweepSpec, SweepPlan]:
+    """The sweep and the plan that `sweeps.launch` would run.
+
+    Args:
+        source: As `sweeps.launch`.
+        overrides: As `sweeps.launch`.
+        name: As `sweeps.launch`.
+        storage: As `sweeps.launch`.
+        address: As `sweeps.launch`.
+
+    Raises:
+        SpecError: As `sweeps.launch`.
+        CannotRunError: As `sweeps.launch`.
+    """
+    spec = load_source(source, overrides)
+    if name is not None:
+        spec = spec.model_copy(update={"name": name})
+    store = choose_store(spec.name, stem_of(source), storage_folder(storage))
+    if address is None:
+        plan = make_plan(spec, local_machine())
+        with _probe(store):
+            return spec, plan
+    with connected(address, None) as connection:
+        plan = make_plan(spec, connection.machine)
+        with _probe(store) as folder:
+            _check_nodes(folder)
+        return spec, plan
+
+
+@contextlib.contextmanager
+def _probe(store: SweepStore) -> Iterator[Path]:
+    """Make a sweep's folder, under a hidden name of its own so that nobody finds the name taken, and remove it."""
+    probe = SweepStore(store.folder.with_name(f".{store.name}.{secrets.token_hex(4)}"))
+    probe.create()
+    try:
+        yield probe.folder
+    finally:
+        probe.discard()
+
+
+def _check_nodes(folder: Path) -> None:
+    from tune_jobs.ray_tune.cluster import check_storage
+
+    check_storage(folder)

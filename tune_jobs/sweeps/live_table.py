@@ -1,0 +1,257 @@
+"""What a person sees while a sweep runs: one table that is redrawn, or a line now and then without a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from analysis.records import FINISHED, TrialRecord
+from analysis.selection import Selection
+from policies.files import open_to_append
+from tune_jobs.cli.output import format_duration, format_score, format_value
+from tune_jobs.process.interruption import current
+from tune_jobs.sweeps.monitor import SweepMonitor
+
+_REFRESH_PER_S = 4
+_LINE_INTERVAL_S = 10.0
+_STATUS_STYLES = {
+    "running": "bold cyan", "completed": "green", "stopped": "yellow", "failed": "bold red", "paused": "magenta",
+    "pending": "dim",
+}  # fmt: skip
+_MAX_RUNNING_ROWS = 12
+
+
+def describe_point(record: TrialRecord) -> str:
+    """A trial's sampled values in a line."""
+    if not record.has_point:
+        return "chosen at its start"
+    return ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items()) or "no searched values"
+
+
+def render(monitor: SweepMonitor) -> RenderableType:
+    """The live table of a sweep."""
+    counts = monitor.counts()
+    total = len(monitor.records)
+    finished = sum(count for status, count in counts.items() if status in FINISHED)
+    head = Table.grid(padding=(0, 2))
+    head.add_row(
+        Text(monitor.name, style="bold"),
+        ProgressBar(total=max(1, total), completed=finished, width=24),
+        f"{finished} of {total} trials",
+        _status_line(counts),
+    )
+    parts: list[RenderableType] = [head, _facts(monitor)]
+    if counts.get("running"):
+        parts.append(_running(monitor))
+    if monitor.stopping:
+        parts.append(Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow"))
+    return Group(*parts)
+
+
+def _status_line(counts: dict[str, int]) -> Text:
+    words = [
+        Text(f"{counts[status]} {status}", style=style)
+        for status, style in _STATUS_STYLES.items()
+        if counts.get(status)
+    ]
+    return Text("  ").join(words)
+
+
+def _facts(monitor: SweepMonitor) -> RenderableType:
+    estimate = monitor.estimate()
+    left = "?" if estimate.time_left_s is None else format_duration(estimate.time_left_s)
+    rate = "?" if estimate.env_steps_per_s is None else f"{estimate.env_steps_per_s:,.0f}"
+    grid = Table.grid(padding=(0, 2))
+    grid.add_row("best so far", _best_text(monitor.best()))
+    grid.add_row("env steps/s", f"{rate}   ({monitor.num_env_steps:,} env steps in all)")
+    unfinished = any(record.status not in FINISHED for record in monitor.records.values())
+    time_left = f"   left: about {left}" if unfinished and not monitor.stopping else ""
+    grid.add_row("time", f"{format_duration(monitor.elapsed_s)}{time_left}")
+    return grid
+
+
+def _best_text(best: Selection | None) -> Text:
+    if best is None:
+        return Text("no evaluation yet", style="dim")
+    text = Text(f"{format_score(best.point_score)}", style="bold green")
+    text.append(
+        f"  {describe_point(best.trial)}  ({best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps)",
+        style="default",
+    )
+    return text
+
+
+def _running(monitor: SweepMonitor) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
+    for column in ("trial", "values"):
+        table.add_column(column)
+    for column in ("env steps", "training return", "evaluation return", "env steps/s"):
+        table.add_column(column, justify="right")
+    running = [record for record in monitor.records.values() if record.status == "running"]
+    for record in running[:_MAX_RUNNING_ROWS]:
+        speed = record.num_env_steps / record.time_s if record.time_s else None
+        table.add_row(
+            record.trial_id,
+            describe_point(record),
+            f"{record.num_env_steps:,}",
+            format_score(record.training_return),
+            format_score(record.evaluation_return),
+            "" if speed is None else f"{speed:,.0f}",
+        )
+    if len(running) > _MAX_RUNNING_ROWS:
+        table.add_row(f"and {len(running) - _MAX_RUNNING_ROWS} more", "", "", "", "", "")
+    return table
+
+
+def summary_line(monitor: SweepMonitor) -> str:
+    """The state of a sweep in a line, for logs."""
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items()))
+    estimate = monitor.estimate()
+    best = monitor.best()
+    words = [
+        f"{monitor.name}: {format_duration(monitor.elapsed_s)}",
+        counts,
+        f"{monitor.num_env_steps:,} env steps",
+    ]
+    if best is not None:
+        words.append(f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})")
+    if estimate.time_left_s:
+        words.append(f"about {format_duration(estimate.time_left_s)} left")
+    return "; ".join(words)
+
+
+class _Lines:
+    """Prints a line every so often, and at the end."""
+
+    def __init__(self, monitor: SweepMonitor, stream: IO[str]) -> None:
+        self._monitor = monitor
+        self._stream = stream
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        self._print()
+
+    def _run(self) -> None:
+        while not self._over.wait(_LINE_INTERVAL_S):
+            self._print()
+
+    def _print(self) -> None:
+        print(summary_line(self._monitor), file=self._stream, flush=True)
+
+
+class _Screen:
+    """Lets rich ask for the table as it is at that moment."""
+
+    def __init__(self, monitor: SweepMonitor) -> None:
+        self._monitor = monitor
+
+    def __rich__(self) -> RenderableType:
+        return render(self._monitor)
+
+
+@contextlib.contextmanager
+def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] = ()) -> Iterator[None]:
+    """Show a sweep on standard error while the block runs; what libraries print there goes to a file instead.
+
+    Args:
+        monitor: What to show.
+        progress: `auto`: a table on a terminal, else lines; `none`: nothing.
+        log: File for everything else that this process prints.
+        notes: The plan's, shown first.
+    """
+    with quiet(log) as stream:
+        if progress != "none":
+            for note in notes:
+                print(f"note: {note}", file=stream, flush=True)
+        if progress == "none":
+            yield
+        elif stream.isatty():
+            console = Console(file=stream)
+            with Live(_Screen(monitor), console=console, refresh_per_second=_REFRESH_PER_S):
+                yield
+        else:
+            with _Lines(monitor, stream):
+                yield
+
+
+class _PatientStream(io.TextIOWrapper):
+    """Drops what cannot be written: its terminal may have gone, or who read it from a pipe, and the sweep goes on."""
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            return super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            super().flush()
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            super().close()
+
+
+_shown_on: list[_PatientStream] = []
+"""Where standard error leads to, while it is sent to a file."""
+
+
+def say_at_last(text: str) -> None:
+    """Tell something on the real standard error, from a process that ends now."""
+    for stream in _shown_on[-1:]:
+        stream.write(f"{text}\n")
+        stream.flush()
+
+
+@contextlib.contextmanager
+def quiet(log: Path) -> Iterator[IO[str]]:
+    """Send standard output and error to a file, C++ included; gives a stream to the real standard error."""
+    _flush()
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(open_to_append(log))
+        stream = stack.enter_context(_PatientStream(os.fdopen(os.dup(2), "wb"), encoding="utf-8"))
+        _shown_on.append(stream)
+        stack.callback(_shown_on.remove, stream)
+        stack.enter_context(_elsewhere(1, file))
+        stack.enter_context(_elsewhere(2, file))
+        try:
+            yield stream
+        finally:
+            _flush()
+
+
+@contextlib.contextmanager
+def _elsewhere(number: int, file: IO[bytes]) -> Iterator[None]:
+    """Let a descriptor of this process lead to a file."""
+    original = os.dup(number)
+    try:
+        os.dup2(file.fileno(), number)
+        yield
+    finally:
+        with current().shielded():
+            os.dup2(original, number)
+            os.close(original)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        # A notebook's need not be files; a terminal's may be gone.
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()

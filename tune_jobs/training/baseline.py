@@ -1,0 +1,117 @@
+"""The `baseline` engine: plays episodes with a policy that does not learn; neither ray nor torch.
+
+A trial of it looks like any other, with results, evaluations, checkpoints and a portable policy, so that a sweep of
+random play is reported, filmed and compared as a sweep of PPO is.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from policies.acting.baselines import baseline_policy
+from policies.acting.evaluate import Resettable
+from policies.acting.policy import Policy, policy_from_portable
+from policies.envs.checked import CheckedEnvs
+from policies.envs.make import make_vector_env
+from policies.errors import MALFORMED, CheckpointError
+from policies.hyperparams import Algorithm, RandomHyperparams, make_hyperparams
+from policies.portable.file import PortablePolicy
+from tune_jobs.training.protocol import IterationStats, TrialTask
+
+STATE_FILE = "baseline.json"
+
+
+class BaselineEngine:
+    """See `TrainingEngine`."""
+
+    def __init__(self) -> None:
+        self._env: gym.vector.VectorEnv[Any, Any, Any] | None = None
+
+    def build(self, task: TrialTask, checkpoint: Path | None) -> None:
+        """See `TrainingEngine.build`."""
+        self.close()
+        hyperparams = make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams)
+        assert isinstance(hyperparams, RandomHyperparams)
+        self._task, self._hyperparams = task, hyperparams
+        self._iteration = self._num_env_steps = 0
+        seed = task.seed
+        if checkpoint is not None:
+            self._iteration, self._num_env_steps = _read_state(checkpoint / STATE_FILE)
+            # Other episodes than those it has played already.
+            seed = int(np.random.SeedSequence([task.seed, self._iteration]).generate_state(1)[0])
+        # The failure penalty is for learning alone: returns are those of the env itself.
+        env = make_vector_env(task.env_id, task.env_args, hyperparams.num_envs)
+        self._env = CheckedEnvs(env, task.env_id)
+        self._policy: Policy = policy_from_portable(self.policy())
+        if isinstance(self._policy, Resettable):
+            self._policy.reset(seed)
+        self._observations, _ = self._env.reset(seed=seed)
+        self._returns: NDArray[np.float64] = np.zeros(hyperparams.num_envs)  # of the running episodes
+        self._lengths: NDArray[np.int64] = np.zeros(hyperparams.num_envs, dtype=np.int64)
+        self._ended: NDArray[np.bool_] = np.zeros(hyperparams.num_envs, dtype=np.bool_)
+
+    def train_iteration(self) -> IterationStats:
+        """See `TrainingEngine.train_iteration`: plays, and trains nothing."""
+        assert self._env is not None
+        goal = self._num_env_steps + self._hyperparams.env_steps_per_iteration
+        finished: list[tuple[float, int]] = []
+        while self._num_env_steps < goal:
+            actions = cast("NDArray[Any]", self._policy.act(self._observations))
+            self._observations, rewards, terminated, truncated, _ = self._env.step(actions)
+            # NEXT_STEP autoreset: the step after an episode's last one only resets; it is no env step.
+            running = ~self._ended
+            self._returns[running] += rewards[running]
+            self._lengths[running] += 1
+            self._num_env_steps += int(running.sum())
+            self._ended = running & (terminated | truncated)
+            for index in np.flatnonzero(self._ended):
+                finished.append((float(self._returns[index]), int(self._lengths[index])))
+                self._returns[index], self._lengths[index] = 0.0, 0
+        self._iteration += 1
+        return IterationStats(num_env_steps=self._num_env_steps, episodes=tuple(finished))
+
+    def policy(self) -> PortablePolicy:
+        """See `TrainingEngine.policy`."""
+        assert self._env is not None
+        task = self._task
+        return baseline_policy(
+            self._hyperparams,
+            env_id=task.env_id,
+            env_args=task.env_args,
+            observation_space=self._env.single_observation_space,
+            action_space=self._env.single_action_space,
+            training={
+                "trial_id": task.trial_id,
+                "seed": task.seed,
+                "hyperparams": task.hyperparams,
+                "iteration": self._iteration,
+            },
+        )
+
+    def save(self, folder: Path) -> None:
+        """See `TrainingEngine.save`: how far it has played. Restored, it begins new episodes."""
+        state = {"iteration": self._iteration, "num_env_steps": self._num_env_steps}
+        (folder / STATE_FILE).write_text(json.dumps(state) + "\n", encoding="utf-8")
+
+    def close(self) -> None:
+        """See `TrainingEngine.close`."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+
+def _read_state(path: Path) -> tuple[int, int]:
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        return int(state["iteration"]), int(state["num_env_steps"])
+    except (OSError, *MALFORMED) as error:
+        raise CheckpointError(
+            f"{path} cannot be read: {error!r}.",
+            "Use another checkpoint of the trial; this one cannot be gone on from.",
+        ) from error

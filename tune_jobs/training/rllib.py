@@ -1,0 +1,186 @@
+"""The `rllib` engine: one RLlib Algorithm a trial, rebuilt in the same warm process for the next."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from ray.rllib.algorithms.algorithm import Algorithm as RLlibAlgorithm
+from ray.rllib.core import DEFAULT_MODULE_ID
+
+from policies.errors import CannotRunError
+from policies.hyperparams import Algorithm, DQNHyperparams, TrainedHyperparams, make_hyperparams
+from policies.portable.file import PortablePolicy, read_policy
+from policies.rllib.config import build_algorithm_config
+from policies.rllib.dqn_algorithm import ReplayDQN
+from policies.rllib.env_runner import ArrayEnvRunner
+from policies.rllib.restore import portable_policy, restore_algorithm, take_over_state
+from tune_jobs.training.env_runner import EnvRunner
+from tune_jobs.training.protocol import IterationStats, TrialTask
+
+RLLIB_FOLDER = "rllib"
+_LIFETIME_STEPS = ("env_runners", "num_env_steps_sampled_lifetime")
+# RLlib's name -> ours; the others are timers and counters.
+_LEARNER_STATS = {
+    "total_loss": "total_loss",
+    "policy_loss": "policy_loss",
+    "vf_loss": "vf_loss",
+    "entropy": "entropy",
+    "mean_kl_loss": "kl",
+    "qf_mean": "q_mean",
+    "gradient_norm": "gradient_norm",
+    "lr": "lr",
+    "gradients_default_optimizer_global_norm": "gradient_norm",
+    "default_optimizer_learning_rate": "lr",
+}
+
+
+class RLlibEngine:
+    """See `TrainingEngine`."""
+
+    def __init__(self) -> None:
+        self._algorithm: RLlibAlgorithm | None = None
+        self._task: TrialTask | None = None
+        self._hyperparams: TrainedHyperparams | None = None
+        # Env steps and iterations of the trial that the Algorithm does not count; negative if it counts others.
+        self._before = (0, 0)
+
+    @property
+    def algorithm(self) -> RLlibAlgorithm:
+        """The Algorithm of the current trial.
+
+        Raises:
+            RuntimeError: Nothing has been built.
+        """
+        if self._algorithm is None:
+            raise RuntimeError("build() has not been called")
+        return self._algorithm
+
+    def build(self, task: TrialTask, checkpoint: Path | None) -> None:
+        """See `TrainingEngine.build`."""
+        self.close()
+        # Small networks run up to several times slower on more than one thread, and trials share the cores.
+        torch.set_num_threads(1)
+        # Validated where the values came from, the sweep file; this turns JSON back into the typed object.
+        # A baseline has an engine of its own.
+        hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
+        self._task, self._hyperparams = task, hyperparams
+        self._before = (0, 0)
+        saved = None if checkpoint is None else read_policy(checkpoint)
+        if checkpoint is not None and saved is not None and _is_of(task, saved):
+            self._algorithm = restore_algorithm(checkpoint / RLLIB_FOLDER, saved.network)
+        else:
+            self._algorithm = self._new_algorithm(task, hyperparams)
+            if checkpoint is not None and saved is not None:
+                take_over_state(self._algorithm, checkpoint / RLLIB_FOLDER, saved.network)
+        if task.changes:
+            self._before = (task.num_env_steps - self._num_env_steps(), task.num_iterations - self._algorithm.iteration)
+        if checkpoint is not None:
+            self._continue_streams(checkpoint)
+
+    def _new_algorithm(self, task: TrialTask, hyperparams: TrainedHyperparams) -> RLlibAlgorithm:
+        config = build_algorithm_config(
+            hyperparams,
+            env_id=task.env_id,
+            env_args=task.env_args,
+            seed=task.seed,
+            num_env_runners=task.num_env_runners,
+            num_gpus=task.num_gpus,
+            failure_penalty=task.failure_penalty,
+            rl_module=task.rl_module,
+        )
+        config.env_runners(env_runner_cls=EnvRunner)
+        # The learner's weights are drawn from these; a warm process has drawn other numbers before.
+        torch.manual_seed(task.seed)
+        return config.build_algo()
+
+    def _num_env_steps(self) -> int:
+        """Env steps as the Algorithm counts them: those before a copied checkpoint are another trial's."""
+        algorithm = self.algorithm
+        if isinstance(algorithm, ReplayDQN):
+            return algorithm.num_env_steps
+        return int(algorithm.metrics.peek(_LIFETIME_STEPS, default=0))
+
+    def _continue_streams(self, checkpoint: Path) -> None:
+        """After a restore: other random numbers than at the trial's start, and a replay buffer with something in it.
+
+        RLlib saves no state of the random generators (2.60), and the replay memory is not in checkpoints.
+        """
+        assert self._task is not None
+        iteration = int(checkpoint.name) if checkpoint.name.isdigit() else 0
+        words = np.random.SeedSequence([self._task.seed, iteration]).generate_state(2)
+        torch.manual_seed(int(words[0]))
+        np.random.seed(int(words[0]))  # noqa: NPY002 (RLlib's connectors draw from the global one)
+        seed = int(words[1])
+
+        def reseed(runner: ArrayEnvRunner) -> None:
+            runner.reseed(seed)
+
+        self.algorithm.env_runner_group.foreach_env_runner(reseed)
+        if isinstance(self._hyperparams, DQNHyperparams):
+            self.algorithm.seed_replay(int(words[0]))
+            # As much as it had when learning began; with no replay, the next steps fill it.
+            num_steps = max(self._hyperparams.learning_starts, self._hyperparams.train_batch_size)
+            if self._hyperparams.replay != "none" and self.algorithm.num_updates:
+                self.algorithm.refill(num_steps)
+
+    def train_iteration(self) -> IterationStats:
+        """See `TrainingEngine.train_iteration`.
+
+        Raises:
+            CannotRunError: An env runner died; RLlib would go on with fewer, or with none and without learning.
+        """
+        result = self.algorithm.train()
+        group = self.algorithm.env_runner_group
+        finished = group.foreach_env_runner(lambda runner: runner.pop_finished_episodes())
+        expected = max(1, self._task.num_env_runners if self._task else 0)
+        if group.num_remote_env_runners() and group.num_healthy_remote_workers() < expected:
+            raise CannotRunError(
+                f"An env runner died: {group.num_healthy_remote_workers()} of {expected} are left.",
+                "See the trial's log; the trial goes on from its latest checkpoint when it is retried.",
+            )
+        return IterationStats(
+            num_env_steps=self._before[0] + self._num_env_steps(),
+            episodes=tuple(episode for runner in finished for episode in (runner or ())),
+            learner=_learner_stats(result),
+        )
+
+    def policy(self) -> PortablePolicy:
+        """See `TrainingEngine.policy`."""
+        assert self._task is not None
+        assert self._hyperparams is not None
+        task = self._task
+        training = {
+            "trial_id": task.trial_id,
+            "seed": task.seed,
+            "hyperparams": task.hyperparams,
+            "iteration": self._before[1] + self.algorithm.iteration,
+        }
+        return portable_policy(
+            self.algorithm, self._hyperparams, env_id=task.env_id, env_args=task.env_args, training=training
+        )
+
+    def save(self, folder: Path) -> None:
+        """See `TrainingEngine.save`: RLlib's own checkpoint, in a folder of its own."""
+        self.algorithm.save_to_path(str((folder / RLLIB_FOLDER).absolute()))
+
+    def close(self) -> None:
+        """See `TrainingEngine.close`."""
+        if self._algorithm is not None:
+            self._algorithm.stop()
+            self._algorithm = None
+
+
+def _is_of(task: TrialTask, saved: PortablePolicy) -> bool:
+    """Whether a checkpoint is of this very trial, with the hyperparameters it has now."""
+    # Only population based training changes them, or copies checkpoints.
+    own = json.loads(json.dumps({"trial_id": task.trial_id, "hyperparams": task.hyperparams}))
+    return not task.changes or {name: saved.training.get(name) for name in own} == own
+
+
+def _learner_stats(result: dict[str, Any]) -> dict[str, float]:
+    stats = result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
+    return {ours: float(stats[theirs]) for theirs, ours in _LEARNER_STATS.items() if theirs in stats}
