@@ -81,3 +81,39 @@ def shown_path(path: Path) -> str:
         return str(path)
     absolute = path.absolute()
     return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)
+
+
+def format_value(value: Any) -> str:
+    """A hyperparameter for a table: 64x64 for lists, four digits for floats."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return "x".join(format_value(item) for item in value)
+    return "-" if value is None else str(value)
+
+
+def format_score(value: float | None) -> str:
+    """A return for a table."""
+    return "-" if value is None else f"{value:.1f}"
+
+
+def format_duration(seconds: float) -> str:
+    """Seconds as people say them: 42 s, 3 min 20 s, 2 h 5 min."""
+    if not math.isfinite(seconds):
+        return "-"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def format_bytes(number: float) -> str:
+    """Bytes in powers of 1,000."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if number < 1000:
+            return f"{number:.0f} {unit}"
+        number /= 1000
+    return f"{number:.1f} TB"

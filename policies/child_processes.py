@@ -1,8 +1,8 @@
 """Where child processes begin, so that they find this package and not a user's folder of the same name.
 
 A spawned process imports the module of its function first, by a path that a user's own `policies` may come first on;
-`tune_jobs` settles whose that name is (see `tune_jobs/process/own_packages.py`). It is named by text here, as all that it may
-be in this package.
+`tune_jobs` settles whose that name is (see `tune_jobs/process/own_packages.py`). It is named by text here,
+as all that it may be in this package.
 """
 
 from __future__ import annotations

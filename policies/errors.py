@@ -121,3 +121,11 @@ MALFORMED = (
     ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError,
 )  # fmt: skip
 """What data of another kind than was expected raises; who reads a file turns these into a `CheckpointError`."""
+
+
+class ObservationError(TuneJobsError):
+    """An observation is not of the shape that the policy takes."""
+
+
+class NonFiniteWeightsError(TuneJobsError):
+    """A network holds NaN or infinite weights: its training went wrong, and what it does means nothing."""

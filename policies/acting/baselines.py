@@ -1,7 +1,7 @@
 """The baselines: policies that observe nothing and learn nothing, for trained ones to be held against.
 
-`random` draws its actions uniformly (`policies.acting.policy.RandomPolicy`), `constant` repeats one. Both can be evaluated,
-filmed, put into a portable policy file and read back like a trained policy.
+`random` draws its actions uniformly (`policies.acting.policy.RandomPolicy`), `constant` repeats one. Both can be
+evaluated, filmed, put into a portable policy file and read back like a trained policy.
 """
 
 from __future__ import annotations

@@ -15,23 +15,19 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from policies.arguments import checked
 from policies.envs.action_bounds import ToBounds
 from policies.envs.make import check_env
-from policies.errors import TuneJobsError
+from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
-    BASELINE_KINDS,
     ActionTransform,
     PolicyNetwork,
     PortablePolicy,
-    read_policy,
     space_from_description,
 )
 from policies.portable.forward import ForwardPass
@@ -40,15 +36,7 @@ ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
 Action = int | NDArray[Any]
 
 
-class ObservationError(TuneJobsError):
-    """An observation is not of the shape that the policy takes."""
-
-
 NON_FINITE_HINT = "Lower the learning rate, or set grad_clip; scale rewards and observations down if they are large."
-
-
-class NonFiniteWeightsError(TuneJobsError):
-    """A network holds NaN or infinite weights: its training went wrong, and what it does means nothing."""
 
 
 class Policy(ABC):
@@ -224,51 +212,6 @@ class RandomPolicy(Policy):
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         actions = [self.action_space.sample() for _ in range(len(observations))]
         return np.array(actions).reshape(len(observations), *(self.action_space.shape or ()))
-
-
-def policy_from_portable(portable: PortablePolicy, description: str | None = None) -> Policy:
-    """The policy that a portable one describes: a network's, or a baseline's.
-
-    Args:
-        portable: What was read from a file, or made in memory.
-        description: Shown in captions and messages; None: by kind, algorithm and env.
-    """
-    network = portable.network
-    policy: Policy
-    if network.kind == "module":
-        from policies.acting.module_policy import ModulePolicy  # torch and RLlib, which no other policy needs
-
-        return ModulePolicy(portable, description)
-    if network.kind not in BASELINE_KINDS:
-        return NetworkPolicy(portable, description)
-    spaces = (space_from_description(portable.observation_space), space_from_description(portable.action_space))
-    if network.kind == "random":
-        policy = RandomPolicy(*spaces, env_id=portable.env_id, env_args=portable.env_args)
-    else:
-        from policies.acting.baselines import ConstantPolicy  # it is a Policy, so it imports this module
-
-        assert network.action is not None  # read_policy and save_policy have checked it
-        policy = ConstantPolicy(*spaces, network.action, env_id=portable.env_id, env_args=portable.env_args)
-    if description is not None:
-        policy.description = description
-    return policy
-
-
-@checked
-def load_policy(path: str | Path) -> Policy:
-    """Read a policy from its portable file; needs no Ray and no torch, and executes nothing in the file.
-
-    A policy whose network is an RLModule of the user's own does need them, and its class from an allowed module.
-
-    Args:
-        path: `policy.json`, `policy.safetensors`, or the folder that holds them.
-
-    Raises:
-        NotFoundError: There is no such file.
-        CheckpointError: The file is incomplete, altered, or of another format.
-        SpecError: It needs a class from a module that is not allowed.
-    """
-    return policy_from_portable(read_policy(Path(path)))
 
 
 def copy_space(space: gym.Space[Any]) -> ActionSpace:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from policies.errors import EnvFailedError, said_by
 
-_PACKAGE = PurePath(__file__).parent
+_PACKAGE = PurePath(__file__).parents[1]
 _notes_signals = False
 _signalled = False
 

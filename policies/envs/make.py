@@ -3,9 +3,9 @@
 Words: an *env id* names a registered environment (`CartPole-v1`); *env arguments* are the keyword arguments
 its constructor takes; a *sub-environment* is one of the copies that a vector environment steps at once.
 
-What an id means is decided in `env_ids`; Gymnasium is given what was found, never the id. The env arguments may hold
-the reserved keys of `env_wrappers`, so that whoever makes the environment of a policy observes what the policy did in
-training.
+What an id means is decided in `policies.envs.ids`; Gymnasium is given what was found, never the id. The env arguments
+may hold the reserved keys of `policies.envs.wrappers`, so that whoever makes the environment of a policy observes what
+the policy did in training.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def make_env(
 
     Args:
         env_id: Gymnasium id, or `module:Name`.
-        env_args: Keyword arguments of its constructor, and reserved keys of `env_wrappers`; None: none.
+        env_args: Keyword arguments of its constructor, and reserved keys of `policies.envs.wrappers`; None: none.
         render_mode: As Gymnasium's; None: no rendering.
 
     Raises:

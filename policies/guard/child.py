@@ -178,7 +178,7 @@ def record_comparison(
 
 
 def _load(saved: Mapping[str, str]) -> Policy:
-    from policies.acting.policy import policy_from_portable
+    from policies.acting.load import policy_from_portable
     from policies.portable.file import read_policy
 
     return calls.watch_policy(policy_from_portable(read_policy(Path(saved["folder"])), saved["description"]))

@@ -42,7 +42,7 @@ _PATIENCE_S = 5.0
 """How long the child may take to end by itself."""
 _TRACEBACK_S = 1.0
 _MAX_FRAMES = 8
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 # `-P`: nothing of the working directory can stand in for this package. The user's folders come later.
 _BOOTSTRAP = """\
 import sys
@@ -188,7 +188,7 @@ class EnvGuard:
         """Do a job in the child.
 
         Args:
-            job: A function of `guard_process`.
+            job: A function of `policies.guard.child`.
             env_id: Its environment.
             timeout_s: How long one call of the user's code may take; the job may take longer.
             arguments: What else the function takes, as JSON.

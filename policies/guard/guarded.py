@@ -36,7 +36,7 @@ def check_env(
     *,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> EnvInfo:
-    """See `envs.check_env`.
+    """See `policies.envs.make.check_env`.
 
     Args:
         env_id: As there.
@@ -59,13 +59,13 @@ def check_env(
 
 
 def check_seedable(env_id: str, env_args: Mapping[str, Any] | None, *, timeout_s: float = CALL_TIMEOUT_S) -> None:
-    """See `packed.envs.check_seedable`; the arguments are those of `check_env`."""
+    """See `policies.packed.envs.make.check_seedable`; the arguments are those of `check_env`."""
     with guarding() as guard:
         guard.run("check_seedable", env_id, env_args=_as_json(env_id, env_args), timeout_s=timeout_s)
 
 
 def measure_step(env_id: str, env_args: Mapping[str, Any] | None, *, timeout_s: float = CALL_TIMEOUT_S) -> StepTime:
-    """See `packed.envs.measure_step`; the arguments are those of `check_env`."""
+    """See `policies.packed.envs.make.measure_step`; the arguments are those of `check_env`."""
     with guarding() as guard:
         told = guard.run("measure_step", env_id, env_args=_as_json(env_id, env_args), timeout_s=timeout_s)
     return StepTime(**told)

@@ -203,19 +203,19 @@ def _own_class(hyperparams: TrainedHyperparams, rl_module: str) -> type[RLModule
         if not issubclass(found, api):
             raise SpecError(
                 f"rl_module {rl_module!r} is no {api.__name__}, which the algorithm needs.",
-                "Derive it from policies.networks.rl_modules.PPOModule for PPO, or DQNModule for DQN.",
+                "Derive it from policies.networks.PPOModule for PPO, or DQNModule for DQN.",
             )
     if isinstance(hyperparams, DQNHyperparams):
         if hyperparams.epsilon_schedule != "linear" and not issubclass(found, EpsilonGreedy):
             raise SpecError(
                 f"epsilon_schedule {hyperparams.epsilon_schedule} does not reach rl_module {rl_module!r}: RLlib's own "
                 "exploration has linear schedules alone.",
-                "Derive the class from policies.networks.rl_modules.DQNModule, or set epsilon_schedule: linear.",
+                "Derive the class from policies.networks.DQNModule, or set epsilon_schedule: linear.",
             )
         if not hyperparams.target_network and not issubclass(found, DQNModule):
             raise SpecError(
                 f"target_network is false, but rl_module {rl_module!r} always has a target network, like RLlib's own.",
-                "Derive the class from policies.networks.rl_modules.DQNModule, or set target_network: true.",
+                "Derive the class from policies.networks.DQNModule, or set target_network: true.",
             )
     return found
 

@@ -1,6 +1,7 @@
 """What a pack knows of each of its members, and how an RLModule's weights lie in a stack's rows.
 
-Names of weights are those of `policies.networks.rl_modules`' modules, so that a member can leave for RLlib and come from it.
+Names of weights are those of `policies.networks.rl_modules`' modules, so that a member can leave for RLlib and come
+from it.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from policies.hyperparams import DQNHyperparams, TrainedHyperparams
-from policies.packed.envs.make import PackedEnvs
+from policies.packed.envs.vector import PackedEnvs
 from policies.packed.member import Member, MemberStats
 
 
@@ -47,7 +47,7 @@ class Stack(Protocol):
         ...
 
     def finish_iteration(self) -> dict[str, MemberStats]:
-        """End the iteration that was begun; what it gave, by id. Members in `envs.errors` have failed."""
+        """End the iteration that was begun; what it gave, by id. Members in `PackedEnvs.errors` have failed."""
         ...
 
 

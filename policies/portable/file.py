@@ -1,11 +1,11 @@
 """The portable policy file: what it takes to act, without Ray, torch or pickle.
 
 It is a pair of files side by side. `policy.safetensors` holds the weights; `policy.json` says what network
-they form (see `policies.portable.network`), which environment it acts in and how it was trained, and carries the SHA-256
-of the weights.
+they form (see `policies.portable.network`), which environment it acts in and how it was trained, and carries the
+SHA-256 of the weights.
 
-Formats: 1 had layers alone; 2 has all that `policies.portable.network` describes, and writes the bounds of a space as one
-number where they are all equal. Both are read.
+Formats: 1 had layers alone; 2 has all that `policies.portable.network` describes, and writes the bounds of a space as
+one number where they are all equal. Both are read.
 """
 
 from __future__ import annotations

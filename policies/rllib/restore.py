@@ -26,6 +26,7 @@ from policies.portable.file import (
     PortablePolicy,
     describe_space,
 )
+from policies.rllib.old_names import old_names
 
 Weights = Mapping[str, NDArray[Any]]
 
@@ -93,7 +94,8 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
         # Before RLlib imports it: it would go on with another class where this one is missing.
         import_module_class(expected.module.class_path)
     try:
-        algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
+        with old_names():
+            algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
     except Exception as error:
         raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
     try:
@@ -124,7 +126,8 @@ def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: Poli
         {name: value for name, value in group.items() if name != "params"} for group in _optimizer_groups(algorithm)
     ]
     try:
-        algorithm.restore_from_path(str(rllib_checkpoint.absolute()))
+        with old_names():
+            algorithm.restore_from_path(str(rllib_checkpoint.absolute()))
         for group, own in zip(_optimizer_groups(algorithm), settings, strict=True):
             group.update(own)
         check_weights(algorithm, expected)

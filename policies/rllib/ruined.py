@@ -11,7 +11,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from policies.acting.policy import NON_FINITE_HINT, NonFiniteWeightsError
+from policies.acting.policy import NON_FINITE_HINT
+from policies.errors import NonFiniteWeightsError
 
 
 def check_gradients(gradients: Iterable[Tensor | None], module: nn.Module) -> None:

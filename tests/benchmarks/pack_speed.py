@@ -19,7 +19,7 @@ import torch
 
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams, make_hyperparams
 from tests.benchmarks import dqn, workload
-from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.training.packed import PackedEngine
 from tune_jobs.training.protocol import TrialTask
 

@@ -15,7 +15,7 @@ from analysis.statistics import Estimate, paired_difference
 from policies.acting.evaluate import Evaluator
 from policies.acting.policy import NetworkPolicy
 from policies.portable.file import PortablePolicy
-from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.training.packed import PackedEngine
 from tune_jobs.training.protocol import IterationStats, TrialTask
 from tune_jobs.training.rllib import RLlibEngine

@@ -68,7 +68,7 @@ def test_the_composed_services_run_a_sweep_on_two_workers(image, tmp_path):
         arguments += ["--set", setting]
     files = image.root.path(launcher["working_dir"])
     files.mkdir()
-    shutil.copy(ROOT / "tune_jobs" / "presets" / "cartpole-ppo.yaml", files / "mine.yaml")
+    shutil.copy(ROOT / "tune_jobs" / "spec" / "presets" / "cartpole-ppo.yaml", files / "mine.yaml")
     # Begun early: Ray tries for 20 s before it gives up.
     stranger = image.begin(
         [*launcher["entrypoint"], *arguments, "--address", "head:6379"],

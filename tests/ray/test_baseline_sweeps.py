@@ -2,7 +2,8 @@
 
 import pytest
 
-from policies.acting.policy import RandomPolicy, load_policy
+from policies.acting.load import load_policy
+from policies.acting.policy import RandomPolicy
 from tests.learning.measure import measure, verdict
 from tests.learning.targets import Target, Task
 from tune_jobs.sweeps import verbs as sweeps

@@ -1,4 +1,4 @@
-"""What `policies.idle.find` says to be idle is on RLlib's engine too; that of packs is in `tests/unit/test_acting.py`."""
+"""What `policies.idle.find` says to be idle is on RLlib's engine too; for packs see `tests/unit/test_acting.py`."""
 
 import numpy as np
 import pytest

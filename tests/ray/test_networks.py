@@ -8,7 +8,8 @@ from network_builds import build, observations_of, portable, rllib_outputs
 from rllib_cases import MODULE, learner_of, module_of
 from rounding import assert_greedy, assert_network
 
-from policies.acting.policy import NetworkPolicy, load_policy
+from policies.acting.load import load_policy
+from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import make_hyperparams
 from policies.portable.file import ConvLayer, save_policy

@@ -11,7 +11,7 @@ import pytest
 from trials import make_task, run_trial
 
 from policies.acting.evaluate import evaluate_policy
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import EnvError
 from policies.portable.file import read_policy

@@ -9,7 +9,7 @@ from scripted_packs import STEPS, make_sweep, run_packs
 from test_schedulers import MIXED
 
 from tune_jobs.ray_tune.early_stopping import build_scheduler
-from tune_jobs.spec.sweep_spec import SchedulerSpec
+from tune_jobs.spec.sections import SchedulerSpec
 from tune_jobs.store.pack_files import PackFiles
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]

@@ -10,7 +10,8 @@ import torch
 from rounding import assert_greedy, assert_network
 from trials import make_task, run_trial
 
-from policies.acting.policy import NetworkPolicy, load_policy
+from policies.acting.load import load_policy
+from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError, NotFoundError
 from policies.hyperparams import ACTIVATIONS, make_hyperparams
 from policies.portable.file import Layer, PolicyNetwork, read_policy, save_policy

@@ -7,9 +7,8 @@ import pytest
 import torch
 from trials import TRIAL_SEED, make_task, run_trial
 
-from policies.acting.policy import NonFiniteWeightsError
-from policies.errors import CannotRunError, CheckpointError, NotFoundError
-from tune_jobs.spec.sweep_spec import StopSpec
+from policies.errors import CannotRunError, CheckpointError, NonFiniteWeightsError, NotFoundError
+from tune_jobs.spec.sections import StopSpec
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

@@ -4,7 +4,7 @@ import pytest
 from scripted_trials import run_scripted
 from test_sweeps import assert_results_without_gaps, launch, make_spec
 
-from tune_jobs.spec.sweep_spec import SchedulerSpec
+from tune_jobs.spec.sections import SchedulerSpec
 from tune_jobs.store.sweep_store import SweepStore
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]

@@ -5,7 +5,7 @@ import pytest
 from trials import make_task, run_trial
 
 from policies.acting.evaluate import Evaluator
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

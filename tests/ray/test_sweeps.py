@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.portable.file import read_policy
 from tune_jobs.spec.seeds import trial_seeds

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from policies.acting.evaluate import Evaluator
-from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.training.protocol import TrialTask
 
 TRIAL_SEED = 9 * 1024

@@ -10,7 +10,7 @@ from policy_factory import make_portable
 from policies.acting.evaluate import Episodes
 from policies.errors import CheckpointError
 from policies.portable.file import Layer, PolicyNetwork, read_policy
-from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
 

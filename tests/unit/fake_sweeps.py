@@ -153,7 +153,7 @@ def sweeps(monkeypatch, tmp_path):
     for name in fake.answers:
         setattr(fake, name, make(name))
     monkeypatch.setitem(sys.modules, "tune_jobs.sweeps.verbs", fake)
-    import tune_jobs
+    import tune_jobs.sweeps
 
-    monkeypatch.setattr(tune_jobs, "sweeps", fake, raising=False)
+    monkeypatch.setattr(tune_jobs.sweeps, "verbs", fake, raising=False)
     return fake

@@ -12,7 +12,8 @@ import pytest
 
 from policies.acting.baselines import ConstantPolicy, baseline_policy
 from policies.acting.evaluate import Evaluator, evaluate_policy
-from policies.acting.policy import RandomPolicy, load_policy, policy_from_portable
+from policies.acting.load import load_policy, policy_from_portable
+from policies.acting.policy import RandomPolicy
 from policies.envs.make import check_env
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import ConstantHyperparams, RandomHyperparams
@@ -20,7 +21,7 @@ from policies.portable.file import PolicyNetwork, read_policy, save_policy
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
-from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps

@@ -11,7 +11,7 @@ from fake_sweeps import SWEEP, TRIALS, Status, evaluation
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.output import to_json
-from tune_jobs.process.interruption import SweepInterrupted
+from tune_jobs.sweeps.interrupted import SweepInterrupted
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"

@@ -11,7 +11,7 @@ import pytest
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
-from tune_jobs.process.interruption import SweepInterrupted, current
+from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store import sweep_store as store_module
 from tune_jobs.store.sweep_store import SweepStore
@@ -20,6 +20,7 @@ from tune_jobs.sweeps import drive as driving
 from tune_jobs.sweeps import resume as resuming
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.drive import write_new
+from tune_jobs.sweeps.interrupted import SweepInterrupted
 
 SPEC = {"env": "CartPole-v1", "algorithm": "ppo", "space": {"lr": {"uniform": [1e-4, 1e-2]}}, "num_samples": 2}
 

@@ -9,9 +9,9 @@ from policy_factory import balancing_policy, make_policy, make_portable, registe
 
 import policies.acting.evaluate
 from policies.acting.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
-from policies.acting.policy import NetworkPolicy, NonFiniteWeightsError, Policy, RandomPolicy
+from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
 from policies.envs.make import make_env
-from policies.errors import EnvError, SpecError
+from policies.errors import EnvError, NonFiniteWeightsError, SpecError
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")

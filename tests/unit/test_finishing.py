@@ -19,7 +19,8 @@ from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
-from tune_jobs.sweeps.drive import SweepResult, _finished, write_new
+from tune_jobs.sweeps.drive import _finished, write_new
+from tune_jobs.sweeps.outcome import SweepResult
 
 HOSTILE = "hostile_envs:Hostile"
 

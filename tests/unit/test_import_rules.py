@@ -8,8 +8,8 @@ import pytest
 
 HEAVY = {"ray", "torch", "pandas", "matplotlib"}
 PROGRAM = "import json, sys\n{code}\nprint(json.dumps(sorted(sys.modules)))"
-# All packages load these two, which settle whose the names of packages are.
-NAMES = {"tune_jobs", "tune_jobs.process.own_packages"}
+# All packages load these, which settle whose the names of packages are.
+NAMES = {"tune_jobs", "tune_jobs.process", "tune_jobs.process.own_packages"}
 
 
 def modules_after(code):
@@ -34,7 +34,7 @@ def modules_after(code):
         ("import tune_jobs.sweeps.conclude", {"ray", "torch"}),
         # The seam between trials and engines.
         (
-            "import tune_jobs.training.trial_loop, tune_jobs.training.protocol, tune_jobs.store.sweep_store, tune_jobs.sweeps.monitor",
+            "import tune_jobs.training.trial_loop, tune_jobs.training.protocol, tune_jobs.sweeps.monitor",
             {"ray", "torch"},
         ),
         ("import analysis.records, analysis.selection, analysis.report", {"ray", "torch", "tune_jobs"}),

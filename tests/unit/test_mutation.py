@@ -5,8 +5,9 @@ import pytest
 from pydantic import TypeAdapter
 
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tune_jobs.search.mutation import FIXED_IN_A_POPULATION, mutate, mutation_generator
+from tune_jobs.search.mutation import mutate, mutation_generator
 from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.rules import FIXED_IN_A_POPULATION
 
 DOMAIN = TypeAdapter(Domain)
 

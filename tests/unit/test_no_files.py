@@ -11,11 +11,12 @@ import odd_files
 import pytest
 from sweep_folders import train
 
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.envs.tallies import read_tally
 from policies.errors import CannotRunError, CheckpointError, TuneJobsError
 from policies.files import MAX_RECORD_BYTES, open_to_append, read_regular, sha256_file
+from tune_jobs.process.streams import quiet
 from tune_jobs.store.candidates import candidates
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.locks import held
@@ -28,7 +29,6 @@ from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import resume as resuming
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.drive import settled
-from tune_jobs.sweeps.live_table import quiet
 
 
 @pytest.fixture(scope="module")

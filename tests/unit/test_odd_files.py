@@ -9,7 +9,7 @@ import numpy as np
 import odd_files
 import pytest
 
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
 from policies.packed.state import load_member

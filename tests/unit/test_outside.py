@@ -13,7 +13,7 @@ import pytest
 from sweep_folders import train
 
 from analysis import records
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
 from tune_jobs.store.candidates import choose, read_trials

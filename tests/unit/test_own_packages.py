@@ -106,16 +106,19 @@ def test_an_error_in_the_users_package_reaches_them(project):
 def test_a_hidden_module_is_warned_of_once(project):
     files = {
         "policies/__init__.py": "",
-        "policies/networks/rl_modules.py": "",
+        "policies/networks.py": "",
         "policies/nets.py": "",
         "analysis/plots.py": "",
     }
-    script = "import tune_jobs\nimport policies.envs.spaces, analysis.plots\nprint(policies.__file__, analysis.plots.__file__)\n"
+    script = (
+        "import tune_jobs\nimport policies.hyperparams, analysis.plots\n"
+        "print(policies.__file__, analysis.plots.__file__)\n"
+    )
     stdout, stderr = project(script, files)
     root = str(tune_jobs.__path__[0]).removesuffix("tune_jobs")
     assert stdout == f"{root}policies/__init__.py {root}analysis/plots.py"
     warnings = [line for line in stderr.splitlines() if "UserWarning" in line]
-    assert ["policies/networks/rl_modules.py:" in warnings[0], "analysis/plots.py:" in warnings[1], len(warnings)] == [
+    assert ["policies/networks.py:" in warnings[0], "analysis/plots.py:" in warnings[1], len(warnings)] == [
         True,
         True,
         2,
@@ -133,17 +136,15 @@ def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(project):
     _, stderr = project("import tune_jobs\nimport policies.envs.spaces\n", files)
     warnings = [line for line in stderr.splitlines() if "UserWarning" in line]
     assert len(warnings) == 1
-    assert f"policies{os.sep}envs: `import policies.envs.make` gives tune-jobs' own" in warnings[0]
+    assert f"policies{os.sep}envs: `import policies.envs` gives tune-jobs' own" in warnings[0]
 
 
 def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(project):
-    files = {"policies/__init__.py": "", "policies/networks/rl_modules.py": ""}
-    script = "import policies.networks.rl_modules\nimport tune_jobs\n"
+    files = {"policies/__init__.py": "", "policies/networks.py": ""}
+    script = "import policies.networks\nimport tune_jobs\n"
     error = project(script, files, fails=True)[1].splitlines()[-1]
-    assert error.startswith(
-        "ImportError: tune_jobs cannot be imported: it has a module policies.networks.rl_modules, and "
-    )
-    assert "policies/networks/rl_modules.py, which is imported already" in error
+    assert error.startswith("ImportError: tune_jobs cannot be imported: it has a module policies.networks, and ")
+    assert "policies/networks.py, which is imported already" in error
     assert "Rename" in error
 
 

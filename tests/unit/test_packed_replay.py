@@ -6,7 +6,7 @@ import pytest
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn.n_step import StackedNStep
 from policies.packed.dqn.replay import StackedPrioritizedReplay, StackedReplay, make_stacked_replay
-from policies.packed.envs.make import Step
+from policies.packed.envs.vector import Step
 from policies.replay import LastTransitions, NStep, PrioritizedReplayBuffer, ReplayBuffer, Transitions, make_replay
 
 D = 2

@@ -10,14 +10,9 @@ import pytest
 from policy_factory import IMAGES, make_image_policy, make_policy, make_portable, register_test_envs
 from rounding import assert_rounded, dense
 
-from policies.acting.policy import (
-    NetworkPolicy,
-    NonFiniteWeightsError,
-    ObservationError,
-    RandomPolicy,
-    load_policy,
-)
-from policies.errors import TuneJobsError
+from policies.acting.load import load_policy
+from policies.acting.policy import NetworkPolicy, RandomPolicy
+from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.hyperparams import ACTIVATIONS
 from policies.portable.file import save_policy
 

@@ -20,7 +20,7 @@ from policy_factory import (
 )
 from rounding import assert_rounded, dense
 
-from policies.acting.policy import load_policy
+from policies.acting.load import load_policy
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.portable.file import (
     Layer,
@@ -311,7 +311,7 @@ def test_an_interrupted_save_is_noticed(tmp_path, monkeypatch):
 def test_reading_needs_neither_ray_nor_torch(tmp_path):
     save_policy(make_portable("CartPole-v1"), tmp_path)
     code = (
-        "import sys; from policies.acting.policy import load_policy; import policies.acting.evaluate\n"
+        "import sys; from policies.acting.load import load_policy; import policies.acting.evaluate\n"
         f"load_policy({str(tmp_path)!r}).act([0, 0, 0, 0])\n"
         "print([name for name in ('ray', 'torch', 'pandas', 'matplotlib', 'scipy') if name in sys.modules])"
     )

@@ -9,8 +9,9 @@ import pytest
 
 from analysis.records import SweepRecord
 from policies.errors import CannotRunError
-from tune_jobs.process.interruption import SweepInterrupted, current, run_alone, taking_signals
-from tune_jobs.sweeps.drive import SweepResult
+from tune_jobs.process.interruption import current, taking_signals
+from tune_jobs.sweeps.interrupted import SweepInterrupted, run_alone
+from tune_jobs.sweeps.outcome import SweepResult
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

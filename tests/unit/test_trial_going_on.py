@@ -8,8 +8,8 @@ import pytest
 from fake_engine import FakeClock, FakeEngine
 from trial_runs import Trial
 
-from policies.acting.policy import NonFiniteWeightsError
 from policies.envs.tallies import tally_of
+from policies.errors import NonFiniteWeightsError
 from tune_jobs.store.ownership import Owner, OwnershipLostError
 from tune_jobs.store.sweep_store import SweepStore
 

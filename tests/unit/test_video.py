@@ -14,9 +14,9 @@ from policy_factory import balancing_policy, make_policy, make_portable, registe
 import policies.acting.movies
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.movies import GifWriter, Mp4Writer
-from policies.acting.policy import NetworkPolicy, NonFiniteWeightsError, RandomPolicy
+from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.acting.video import record_comparison, record_video
-from policies.errors import CannotRunError, EnvError, SpecError
+from policies.errors import CannotRunError, EnvError, NonFiniteWeightsError, SpecError
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")

@@ -16,7 +16,7 @@ import click
 from policies.errors import CannotRunError, TuneJobsError, said_by
 
 if TYPE_CHECKING:
-    from tune_jobs.sweeps.drive import SweepResult
+    from tune_jobs.sweeps.outcome import SweepResult
 
 _INTERRUPTED, _CANNOT_PRINT = 130, CannotRunError.exit_code
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
@@ -71,7 +71,7 @@ class CommandGroup(click.Group):
 
 
 def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
-    from tune_jobs.process.interruption import SweepInterrupted
+    from tune_jobs.sweeps.interrupted import SweepInterrupted
 
     if isinstance(interruption, SweepInterrupted):
         return _UNCHANGED[command]
@@ -193,7 +193,7 @@ def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> Sw
     Raises:
         KeyboardInterrupt: It ended before the sweep had begun.
     """
-    from tune_jobs.process.interruption import SweepInterrupted
+    from tune_jobs.sweeps.interrupted import SweepInterrupted
 
     try:
         return call(*args, **kwargs)

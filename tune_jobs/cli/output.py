@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from pydantic import BaseModel
 
-from analysis.wording import counted
+from analysis.wording import counted, format_duration, format_score, format_value
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -56,42 +56,6 @@ def to_json(value: Any) -> Any:
 def print_json(value: Any) -> None:
     """Print one JSON document on standard output."""
     click.echo(json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=False))
-
-
-def format_value(value: Any) -> str:
-    """A hyperparameter for a table: 64x64 for lists, four digits for floats."""
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list | tuple):
-        return "x".join(format_value(item) for item in value)
-    return "-" if value is None else str(value)
-
-
-def format_score(value: float | None) -> str:
-    """A return for a table."""
-    return "-" if value is None else f"{value:.1f}"
-
-
-def format_duration(seconds: float) -> str:
-    """Seconds as people say them: 42 s, 3 min 20 s, 2 h 5 min."""
-    if not math.isfinite(seconds):
-        return "-"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
-def format_bytes(number: float) -> str:
-    """Bytes in powers of 1,000."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if number < 1000:
-            return f"{number:.0f} {unit}"
-        number /= 1000
-    return f"{number:.1f} TB"
 
 
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from analysis.wording import counted
-from tune_jobs.cli.output import format_bytes, format_value, make_console, make_table, print_facts, print_json, span
+from analysis.wording import counted, format_bytes, format_value
+from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
 
 if TYPE_CHECKING:
     from rich.table import Table

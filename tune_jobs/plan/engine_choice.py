@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
-    HYPERPARAMS_BY_ALGORITHM,
     DQNHyperparams,
     Hyperparams,
     PPOHyperparams,
     RandomHyperparams,
 )
 from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.rules import is_baseline, why_none_is_packed
 
 if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
-    from policies.packed.envs.make import EnvKind
+    from policies.packed.envs.vector import EnvKind
     from tune_jobs.spec.sweep_spec import SweepSpec
 
 Engine = Literal["packed", "rllib", "baseline"]
@@ -109,27 +109,6 @@ def why_not_packed(spec: SweepSpec, hyperparams: Hyperparams | None = None, env:
     return None
 
 
-def why_none_is_packed(spec: SweepSpec) -> str | None:
-    """Why no trial of a sweep can be trained in a pack, as far as its file tells, or None."""
-    reasons = {
-        f"algorithm is {spec.algorithm}, which does not learn": _is_baseline(spec),
-        f"rl_module is {spec.rl_module}, and packs have no networks but their own": spec.rl_module is not None,
-        "env.pixels is true, and packs have no convolutions": spec.env.pixels,
-        f"resources.num_env_runners is {spec.resources.num_env_runners}, and packs have no env runners": (
-            spec.resources.num_env_runners > 0
-        ),
-        "scheduler.type is pbt, whose trials go on from copies of each other": spec.scheduler.type == "pbt",
-        "scheduler.type is hyperband, which pauses trials until others have come as far": (
-            spec.scheduler.type == "hyperband"
-        ),
-    }
-    return next((reason for reason, applies in reasons.items() if applies), None)
-
-
-def _is_baseline(spec: SweepSpec) -> bool:
-    return issubclass(HYPERPARAMS_BY_ALGORITHM[spec.algorithm], RandomHyperparams)
-
-
 def _possible_filters(spec: SweepSpec) -> list[Any]:
     domain: Domain | None = spec.space.get("conv_filters")
     if domain is None:
@@ -157,7 +136,7 @@ def choose_engines(
         SpecError: The wish is that all are packed, and one cannot be.
     """
     engines: list[Engine] = []
-    if _is_baseline(spec):
+    if is_baseline(spec):
         engines = ["baseline"] * len(trials)
         return EngineChoice(tuple(engines))
     why_not_seeded: str | None = None

@@ -1,7 +1,7 @@
 """Hyperparameters of a sweep that can't act: refused if a search over one could change nothing, else told.
 
-When a hyperparameter is idle is the affair of `policies.idle.find`. Here: of which points, and what is said. A search is
-refused only where no value that its space may give could differ from another; a fixed value never is.
+When a hyperparameter is idle is the affair of `policies.idle.find`. Here: of which points, and what is said. A search
+is refused only where no value that its space may give could differ from another; a fixed value never is.
 """
 
 from __future__ import annotations

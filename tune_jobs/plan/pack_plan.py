@@ -36,7 +36,7 @@ class Member:
 
     trial_id: str
     key: tuple[Any, ...] | None
-    """See `packs.pack_key`; None: its point is not known."""
+    """See `engine_choice.pack_key`; None: its point is not known."""
     num_bytes: float
     """Memory it takes, as an estimate."""
     num_envs: int = 1

@@ -20,6 +20,7 @@ from policies.errors import CannotRunError, SpecError
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
+from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.plan.engine_choice import Engine, PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
 from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
@@ -30,7 +31,6 @@ from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.tpe import check_installed
 from tune_jobs.spec.domains import num_points
-from tune_jobs.spec.problems import details_of, dotted, explain
 from tune_jobs.spec.rules import idle_settings
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec.sweep_spec import SweepSpec

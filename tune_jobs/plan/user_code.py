@@ -97,5 +97,5 @@ def check_rl_module(spec: SweepSpec) -> None:
     if not any(base.__name__ == "RLModule" and base.__module__.startswith("ray.rllib.") for base in bases):
         raise SpecError(
             f"rl_module is {spec.rl_module}, which is no RLModule class but {found!r}.",
-            "Derive it from RLlib's RLModule, or from one of policies.networks.rl_modules.",
+            "Derive it from RLlib's RLModule, or from one of policies.networks.",
         )

@@ -25,7 +25,8 @@ from types import ModuleType
 from typing import Any
 
 NAMES = ("policies", "analysis")
-_ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))  # noqa: PTH100, PTH120 (as sys.path and __path__)
+# As sys.path and __path__ are: strings.
+_ROOT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))  # noqa: PTH100, PTH118, PTH120
 _INIT = "__init__.py"
 _PYTHONS_OWN = (BuiltinImporter, FrozenImporter, PathFinder)
 _SHARED = ("__all__", "__version__")

@@ -29,6 +29,7 @@ from policies.errors import CannotRunError, TuneJobsError
 from policies.files import write_atomic
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
+from tune_jobs.process.streams import quiet
 from tune_jobs.ray_tune.address import recorded_cluster
 from tune_jobs.ray_tune.connected_ray import (
     alive_nodes,
@@ -41,7 +42,6 @@ from tune_jobs.ray_tune.environment import prepare_environment, provide_token
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
 from tune_jobs.store.places import within
-from tune_jobs.sweeps.live_table import quiet
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2

@@ -54,7 +54,7 @@ class RemoteDriver:
 
 
 def run_trials_remotely(job: RunJob, listener: Listener) -> None:
-    """As `runner.run_trials`, with the loop in an actor on the joined cluster.
+    """As `run_trials.run_trials`, with the loop in an actor on the joined cluster.
 
     Raises:
         CannotRunError: The actor or the connection to the cluster was lost.

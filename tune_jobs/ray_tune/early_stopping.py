@@ -17,7 +17,7 @@ from ray.tune.schedulers import (
     TrialScheduler,
 )
 
-from tune_jobs.spec.sweep_spec import SchedulerSpec
+from tune_jobs.spec.sections import SchedulerSpec
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController

@@ -34,7 +34,7 @@ from tune_jobs.training.protocol import PackEngine
 if TYPE_CHECKING:
     from policies.acting.evaluate import Episodes
     from policies.acting.policy import Policy
-    from policies.packed.envs.make import EnvKind
+    from policies.packed.envs.vector import EnvKind
 
 
 def make_pack_engine(env_kind: EnvKind, num_env_processes: int) -> PackEngine:

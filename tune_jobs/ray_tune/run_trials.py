@@ -356,7 +356,7 @@ def _give_up(run: _Run, death: RayDiedError) -> None:
 
     In the background, as the main thread can't; that one changes nothing meanwhile.
     """
-    from tune_jobs.sweeps.drive import end_process
+    from tune_jobs.store.closing import end_process
 
     run.keeper.close()
     end_process(run.store, ray_died(run.store.name, death))

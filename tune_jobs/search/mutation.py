@@ -17,20 +17,6 @@ from tune_jobs.spec.domains import Domain, Listed, Range
 FACTORS = (0.8, 1.2)
 """What a number is multiplied with if it isn't drawn anew; Jaderberg et al. use these two."""
 
-FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
-    {
-        # Another network, or other running statistics, than the ones that are copied.
-        "hidden_sizes", "activation", "initializer", "conv_filters", "normalize_observations", "vf_share_layers",
-        "dueling", "target_network",
-        # Another optimizer state than the one that is copied.
-        "optimizer", "rmsprop_momentum",
-        # Other sub-environments; a trial's seeds are counted by them.
-        "num_envs",
-        # They act at a trial's start alone.
-        "kl_coeff", "learning_starts",
-    }
-)  # fmt: skip
-"""Hyperparameters that can't change within a trial, or would do nothing."""
 
 _SPAWN_KEY = 4  # 0 to 3 belong to points and seeds
 

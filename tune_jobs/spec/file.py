@@ -14,9 +14,10 @@ from analysis.records import SweepRecord
 from policies.arguments import checked
 from policies.errors import CheckpointError, SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from policies.suggestions import did_you_mean
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
-from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError, did_you_mean
+from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.yaml import parse_yaml
 
@@ -53,7 +54,7 @@ _PRESET_LABELS = {
 
 def list_presets() -> list[Preset]:
     """The presets, by name."""
-    folder = resources.files("tune_jobs").joinpath("presets")
+    folder = resources.files("tune_jobs.spec").joinpath("presets")
     files = [file for file in folder.iterdir() if file.name.endswith(".yaml")]
     presets = [read_preset(file.name.removesuffix(".yaml"), file.read_text(encoding="utf-8")) for file in files]
     return sorted(presets)

@@ -9,9 +9,12 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from policies.suggestions import did_you_mean
+from policies.wrong_values import Detail, details_of, dotted, explain
 from tune_jobs.spec.domains import Domain
-from tune_jobs.spec.problems import Detail, Problem, details_of, did_you_mean, dotted, explain
-from tune_jobs.spec.sweep_spec import NAME_RULE, SweepSpec, hyperparam_problems
+from tune_jobs.spec.hyperparam_problems import hyperparam_problems
+from tune_jobs.spec.problems import Problem
+from tune_jobs.spec.sections import NAME_RULE, SweepFields
 
 
 def problems_of(error: ValidationError, data: Any) -> list[Problem]:
@@ -83,7 +86,7 @@ def _unknown_key(location: Sequence[int | str]) -> str:
 
 
 def _section(location: Sequence[int | str]) -> type[BaseModel]:
-    model: Any = SweepSpec
+    model: Any = SweepFields
     for part in location:
         model = model.model_fields[str(part)].annotation
     found: type[BaseModel] = model
@@ -94,7 +97,7 @@ def _other_place(name: str) -> str:
     """A hint for a field that exists, but in another section."""
     places = [
         f"{section}.{name}"
-        for section, field in SweepSpec.model_fields.items()
+        for section, field in SweepFields.model_fields.items()
         if isinstance(field.annotation, type)
         and issubclass(field.annotation, BaseModel)
         and name in field.annotation.model_fields

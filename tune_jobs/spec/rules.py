@@ -1,22 +1,40 @@
-"""Settings of search method and scheduler that don't go with each other, or with the rest of a sweep."""
+"""Settings of a sweep that don't go with each other, and why none of its trials can be packed."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from policies.errors import SpecError
-from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, RandomHyperparams
-from tune_jobs.search.mutation import FIXED_IN_A_POPULATION
+from policies.hyperparams import (
+    HYPERPARAMS_BY_ALGORITHM,
+    RandomHyperparams,
+)
 from tune_jobs.spec.domains import Grid, num_points
 
 if TYPE_CHECKING:
-    from tune_jobs.spec.sweep_spec import SweepSpec
+    from tune_jobs.spec.sections import SweepFields
 
 Found = list[tuple[str, str]]
 """(dotted path in the sweep file, what is wrong there)."""
 
 
-def search_problems(spec: SweepSpec) -> Found:
+FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
+    {
+        # Another network, or other running statistics, than the ones that are copied.
+        "hidden_sizes", "activation", "initializer", "conv_filters", "normalize_observations", "vf_share_layers",
+        "dueling", "target_network",
+        # Another optimizer state than the one that is copied.
+        "optimizer", "rmsprop_momentum",
+        # Other sub-environments; a trial's seeds are counted by them.
+        "num_envs",
+        # They act at a trial's start alone.
+        "kl_coeff", "learning_starts",
+    }
+)  # fmt: skip
+"""Hyperparameters that can't change within a trial, or would do nothing."""
+
+
+def search_problems(spec: SweepFields) -> Found:
     """What is wrong with a sweep's search method and scheduler."""
     found: Found = []
     if spec.search.type == "tpe":
@@ -47,7 +65,7 @@ _USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
 """Which types of search and scheduler a field is for; `perturb_every_env_steps` is refused with others than pbt."""
 
 
-def idle_settings(spec: SweepSpec) -> list[str]:
+def idle_settings(spec: SweepFields) -> list[str]:
     """What to say of settings of search and scheduler that were changed and can't act, for the plan."""
     notes = []
     for section, fields in _USED_BY.items():
@@ -58,7 +76,7 @@ def idle_settings(spec: SweepSpec) -> list[str]:
     return notes
 
 
-def check_extendable(spec: SweepSpec) -> None:
+def check_extendable(spec: SweepFields) -> None:
     """Check that more samples are other points than those there are.
 
     Raises:
@@ -73,12 +91,8 @@ def check_extendable(spec: SweepSpec) -> None:
         )
 
 
-def _learns(spec: SweepSpec) -> bool:
-    return not issubclass(HYPERPARAMS_BY_ALGORITHM[spec.algorithm], RandomHyperparams)
-
-
-def _tpe_problems(spec: SweepSpec) -> Found:
-    if not _learns(spec):
+def _tpe_problems(spec: SweepFields) -> Found:
+    if is_baseline(spec):
         return [("search.type", f"tpe needs an algorithm that learns, and {spec.algorithm} does not: use random")]
     found: Found = []
     if not spec.space:
@@ -98,9 +112,9 @@ def _tpe_problems(spec: SweepSpec) -> Found:
     return found
 
 
-def _population_problems(spec: SweepSpec) -> Found:
+def _population_problems(spec: SweepFields) -> Found:
     found: Found = []
-    if not _learns(spec):
+    if is_baseline(spec):
         return [("scheduler.type", f"pbt needs an algorithm that learns, and {spec.algorithm} does not")]
     if not spec.space:
         found.append(("scheduler.type", "pbt has nothing to change: space is empty"))
@@ -127,3 +141,25 @@ def _population_problems(spec: SweepSpec) -> Found:
         )
         found.append(("scheduler.perturb_every_env_steps", text))
     return found
+
+
+def why_none_is_packed(spec: SweepFields) -> str | None:
+    """Why no trial of a sweep can be trained in a pack, as far as its file tells, or None."""
+    reasons = {
+        f"algorithm is {spec.algorithm}, which does not learn": is_baseline(spec),
+        f"rl_module is {spec.rl_module}, and packs have no networks but their own": spec.rl_module is not None,
+        "env.pixels is true, and packs have no convolutions": spec.env.pixels,
+        f"resources.num_env_runners is {spec.resources.num_env_runners}, and packs have no env runners": (
+            spec.resources.num_env_runners > 0
+        ),
+        "scheduler.type is pbt, whose trials go on from copies of each other": spec.scheduler.type == "pbt",
+        "scheduler.type is hyperband, which pauses trials until others have come as far": (
+            spec.scheduler.type == "hyperband"
+        ),
+    }
+    return next((reason for reason, applies in reasons.items() if applies), None)
+
+
+def is_baseline(spec: SweepFields) -> bool:
+    """Whether its algorithm is one that does not learn."""
+    return issubclass(HYPERPARAMS_BY_ALGORITHM[spec.algorithm], RandomHyperparams)

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import read_regular
-from tune_jobs.spec.problems import details_of, dotted, explain
+from policies.wrong_values import details_of, dotted, explain
 
 _RecordT = TypeVar("_RecordT", bound=BaseModel)
 

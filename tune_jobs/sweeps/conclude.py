@@ -11,7 +11,8 @@ from typing import Any
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord
 from analysis.selection import NoUsableTrialError, score_trial
 from policies.acting.baselines import BASELINES, ConstantPolicy
-from policies.acting.policy import Policy, RandomPolicy, load_policy, policy_from_portable
+from policies.acting.load import load_policy, policy_from_portable
+from policies.acting.policy import Policy, RandomPolicy
 from policies.envs.modules import allow_modules
 from policies.envs.wrappers import FRAME_STACK, PIXELS
 from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
@@ -201,7 +202,7 @@ def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | Non
 def evaluate(
     source: PolicySource, num_episodes: int, first_seed: int | None
 ) -> tuple[EvaluationRecord, EvaluationRecord]:
-    """Greedy episodes of a policy, and of a random one on the same seeds; see `sweeps.evaluate`."""
+    """Greedy episodes of a policy, and of a random one on the same seeds; see `verbs.evaluate`."""
     first = FRESH_SEED if first_seed is None else first_seed
     seeds = range(first, first + num_episodes)
     env_id, env_args, timeout_s = source.env_id, source.env_args, source.timeout_s

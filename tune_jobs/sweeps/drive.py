@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import platform
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
@@ -24,40 +23,17 @@ from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.address import check_address
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.closing import close_run
 from tune_jobs.store.leftovers import remove_leftovers
 from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.monitor import SweepMonitor
+from tune_jobs.sweeps.outcome import SweepResult
 
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection
 
 _PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
-
-
-@dataclass(frozen=True)
-class SweepResult:
-    """What a launch, resume or extend left."""
-
-    folder: Path
-    sweep: SweepRecord
-    trials: list[TrialRecord]
-    best: BestRecord | None = None
-    why_no_best: str | None = None
-    artifacts: dict[str, Path] = field(default_factory=dict)
-    """Where each result lies: policy, before_mp4, after_mp4, after_gif, before_after_mp4, report."""
-    interrupted: bool = False
-    notes: tuple[str, ...] = ()
-    """What could not be made (a video of an environment that can't be drawn, say), and why."""
-    finish_failed: bool = False
-    """Whether no winner could be confirmed, or the environment failed where it was filmed."""
-
-    @property
-    def exit_code(self) -> int:
-        """130 if it was interrupted, 3 if a trial failed or what comes after the trials did, else 0."""
-        if self.interrupted:
-            return 130
-        return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
 
 
 def write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None) -> None:
@@ -268,17 +244,7 @@ def _run_trials(
             finally:
                 # Before Ray is shut down: where a part of it died, that takes long, and may end this process.
                 with current().shielded(), run.held():
-                    _close(store, started)
-
-
-def end_process(store: SweepStore, error: CannotRunError) -> NoReturn:
-    """Write down how the run ended, say why, and end this process as it stands; from any thread."""
-    from tune_jobs.sweeps.live_table import say_at_last
-
-    with contextlib.suppress(TuneJobsError):
-        _close(store)
-    say_at_last(f"error: {error}")
-    os._exit(error.exit_code)
+                    close_run(store, started)
 
 
 @contextlib.contextmanager
@@ -291,31 +257,10 @@ def _noted() -> Iterator[None]:
 
 
 def _close_if_open(store: SweepStore) -> None:
-    """As `_close`, where Ray did not come so far that the run began."""
+    """As `close_run`, where Ray did not come so far that the run began."""
     with current().shielded():
         if store.read_record().state == "running":
-            _close(store)
-
-
-def _close(store: SweepStore, started: float | None = None) -> None:
-    """Write down how the run that began then ended; None: it had not begun."""
-    interrupted = False
-    for trial in store.read_trials():
-        if trial.status not in FINISHED:
-            interrupted = True
-            if trial.status == "running":
-                store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "paused"}))
-    record = store.read_record()
-    now = time.time()
-    store.write_record(
-        record.model_copy(
-            update={
-                "state": "interrupted" if interrupted else "completed",
-                "ended_at": now,
-                "run_time_s": record.run_time_s + (0.0 if started is None else now - started),
-            }
-        )
-    )
+            close_run(store)
 
 
 def _finished(store: SweepStore, result: SweepResult) -> SweepResult:

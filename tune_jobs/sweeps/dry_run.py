@@ -1,4 +1,4 @@
-"""What a launch would do: the checks of `sweeps.launch` in their order, and nothing that stays."""
+"""What a launch would do: the checks of `verbs.launch` in their order, and nothing that stays."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def planned(
     storage: str | Path | None = None,
     address: str | None = None,
 ) -> tuple[SweepSpec, SweepPlan]:
-    """The sweep and the plan that `sweeps.launch` would run.
+    """The sweep and the plan that `verbs.launch` would run.
 
     Args:
-        source: As `sweeps.launch`.
-        overrides: As `sweeps.launch`.
-        name: As `sweeps.launch`.
-        storage: As `sweeps.launch`.
-        address: As `sweeps.launch`.
+        source: As `verbs.launch`.
+        overrides: As `verbs.launch`.
+        name: As `verbs.launch`.
+        storage: As `verbs.launch`.
+        address: As `verbs.launch`.
 
     Raises:
-        SpecError: As `sweeps.launch`.
-        CannotRunError: As `sweeps.launch`.
+        SpecError: As `verbs.launch`.
+        CannotRunError: As `verbs.launch`.
     """
     spec = load_source(source, overrides)
     if name is not None:

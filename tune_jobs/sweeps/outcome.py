@@ -1,61 +1,33 @@
-"""What a sweep came to: its trials as records and as a table, and its report."""
+"""What a launch, resume or extend came to."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from analysis.records import TrialRecord
-from policies.arguments import checked
-from policies.envs.modules import allowed_again
-from policies.errors import NotFoundError
-
-if TYPE_CHECKING:
-    import pandas as pd
+from analysis.records import BestRecord, SweepRecord, TrialRecord
 
 
-@checked
-def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[TrialRecord]:
-    """A sweep's trials, by index.
+@dataclass(frozen=True)
+class SweepResult:
+    """What a launch, resume or extend left."""
 
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from tune_jobs.store.candidates import read_trials
-    from tune_jobs.sweeps.conclude import find_sweep
+    folder: Path
+    sweep: SweepRecord
+    trials: list[TrialRecord]
+    best: BestRecord | None = None
+    why_no_best: str | None = None
+    artifacts: dict[str, Path] = field(default_factory=dict)
+    """Where each result lies: policy, before_mp4, after_mp4, after_gif, before_after_mp4, report."""
+    interrupted: bool = False
+    notes: tuple[str, ...] = ()
+    """What could not be made (a video of an environment that can't be drawn, say), and why."""
+    finish_failed: bool = False
+    """Whether no winner could be confirmed, or the environment failed where it was filmed."""
 
-    return read_trials(find_sweep(sweep, storage))
-
-
-@checked
-def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.DataFrame:
-    """A sweep's trials as a pandas DataFrame, one row a trial: the table `trials.csv` of its report.
-
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from analysis.report_data import goal_of
-    from analysis.tables import trials_frame
-    from tune_jobs.store.candidates import read_trials
-    from tune_jobs.sweeps.conclude import find_sweep, read_results
-
-    store = find_sweep(sweep, storage)
-    try:
-        best = store.read_best()
-    except NotFoundError:
-        # None was chosen yet, or it can't be read: then the env's own threshold counts.
-        best = None
-    return trials_frame(read_trials(store), read_results(store), threshold=goal_of(store.read_record(), best))
-
-
-@allowed_again()
-@checked
-def report(sweep: str | Path, *, storage: str | Path | None = None) -> Path:
-    """Write a sweep's report; returns its index.html.
-
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from tune_jobs.sweeps.conclude import find_sweep, make_report
-
-    return make_report(find_sweep(sweep, storage))
+    @property
+    def exit_code(self) -> int:
+        """130 if it was interrupted, 3 if a trial failed or what comes after the trials did, else 0."""
+        if self.interrupted:
+            return 130
+        return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0

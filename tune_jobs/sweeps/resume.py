@@ -14,7 +14,8 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.sweep_store import SweepStore
-from tune_jobs.sweeps.drive import SweepResult, connected, machine_here, pending_record, run_sweep, settled
+from tune_jobs.sweeps.drive import connected, machine_here, pending_record, run_sweep, settled
+from tune_jobs.sweeps.outcome import SweepResult
 
 
 @guarding()

@@ -21,17 +21,12 @@ from policies.errors import TuneJobsError
 from policies.guard.guard import guarding
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.plan.user_code import Source, load_source
-from tune_jobs.process.interruption import current, run_alone
+from tune_jobs.process.interruption import current
 from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
-from tune_jobs.sweeps.drive import (
-    SweepResult,
-    connected,
-    machine_here,
-    run_sweep,
-    settled,
-    write_new,
-)
-from tune_jobs.sweeps.outcome import dataframe, report, trials
+from tune_jobs.sweeps.drive import connected, machine_here, run_sweep, settled, write_new
+from tune_jobs.sweeps.interrupted import run_alone
+from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.results import dataframe, report, trials
 from tune_jobs.sweeps.storage import choose_store, create_store, expanded, stem_of, storage_folder
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from policies.acting.baselines import baseline_policy
 from policies.acting.evaluate import Resettable
-from policies.acting.policy import Policy, policy_from_portable
+from policies.acting.load import policy_from_portable
+from policies.acting.policy import Policy
 from policies.envs.checked import CheckedEnvs
 from policies.envs.make import make_vector_env
 from policies.errors import MALFORMED, CheckpointError

@@ -1,5 +1,6 @@
-"""The trials of one pack from start to end: each by the rules of `tune_jobs.training.trial_loop`, trained and evaluated together.
+"""The trials of one pack from start to end, trained and evaluated together.
 
+Each goes by the rules of `tune_jobs.training.trial_loop`.
 A member that fails is tried again by itself, from its latest checkpoint; the others do not notice.
 """
 
@@ -18,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from policies.acting.evaluate import Episodes, Evaluator
-from policies.acting.policy import NonFiniteWeightsError, Policy
+from policies.acting.policy import Policy
 from policies.envs.tallies import Reached, end_tally, tally_of
-from policies.errors import TuneJobsError, said_by
+from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
 from policies.portable.file import PortablePolicy
 from tune_jobs.store.ownership import Owner, OwnershipLostError
 from tune_jobs.store.progress import Progress

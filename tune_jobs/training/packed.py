@@ -12,7 +12,8 @@ import torch
 
 from policies.errors import CheckpointError
 from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
-from policies.packed.envs.make import EnvKind, choose_kind, make_packed_envs, measure_step
+from policies.packed.envs.make import choose_kind, make_packed_envs, measure_step
+from policies.packed.envs.vector import EnvKind
 from policies.packed.initial import new_member
 from policies.packed.member import Member
 from policies.packed.portable_member import portable_policy

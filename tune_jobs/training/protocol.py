@@ -1,8 +1,8 @@
 """What an engine is: the one thing that knows how a trial's iterations are computed.
 
-Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is `tune_jobs.training.trial_loop`'s and the same
-for all engines. There are two kinds: those that train one trial at a time, and those that train a pack of them together
-(`tune_jobs.training.pack_loop`). This module imports no ray, so that both sides can import it.
+Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is `tune_jobs.training.trial_loop`'s
+and the same for all engines. There are two kinds: those that train one trial at a time, and those that train a pack
+of them together (`tune_jobs.training.pack_loop`). This module imports no ray, so that both sides can import it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from analysis.records import ChangeRecord
 from policies.portable.file import PortablePolicy
-from tune_jobs.spec.sweep_spec import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 
 
 @dataclass(frozen=True)

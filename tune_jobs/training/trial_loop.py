@@ -17,8 +17,10 @@ from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
 from policies.acting.evaluate import Episodes, Evaluator
-from policies.acting.policy import NonFiniteWeightsError, Policy, policy_from_portable
+from policies.acting.load import policy_from_portable
+from policies.acting.policy import Policy
 from policies.envs.tallies import Reached, begin_tally, end_tally
+from policies.errors import NonFiniteWeightsError
 from policies.files import write_plain
 from policies.portable.file import save_policy
 from tune_jobs.store.copies import pending_copy, remove_copies

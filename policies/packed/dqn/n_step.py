@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.hyperparams import DQNHyperparams
-from policies.packed.envs.make import Step
+from policies.packed.envs.vector import Step
 from policies.replay import NStep, Transitions
 
 Floats = NDArray[np.float32]

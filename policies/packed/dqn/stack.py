@@ -1,7 +1,7 @@
 """DQN of the members of a pack that share a tensor program: one vector of environments, batched updates.
 
-What an iteration does is what `policies.rllib.dqn_algorithm` does for one trial: phases of sampling, each followed by the
-updates that are due.
+What an iteration does is what `policies.rllib.dqn_algorithm` does for one trial: phases of sampling, each followed by
+the updates that are due.
 
 Shapes: M members, T vector steps, N sub-environments a member, S = M * N rows, B rows a batch, D numbers an
 observation.
@@ -22,7 +22,7 @@ from policies.networks.epsilon import EpsilonSchedule
 from policies.packed.dqn.group import DQNGroup
 from policies.packed.dqn.n_step import StackedNStep
 from policies.packed.dqn.replay import StackedReplay, make_stacked_replay
-from policies.packed.envs.make import PackedEnvs, Step
+from policies.packed.envs.vector import PackedEnvs, Step
 from policies.packed.member import Member, MemberStats, group_members
 from policies.packed.sampling import EpisodeTracker, Observations, merge_statistics
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from policies.envs.make import make_env, make_vector_env
 from policies.errors import EnvError
-from policies.packed.envs.make import Step
 from policies.packed.envs.penalty import Penalty
 from policies.packed.envs.rows import MemberRows, Rows
+from policies.packed.envs.vector import Step
 
 _Flags = NDArray[np.bool_]
 

@@ -16,11 +16,11 @@ from policies.envs.make import make_env
 from policies.envs.spaces import observation_dtype
 from policies.envs.tallies import Tally, tally_of
 from policies.errors import EnvError
-from policies.packed.envs.make import Step
 from policies.packed.envs.penalty import Penalty
 from policies.packed.envs.process import ProcessHost
 from policies.packed.envs.rows import MemberRows, Rows
 from policies.packed.envs.sub_envs import HereHost, Host, HostDiedError, SubStep
+from policies.packed.envs.vector import Step
 
 _NUM_SEEDS = 2**32  # Gymnasium takes larger ones, but many an env does not
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from policies.envs.action_bounds import ToBounds
 from policies.hyperparams import PPOHyperparams
-from policies.packed.envs.make import PackedEnvs
+from policies.packed.envs.vector import PackedEnvs
 from policies.packed.member import Member, MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo.gae import advantages_and_targets, standardise

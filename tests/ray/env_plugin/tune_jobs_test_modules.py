@@ -6,7 +6,7 @@ from ray.rllib.core.rl_module.apis import ValueFunctionAPI
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import nn
 
-from policies.networks.rl_modules import DQNModule
+from policies.networks import DQNModule
 
 NUMBER = 3
 

@@ -1,0 +1,102 @@
+"""What is wrong with fixed and searched hyperparameters, each looked at by itself."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import (
+    BaseModel,
+    ValidationError,
+    create_model,
+)
+
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
+from policies.suggestions import did_you_mean
+from policies.wrong_values import details_of, dotted, explain
+from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.problems import Problem
+
+
+def hyperparam_problems(
+    algorithm: Algorithm, hyperparams: Mapping[str, Any], space: Mapping[str, Domain]
+) -> list[Problem]:
+    """What is wrong with fixed and searched hyperparameters, each looked at by itself.
+
+    Args:
+        algorithm: Whose hyperparameters they are.
+        hyperparams: Fixed values by name.
+        space: Domains by name.
+
+    Returns:
+        Unknown names, values that are refused, and names that are both fixed and searched.
+    """
+    fields = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    problems = []
+    for section, names in (("hyperparams", hyperparams), ("space", space)):
+        problems += [
+            Problem(f"{section}.{name}", _unknown_hyperparam(algorithm, name)) for name in names if name not in fields
+        ]
+    for name, value in hyperparams.items():
+        if name in fields:
+            problems += _value_problems(algorithm, name, value, path=f"hyperparams.{name}")
+        if name in space:
+            text = f"is fixed at {value!r} and searched in space.{name} at once: take it out of one of them"
+            problems.append(Problem(f"hyperparams.{name}", text))
+    for name, domain in space.items():
+        if name in fields:
+            problems += _domain_problems(algorithm, name, domain)
+    return problems
+
+
+def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
+    known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
+    have = "have" if len(others) > 1 else "has"
+    suggestion = f" ({' and '.join(others)} {have} it.)" if others else did_you_mean(name, known)
+    if name == "learning_rate":
+        suggestion = " Did you mean 'lr'?"  # its letters are nearer to DQN's learning_starts
+    listed = "" if suggestion else f" It has {', '.join(sorted(known))}."
+    return f"{algorithm} has no hyperparameter {name!r}.{suggestion}{listed}"
+
+
+def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Problem]:
+    problems = []
+    for index, value in domain.probes():
+        path = f"space.{name}.{domain.kind}"
+        found = _value_problems(algorithm, name, value, path=path if index is None else f"{path}[{index}]")
+        if found and index is None:
+            text = f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
+            found = [Problem(path, text)]
+        problems += found
+        if found and domain.kind not in ("grid", "choice"):
+            break  # both ends of a range are mostly wrong for the same reason
+    return problems
+
+
+def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -> list[Problem]:
+    try:
+        checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
+    except ValidationError as error:
+        return [Problem(path + dotted(detail["loc"][1:], root=False), explain(detail)) for detail in details_of(error)]
+    if not _same_kind(value, checked):
+        meant = list(checked) if isinstance(checked, tuple) else checked
+        return [Problem(path, f"{value!r} is of the wrong type: write {meant!r} if that is meant")]
+    return []
+
+
+def _same_kind(raw: Any, checked: Any) -> bool:
+    """Whether pydantic left the kind of a value alone: it would read true as 1, 1 as true and "5" as 5."""
+    if isinstance(checked, tuple):
+        # One number may stand for a list of one.
+        return all(map(_same_kind, raw if isinstance(raw, list | tuple) else [raw], checked))
+    return isinstance(raw, str) == isinstance(checked, str) and isinstance(raw, bool) == isinstance(checked, bool)
+
+
+@functools.cache
+def _alone(algorithm: Algorithm, name: str) -> type[BaseModel]:
+    """A hyperparameter without the checks across several: the plan makes these for each point."""
+    field = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields[name]
+    model: type[BaseModel] = create_model("Alone", **{name: (field.annotation, field)})  # type: ignore[call-overload]
+    return model

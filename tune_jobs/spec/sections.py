@@ -1,0 +1,217 @@
+"""The sections of a sweep file, and all fields of a sweep: types and ranges alone.
+
+What has to be true of several fields together stands in `tune_jobs.spec.rules`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+)
+
+from policies.hyperparams import Algorithm
+from tune_jobs.spec.domains import Domain, Number, WholeNumber
+from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
+
+SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
+
+NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
+_LARGEST_REWARD = 3.4e38
+"""Beyond it a number is infinite in 32 bits, in which learners compute."""
+NAME_RULE = "up to 100 letters, digits, '_', '-' and '.', beginning with none of the last two"
+
+Flag = Annotated[bool, Field(strict=True)]
+"""true or false; no text and no number stands for them."""
+PositiveWhole = Annotated[WholeNumber, Field(ge=1)]
+NonNegativeWhole = Annotated[WholeNumber, Field(ge=0)]
+PositiveNumber = Annotated[Number, Field(gt=0)]
+
+
+class Section(BaseModel):
+    """A part of a sweep: frozen, and without fields that it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class EnvSpec(Section):
+    """The environment all trials train in."""
+
+    id: str = Field(description="Gymnasium id, such as CartPole-v1.", min_length=1)
+    args: dict[str, Any] = Field(default_factory=dict, description="Keyword arguments of gymnasium.make.")
+    frame_stack: Annotated[WholeNumber, Field(ge=1, le=64)] = Field(
+        1, description="Observe the last so many observations at once."
+    )
+    pixels: Flag = Field(
+        default=False, description="Observe small grey images of what the env renders, not its numbers."
+    )
+    failure_penalty: Annotated[Number, Field(ge=-_LARGEST_REWARD, le=_LARGEST_REWARD)] | None = Field(
+        None,
+        description="Reward of the step in which the env ends by failure, such as the pole's fall. Training sees it, "
+        "evaluation and reported returns never do. null: the env's own reward.",
+    )
+
+    @property
+    def wrapped_args(self) -> dict[str, Any]:
+        """`args` and the wrappers of observations: what everybody who makes this environment needs."""
+        # Not above: the command line reads and prints sweep files without Gymnasium.
+        from policies.envs.wrappers import with_wrappers
+
+        return with_wrappers(self.args, frame_stack=self.frame_stack, pixels=self.pixels)
+
+
+class StopSpec(Section):
+    """When a trial ends: at whichever comes first. The three caps always hold, so nothing runs for ever."""
+
+    training_return: Number | None = Field(
+        None, description="End when the mean return of the last 100 whole training episodes reaches this."
+    )
+    evaluation_return: Number | None = Field(
+        None, description="End when the mean return of the greedy evaluation episodes reaches this."
+    )
+    num_episodes: PositiveWhole | None = Field(
+        None, description="End with the iteration in which this many whole training episodes are done."
+    )
+    num_env_steps: PositiveWhole = Field(200_000, description="End after this many env steps.")
+    num_iterations: PositiveWhole = Field(100_000, description="End after this many iterations.")
+    time_s: PositiveNumber = Field(3600.0, description="End after this many seconds of training.")
+
+
+class SearchSpec(Section):
+    """How the points of the space are chosen."""
+
+    type: Literal["random", "tpe"] = Field(
+        "random",
+        description="random: independent draws, and every combination of grids; tpe: a model of the finished trials "
+        "proposes the next points (Bergstra et al. 2011; install tune-jobs[tpe]).",
+    )
+    num_startup_trials: PositiveWhole = Field(
+        10, description="tpe: points are random until so many have been tried to their end; the model's follow."
+    )
+
+
+class SchedulerSpec(Section):
+    """Whether trials that do worse than others, after as many env steps, are ended early, or take over from them."""
+
+    type: SchedulerType = Field(
+        "none",
+        description="none, asha (successive halving), hyperband, median (worse than the median) or pbt (population "
+        "based training: the worst go on from copies of the best, with mutated hyperparameters).",
+    )
+    grace_env_steps: PositiveWhole | None = Field(
+        None, description="No trial is ended before this many env steps; null: 1/20 of stop.num_env_steps."
+    )
+    reduction_factor: Annotated[Number, Field(gt=1)] = Field(
+        3.0, description="asha, hyperband: one trial in this many goes on at each rung."
+    )
+    perturb_every_env_steps: PositiveWhole | None = Field(
+        None, description="pbt: env steps between two comparisons of a trial; null: 1/10 of stop.num_env_steps."
+    )
+    quantile_fraction: Annotated[Number, Field(gt=0, le=0.5)] = Field(
+        0.25, description="pbt: the worst share of the trials, which copies the best share."
+    )
+    resample_probability: Annotated[Number, Field(ge=0, le=1)] = Field(
+        0.25, description="pbt: how often a mutation draws a new value; else it moves to a neighbouring one."
+    )
+
+
+class EvaluationSpec(Section):
+    """Greedy episodes during training, on seeds that are the same for all trials."""
+
+    every_iterations: PositiveWhole = Field(5, description="Evaluate at each multiple of this, and at the end.")
+    num_episodes: Annotated[WholeNumber, Field(ge=1, le=MAX_EPISODES)] = Field(
+        10, description="Episodes of an evaluation."
+    )
+
+
+class CheckpointSpec(Section):
+    """Which checkpoints are kept. The best and the latest always are."""
+
+    every_iterations: PositiveWhole = Field(10, description="Save at each multiple of this, and at the end.")
+    keep: NonNegativeWhole = Field(2, description="How many of the newest to keep beside best and latest.")
+
+
+class ResourcesSpec(Section):
+    """What one trial may use, and how many run at once."""
+
+    num_cpus: PositiveWhole | None = Field(None, description="CPUs a trial; null: 1 and 1 for each env runner.")
+    num_gpus: Annotated[Number, Field(ge=0)] = Field(0.0, description="GPUs a trial, fractions allowed.")
+    num_env_runners: Annotated[WholeNumber, Field(ge=0, le=SEEDS_PER_TRIAL)] = Field(
+        0, description="Processes that sample for one trial; 0: the trial's own process does."
+    )
+    max_concurrent: PositiveWhole | None = Field(None, description="Trials at once; null: as many as fit.")
+
+
+def _from_text(key: str) -> BeforeValidator:
+    """Let a section be written as one text: `env: CartPole-v1`, `scheduler: asha`."""
+
+    def expand(value: Any) -> Any:
+        return {key: value} if isinstance(value, str) else value
+
+    return BeforeValidator(expand)
+
+
+class SweepFields(Section):
+    """The fields of a sweep, each right by itself."""
+
+    name: str | None = Field(
+        None,
+        pattern=f"^{NAME_PATTERN}$",
+        description="Name of the sweep and of its folder; null: the file's or preset's, with a number if it is taken.",
+    )
+    env: Annotated[EnvSpec, _from_text("id")] = Field(description="Gymnasium id, or a mapping of id and args.")
+    algorithm: Algorithm = Field(description="ppo or dqn; or a baseline that does not learn: random or constant.")
+    rl_module: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$",
+        description="An RLModule class of your own as module:Class, in a module that was allowed.",
+    )
+    hyperparams: dict[str, Any] = Field(default_factory=dict, description="Fixed hyperparameters.")
+    space: dict[str, Domain] = Field(default_factory=dict, description="Searched hyperparameters.")
+    num_samples: PositiveWhole = Field(
+        1, description="Random draws for each combination of the grids' values; with tpe: points."
+    )
+    seeds_per_point: PositiveWhole = Field(1, description="Trials a point, each with its own seed.")
+    seed: Annotated[WholeNumber, Field(ge=0)] = Field(0, description="Sweep seed: fixes points and all other seeds.")
+    stop: StopSpec = Field(default_factory=StopSpec, description="When a trial ends.")
+    search: Annotated[SearchSpec, _from_text("type")] = Field(
+        default_factory=SearchSpec, description="Search method: random or tpe, or a mapping."
+    )
+    scheduler: Annotated[SchedulerSpec, _from_text("type")] = Field(
+        default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
+    )
+    evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
+    checkpoints: CheckpointSpec = Field(default_factory=CheckpointSpec, description="What is kept of a trial.")
+    resources: ResourcesSpec = Field(default_factory=ResourcesSpec, description="CPUs, GPUs, env runners.")
+    engine: Literal["auto", "packed", "rllib"] = Field(
+        "auto",
+        description="packed: many trials at once in each process; rllib: each trial in a process of its own, by RLlib; "
+        "auto: packed where it is possible.",
+    )
+    max_retries: NonNegativeWhole = Field(2, description="How often a failed trial is tried again.")
+    iteration_timeout_s: PositiveNumber = Field(
+        600.0, description="An iteration that takes longer counts as a failure of its trial."
+    )
+
+    @property
+    def grace_env_steps(self) -> int:
+        """Env steps before which the scheduler ends no trial."""
+        if self.scheduler.grace_env_steps is not None:
+            return self.scheduler.grace_env_steps
+        return max(1, self.stop.num_env_steps // 20)
+
+    @property
+    def perturb_every_env_steps(self) -> int:
+        """pbt: env steps between two comparisons of a trial."""
+        return self.scheduler.perturb_every_env_steps or max(1, self.stop.num_env_steps // 10)
+
+    @property
+    def cpus_per_trial(self) -> int:
+        """CPUs one trial takes: its own process and its env runners."""
+        if self.resources.num_cpus is not None:
+            return self.resources.num_cpus
+        return 1 + self.resources.num_env_runners

@@ -1,0 +1,43 @@
+"""How a run's end is written down; also from a thread that ends the process at once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from typing import NoReturn
+
+from analysis.records import FINISHED
+from policies.errors import CannotRunError, TuneJobsError
+from tune_jobs.store.sweep_store import SweepStore
+
+
+def end_process(store: SweepStore, error: CannotRunError) -> NoReturn:
+    """Write down how the run ended, say why, and end this process as it stands; from any thread."""
+    from tune_jobs.process.streams import say_at_last
+
+    with contextlib.suppress(TuneJobsError):
+        close_run(store)
+    say_at_last(f"error: {error}")
+    os._exit(error.exit_code)
+
+
+def close_run(store: SweepStore, started: float | None = None) -> None:
+    """Write down how the run that began then ended; None: it had not begun."""
+    interrupted = False
+    for trial in store.read_trials():
+        if trial.status not in FINISHED:
+            interrupted = True
+            if trial.status == "running":
+                store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "paused"}))
+    record = store.read_record()
+    now = time.time()
+    store.write_record(
+        record.model_copy(
+            update={
+                "state": "interrupted" if interrupted else "completed",
+                "ended_at": now,
+                "run_time_s": record.run_time_s + (0.0 if started is None else now - started),
+            }
+        )
+    )
