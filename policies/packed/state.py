@@ -24,7 +24,7 @@ _WEIGHTS = "weights"
 _STATISTICS = (OBS_MEAN, OBS_VAR, OBS_COUNT)
 _MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"})
 """Of Adam and of RMSprop."""
-_HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
+_HINT = "Use another checkpoint of the trial; training cannot continue from this one."
 
 
 def save_member(member: Member, folder: Path) -> None:

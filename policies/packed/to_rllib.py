@@ -81,7 +81,7 @@ def to_algorithm(
         algorithm.stop()
         raise CheckpointError(
             f"The state of {member.member_id} does not go into RLlib's networks: {error!r}.",
-            "Use another checkpoint of the trial; this one cannot be gone on from.",
+            "Use another checkpoint of the trial; training cannot continue from this one.",
         ) from error
     return algorithm
 

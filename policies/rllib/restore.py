@@ -30,7 +30,7 @@ from policies.rllib.old_names import old_names
 
 Weights = Mapping[str, NDArray[Any]]
 
-_RESTORE_HINT = "Use another checkpoint of the trial; this one cannot be gone on from."
+_RESTORE_HINT = "Use another checkpoint of the trial; training cannot continue from this one."
 
 
 def _module_network(algorithm: Algorithm, class_path: str) -> PolicyNetwork:

@@ -114,7 +114,7 @@ class RecordKeeper:
         self._update(trial_id, status="paused")
 
     def lost(self, trial_id: str) -> None:
-        """A trial's process ended because another one has the trial: it waits to be gone on with."""
+        """A trial's process ended because another one has the trial, which waits to be continued."""
         self.running.discard(trial_id)
         self._update(trial_id, status="paused")
 

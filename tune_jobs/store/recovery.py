@@ -1,4 +1,4 @@
-"""What of a trial's folder can be gone on with; what is damaged is set aside, never deleted, and never silently.
+"""What of a trial's folder training can continue from; what is damaged is set aside, never deleted, and never silently.
 
 Results that can't be read go to `results.damaged`, checkpoints and copies to `damaged/`; only the owner does it.
 """

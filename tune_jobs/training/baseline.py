@@ -114,5 +114,5 @@ def _read_state(path: Path) -> tuple[int, int]:
     except (OSError, *MALFORMED) as error:
         raise CheckpointError(
             f"{path} cannot be read: {error!r}.",
-            "Use another checkpoint of the trial; this one cannot be gone on from.",
+            "Use another checkpoint of the trial; training cannot continue from this one.",
         ) from error
