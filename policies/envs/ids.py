@@ -6,7 +6,7 @@ id such as `module:Env-v0` names, allowed or not.
 
 from __future__ import annotations
 
-import difflib
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -15,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_i
 from policies.envs.modules import import_module_allowed
 from policies.envs.plugins import load_env_plugins
 from policies.errors import EnvError, SpecError
+from policies.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvCreator
@@ -56,7 +57,7 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         found = _find_registered(env_id)
     if found is None:
         reasons = "".join(f" {problem}" for problem in problems)
-        guess = _did_you_mean(env_id, list(gym.registry))
+        guess = _nearest_ids(env_id, gym.registry)
         raise EnvError(
             f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}",
             "Correct the id, or install the package that registers it.",
@@ -89,7 +90,7 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
     ]
     raise EnvError(
         f"The module {module_name!r} neither registers an environment {name!r} with Gymnasium nor has a class of that "
-        f"name that is a gymnasium.Env.{_did_you_mean(name, [*classes, *gym.registry])}",
+        f"name that is a gymnasium.Env.{_nearest_ids(name, [*classes, *gym.registry])}",
         "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
     )
 
@@ -105,8 +106,6 @@ def _find_registered(env_id: str) -> str | None:
     return None if newest is None else get_env_id(namespace, name, newest)
 
 
-def _did_you_mean(env_id: str, known: list[str]) -> str:
-    by_lower_case = {name.lower(): name for name in known}
-    close = difflib.get_close_matches(env_id.lower(), by_lower_case, n=3, cutoff=0.7)
-    names = [repr(by_lower_case[name]) for name in close]
-    return f" Did you mean {' or '.join(names)}?" if names else ""
+def _nearest_ids(env_id: str, known: Iterable[str]) -> str:
+    # Versions of one environment are equally near.
+    return did_you_mean(env_id, known, at_most=3, cutoff=0.7)

@@ -11,7 +11,6 @@ the policy did in training.
 from __future__ import annotations
 
 import copy
-import difflib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint
 from policies.envs.wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError, said_by
+from policies.suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from policies.hyperparams import Algorithm
@@ -257,10 +257,8 @@ def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
                 f"Remove {name!r} from the env's arguments.",
             )
         if name not in known and not takes_any:
-            close = difflib.get_close_matches(str(name), known, n=1)
-            did_you_mean = f" Did you mean {close[0]!r}?" if close else ""
             raise EnvError(
-                f"{env_id} takes no argument {name!r} (value {value!r}).{did_you_mean}",
+                f"{env_id} takes no argument {name!r} (value {value!r}).{did_you_mean(name, sorted(known))}",
                 f"It takes: {', '.join(sorted(known))}.",
             )
     if "max_episode_steps" in env_args:

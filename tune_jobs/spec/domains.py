@@ -10,7 +10,6 @@ In a sweep file a domain is a mapping of one key, its kind: `lr: {loguniform: [1
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import json
 import math
@@ -21,6 +20,8 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+
+from policies.suggestions import did_you_mean
 
 # First element of the spawn keys of points; seeds.py uses 1 and up.
 POINTS_SPAWN_KEY = 0
@@ -305,9 +306,8 @@ def _check_shape(value: Any) -> Any:
         raise ValueError(f"needs exactly one key, the kind of the domain ({kinds}), and has {len(value)}")
     kind = next(iter(value))
     if kind not in _KINDS:
-        close = difflib.get_close_matches(str(kind), DOMAIN_KINDS, n=1)
-        did_you_mean = f" Did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"there is no domain {kind!r} (there are {', '.join(DOMAIN_KINDS)}).{did_you_mean}")
+        suggestion = did_you_mean(kind, DOMAIN_KINDS)
+        raise ValueError(f"there is no domain {kind!r} (there are {', '.join(DOMAIN_KINDS)}).{suggestion}")
     return value
 
 

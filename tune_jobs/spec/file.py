@@ -214,7 +214,7 @@ def _read_text(source: str | Path) -> tuple[str, str]:
             return f"preset {source}", presets[str(source)].text
         if path.is_dir():
             raise SpecError(f"{source} is a folder, not a sweep file", "Name the .yaml file, or a preset.")
-        suggestion = did_you_mean(str(source), presets)
+        suggestion = did_you_mean(source, presets)
         raise SpecError(
             f"There is no sweep file {str(source)!r} and no preset of that name.{suggestion}",
             f"Name a .yaml file, or one of the presets: {', '.join(presets)}.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
 from policies.portable.file import PolicyNetwork, read_policy, save_policy
+from policies.suggestions import did_you_mean
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import choose, leave_out, read_trials
@@ -45,10 +45,8 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepSto
     if store.exists():
         return store
     known = [item.name for item in list_sweep_stores(root)]
-    close = difflib.get_close_matches(str(sweep), known, n=1)
-    guess = f" Did you mean {close[0]!r}?" if close else ""
     raise NotFoundError(
-        f"No sweep {str(sweep)!r} in {root}.{guess}",
+        f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
         "List the sweeps with `tune-jobs list`; name another storage folder with --storage.",
     )
 
