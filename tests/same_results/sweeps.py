@@ -83,7 +83,8 @@ _PIXELS = {
     "lr_decay_steps": 500,
 }
 # Iterations long enough for an interruption to come before the last.
-_LONG = {"hyperparams": {"num_epochs": 60, "minibatch_size": 16}, "stop": {"num_env_steps": 256 * 14}}
+_LONG_PACKED = {"hyperparams": {"num_epochs": 30, "minibatch_size": 16}, "stop": {"num_env_steps": 256 * 14}}
+_LONG_RLLIB = {"hyperparams": {"num_epochs": 15, "minibatch_size": 16}, "stop": {"num_env_steps": 256 * 10}}
 
 _ALL = (
     Sweep(
@@ -116,8 +117,8 @@ _ALL = (
            resources=_ONE_PROCESS),
     _sweep("seeds_per_point", "ppo", engine="packed", env={"id": "Acrobot-v1", "frame_stack": 2}, seeds_per_point=2),
     _sweep("random", "random", num_samples=1, seeds_per_point=2),
-    _sweep("stopped_packed", "ppo", engine="packed", stopped_at=2, resources=_ONE_PROCESS, **_LONG),
-    _sweep("stopped_rllib", "ppo", engine="rllib", stopped_at=2, **_LONG),
+    _sweep("stopped_packed", "ppo", engine="packed", stopped_at=2, resources=_ONE_PROCESS, **_LONG_PACKED),
+    _sweep("stopped_rllib", "ppo", engine="rllib", stopped_at=2, **_LONG_RLLIB),
 )  # fmt: skip
 SWEEPS = {sweep.name: sweep for sweep in _ALL}
 """By name."""
