@@ -10,19 +10,23 @@ from test_interruption import PROGRAM, read, wait_until
 
 pytestmark = pytest.mark.ray
 
-# Two packs of two.
+# Two packs of two. Each iteration has 48 updates: when the first checkpoints are there, the last is seconds away.
 SPEC = """
 env: CartPole-v1
 algorithm: ppo
 engine: packed
-hyperparams: {train_batch_size: 256, minibatch_size: 128, num_epochs: 2}
+hyperparams: {hidden_sizes: [128, 128], train_batch_size: 256, minibatch_size: 32, num_epochs: 6}
 space: {lr: {loguniform: [1e-4, 1e-2]}}
 num_samples: 5
-stop: {num_env_steps: 60_000}
+stop: {num_env_steps: 24_000}
 evaluation: {every_iterations: 3, num_episodes: 2}
 checkpoints: {every_iterations: 3, keep: 1}
 resources: {max_concurrent: 4}
 """
+
+
+def has_checkpoint(folder, index):
+    return any(folder.glob(f"trials/t000{index}/checkpoints/[0-9]*/manifest.json"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
@@ -32,7 +36,7 @@ def test_members_go_on_from_their_checkpoints(tmp_path, number):
     command = [PROGRAM, "launch", "spec.yaml", "--name", "cut", "--no-finish"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        wait_until(lambda: len(list(folder.glob("trials/*/checkpoints/[0-9]*/manifest.json"))) >= 4, process)
+        wait_until(lambda: all(has_checkpoint(folder, index) for index in range(4)), process)
         process.send_signal(number)
         out, err = process.communicate(timeout=600)
     finally:
@@ -41,18 +45,13 @@ def test_members_go_on_from_their_checkpoints(tmp_path, number):
     before = read(folder)
     assert "completed" not in [record["status"] for record in before]
     if number == signal.SIGINT:
-        # On a busy machine one pack may not have begun yet: its members have nothing to save.
-        begun = [record for record in before if record["checkpoints"]]
-        assert begun
-        assert [record["num_iterations"] for record in before if not record["checkpoints"]] == [0] * (5 - len(begun))
-        assert {record["status"] for record in begun} == {"paused"}
-        assert {record["status"] for record in before} <= {"paused", "pending"}
-        assert all(record["checkpoints"][-1]["iteration"] == record["num_iterations"] for record in begun)
+        assert [record["status"] for record in before] == ["paused"] * 4 + ["pending"]
+        assert all(record["checkpoints"][-1]["iteration"] == record["num_iterations"] for record in before[:4])
     latest = [
         max((int(path.name) for path in (folder / f"trials/t000{index}/checkpoints").glob("[0-9]*")), default=0)
         for index in range(4)
     ]
-    assert max(latest) > 0
+    assert min(latest) > 0
     done = subprocess.run(
         [PROGRAM, "resume", str(folder), "--json", "--no-finish"], capture_output=True, text=True, check=False
     )
@@ -65,9 +64,8 @@ def test_members_go_on_from_their_checkpoints(tmp_path, number):
         assert [line["iteration"] for line in lines] == list(range(1, len(lines) + 1))
         steps = [line["num_env_steps"] for line in lines]
         assert steps == sorted(steps)
-        assert steps[-1] >= 60_000 > steps[-2]
+        assert steps[-1] >= 24_000 > steps[-2]
     for index, iteration in enumerate(latest):
-        if iteration:
-            log = (folder / f"trials/t000{index}/log.txt").read_text()
-            # A killed driver's packs train on for a moment.
-            assert int(re.findall(r"built from checkpoint (\d+)", log)[-1]) >= iteration
+        log = (folder / f"trials/t000{index}/log.txt").read_text()
+        # A killed driver's packs train on for a moment.
+        assert int(re.findall(r"built from checkpoint (\d+)", log)[-1]) >= iteration
