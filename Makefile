@@ -39,14 +39,15 @@ $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
-# In two processes, for two cores: the tests that start Ray have one Ray between them, the others need none. What the
-# others print, skipped tests with their reasons too, comes when both are done.
-WITH_RAY := tests/cluster tests/learning tests/ray
+# In three processes on two cores, as many of the tests wait for processes of their own: two halves of those that start Ray,
+# each with a Ray of its own, and the others. What the halves print, skipped tests with their reasons too, comes at the end.
+RAY := tests/ray
 test: $(VENV)/installed-test lint types
-	@$(BIN)/python -m pytest $(addprefix --ignore=,$(WITH_RAY)) > $(VENV)/tests-without-ray.log 2>&1 & others=$$!; \
-	$(BIN)/python -m pytest $(WITH_RAY); with_ray=$$?; \
-	wait $$others; without_ray=$$?; cat $(VENV)/tests-without-ray.log; \
-	exit $$((with_ray || without_ray))
+	@$(BIN)/python -m pytest $(RAY)/test_[a-o]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
+	$(BIN)/python -m pytest $(RAY)/test_[p-z]*.py tests/learning > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
+	$(BIN)/python -m pytest --ignore=$(RAY) --ignore=tests/learning; others=$$?; \
+	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
+	exit $$((first || second || others))
 
 lint: $(VENV)/installed-test
 	$(BIN)/ruff check .
