@@ -10,13 +10,14 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.records import TrialRecord
-from analysis.tables import format_value, point_names
+from analysis.tables import cell_value, point_names
+from analysis.wording import is_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,7 +69,7 @@ def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
     """Searched hyperparameters that can be an axis: numbers of at least two values, lr first."""
     names = []
     for name in point_names(trials):
-        values = {trial.point[name] for trial in trials if _is_number(trial.point.get(name))}
+        values = {trial.point[name] for trial in trials if is_number(trial.point.get(name))}
         if len(values) > 1:
             names.append(name)
     return sorted(names, key=lambda name: name != "lr")
@@ -78,7 +79,7 @@ def group_names(trials: Sequence[TrialRecord], axis: str | None) -> list[str]:
     """Up to two searched hyperparameters to tell trials apart by: of few values, other than the axis."""
     names = []
     for name in point_names(trials):
-        values = {format_value(trial.point.get(name)) for trial in trials}
+        values = {cell_value(trial.point.get(name)) for trial in trials}
         if name != axis and 1 < len(values) <= _MAX_GROUP_VALUES:
             names.append(name)
     return names[:2]
@@ -91,7 +92,7 @@ def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[st
     """
     if not names:
         return {trial.trial_id: Style("", PALETTE[0], MARKERS[0], LINES[0]) for trial in trials}
-    keys = {t.trial_id: tuple(format_value(t.point.get(name)) for name in names) for t in trials}
+    keys = {t.trial_id: tuple(cell_value(t.point.get(name)) for name in names) for t in trials}
     first = list(dict.fromkeys(key[0] for key in keys.values()))
     last = list(dict.fromkeys(key[-1] for key in keys.values()))
     styles = {
@@ -220,7 +221,3 @@ def to_svg(figure: Figure, *, label: str, prefix: str) -> str:
     for color, name in _CSS_NAMES.items():
         svg = svg.replace(f": {color}", f": var(--{name}, {color})")
     return svg.replace("<svg ", f'<svg role="img" aria-label="{html.escape(label)}" ', 1)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

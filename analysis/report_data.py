@@ -15,12 +15,12 @@ from analysis.selection import NoUsableTrialError, error_summary, select_best
 from analysis.statistics import mean_with_ci, paired_difference
 from analysis.tables import (
     SOLVED_OVER_NUM_EPISODES,
-    format_value,
+    cell_value,
     point_names,
     steps_to_solve_frame,
     trials_frame,
 )
-from analysis.wording import NONE, duration, moment, number, seed_range, shown_path
+from analysis.wording import NONE, duration, moment, number, return_text, seed_range, shown_path
 from policies.portable.file import BASELINE_KINDS
 
 _MAX_AVERAGED = 1e150
@@ -96,7 +96,7 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
         "iteration": best.checkpoint.iteration,
         "num_env_steps": best.checkpoint.num_env_steps,
         "seed": best.seed,
-        "point": [(name, number(format_value(value))) for name, value in best.point.items()],
+        "point": [(name, number(cell_value(value))) for name, value in best.point.items()],
         "selection_score": best.selection_score,
         "num_selection_episodes": len(sweep.evaluation_seeds),
         "confirmation": confirmation,
@@ -117,7 +117,7 @@ def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
     except NoUsableTrialError as error:
         return error.message, error.hint
     return (
-        f"{selection.trial.trial_id} leads with {selection.score:.1f}, not confirmed on fresh seeds yet.",
+        f"{selection.trial.trial_id} leads with {return_text(selection.score)}, not confirmed on fresh seeds yet.",
         f"Run: tune-jobs best {shlex.quote(shown_path(folder))}",
     )
 
@@ -152,7 +152,7 @@ def failures(trials: Sequence[TrialRecord]) -> list[dict[str, str]]:
             "trial_id": trial.trial_id,
             "summary": error_summary(trial.error),
             "text": (trial.error or "")[-_MAX_ERROR_CHARS:],
-            "point": ", ".join(f"{name} {number(format_value(value))}" for name, value in trial.point.items()),
+            "point": ", ".join(f"{name} {number(cell_value(value))}" for name, value in trial.point.items()),
             "num_failures": str(trial.num_failures),
         }
         for trial in sorted(trials, key=lambda item: item.index)

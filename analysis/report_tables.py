@@ -14,8 +14,8 @@ import numpy as np
 from analysis.records import BestRecord, IterationRecord, TrialRecord
 from analysis.selection import PointScore, rank_points
 from analysis.statistics import iqm, mean_with_ci, small_sample_note
-from analysis.tables import format_value, groups_frame, point_names, steps_to_solve_frame, trials_frame
-from analysis.wording import NONE, interval_text, is_number, number
+from analysis.tables import cell_value, groups_frame, point_names, steps_to_solve_frame, trials_frame
+from analysis.wording import NONE, interval_text, is_number, number, return_text
 
 MAX_STEPS_ROWS = 20
 """Points that the table of env steps to solve shows; the CSV file beside the report has them all."""
@@ -136,10 +136,10 @@ def _point_row(rank: int, point: PointScore, names: Sequence[str], rng: np.rando
     interval = interval_text(mean_with_ci(scores, rng=rng)) if len(scores) > 1 else NONE
     return [
         Cell(rank, str(rank)),
-        *(_cell(name, format_value(point.point.get(name))) for name in names),
+        *(_cell(name, cell_value(point.point.get(name))) for name in names),
         Cell(len(scores), f"{len(scores)} of {point.num_seeds}"),
-        Cell(point.score, f"{point.score:.1f}"),
-        Cell(iqm(scores), f"{iqm(scores):.1f}"),
+        Cell(point.score, return_text(point.score)),
+        Cell(iqm(scores), return_text(iqm(scores))),
         Cell(interval, interval),
         Cell("; ".join(notes), "; ".join(notes), "wide"),
     ]
@@ -150,4 +150,4 @@ def _cell(name: str, value: Any) -> Cell:
 
     if pd.isna(value):
         return Cell(None, NONE)
-    return Cell(value, f"{value:.1f}" if name in _ONE_DECIMAL else number(value))
+    return Cell(value, return_text(value) if name in _ONE_DECIMAL else number(value))

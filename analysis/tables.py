@@ -39,7 +39,7 @@ _AFTER_POINT = [
 ]
 
 
-def format_value(value: Any) -> Any:
+def cell_value(value: Any) -> Any:
     """A sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text."""
     if isinstance(value, list | tuple):
         return "x".join(str(item) for item in value)
@@ -50,7 +50,7 @@ def describe_changes(trial: TrialRecord) -> str | None:
     """What population based training changed, such as "at 4,096 env steps from t0003: lr 0.01"; None: nothing."""
     texts = [
         f"at {change.num_env_steps:,} env steps from {change.source_trial_id}: "
-        + ", ".join(f"{name} {format_value(value)}" for name, value in change.after.items())
+        + ", ".join(f"{name} {cell_value(value)}" for name, value in change.after.items())
         for change in trial.changes
     ]
     return "; ".join(texts) or None
@@ -108,7 +108,7 @@ def trials_frame(
             {
                 "trial_id": trial.trial_id,
                 "status": trial.status,
-                **{name: format_value(point.get(name)) for name in names},
+                **{name: cell_value(point.get(name)) for name in names},
                 "seed": trial.seed,
                 "score": best.score if best is not None else None,
                 "score_num_env_steps": best.checkpoint.num_env_steps if best is not None else None,
@@ -223,7 +223,7 @@ def steps_to_solve_frame(
         rows.append(
             {
                 "point_index": index,
-                **{name: format_value(members[0].point.get(name)) for name in names},
+                **{name: cell_value(members[0].point.get(name)) for name in names},
                 "num_seeds": len(known),
                 "num_solved": len(solved),
                 "median_num_env_steps": median_steps(known) if known else None,

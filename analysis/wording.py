@@ -13,6 +13,8 @@ from analysis.statistics import Estimate
 
 NONE = "\u2013"
 """What stands for a value that is not known."""
+PLAIN_NONE = "-"
+"""The same in a terminal, which may not have the other one."""
 
 
 def number(value: Any) -> str:
@@ -31,13 +33,19 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
     return f"{count:,} {noun if count == 1 else plural or f'{noun}s'}"
 
 
-def duration(seconds: float) -> str:
-    """Seconds as "42 s", "1 min 10 s" or "2 h 5 min"; a dash if they are not finite."""
+def duration(seconds: float, *, tenths: bool = True, none: str = NONE) -> str:
+    """Seconds as "8.2 s", "42 s", "1 min 10 s" or "2 h 5 min".
+
+    Args:
+        seconds: How long.
+        tenths: Whether less than 10 s has them: a clock that runs, or an estimate, is better without.
+        none: The text if it is not finite.
+    """
     if not math.isfinite(seconds):
-        return NONE
+        return none
     whole = round(seconds)
     if whole < 60:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+        return f"{seconds:.1f} s" if tenths and seconds < 10 else f"{whole} s"
     minutes, rest = divmod(whole, 60)
     if minutes < 60:
         return f"{minutes} min {rest} s"
@@ -65,7 +73,7 @@ def seed_range(seeds: Sequence[int]) -> str:
 
 def interval_text(estimate: Estimate) -> str:
     """An interval as "188.1 to 199.9"."""
-    return f"{estimate.lower:.1f} to {estimate.upper:.1f}"
+    return f"{return_text(estimate.lower)} to {return_text(estimate.upper)}"
 
 
 def is_number(value: Any) -> bool:
@@ -83,34 +91,21 @@ def shown_path(path: Path) -> str:
     return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)
 
 
-def format_value(value: Any) -> str:
-    """A hyperparameter for a table: 64x64 for lists, four digits for floats."""
+def setting_text(value: Any) -> str:
+    """A hyperparameter in a terminal, as a sweep file has it: no thousands apart; 64x64 for lists."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list | tuple):
-        return "x".join(format_value(item) for item in value)
-    return "-" if value is None else str(value)
+        return "x".join(setting_text(item) for item in value)
+    return PLAIN_NONE if value is None else str(value)
 
 
-def format_score(value: float | None) -> str:
-    """A return for a table."""
-    return "-" if value is None else f"{value:.1f}"
+def return_text(value: float | None, *, none: str = NONE) -> str:
+    """A return or a score, with one decimal."""
+    return none if value is None else f"{value:.1f}"
 
 
-def format_duration(seconds: float) -> str:
-    """Seconds as people say them: 42 s, 3 min 20 s, 2 h 5 min."""
-    if not math.isfinite(seconds):
-        return "-"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s"
-    return f"{minutes // 60} h {minutes % 60} min"
-
-
-def format_bytes(number: float) -> str:
+def bytes_text(number: float) -> str:
     """Bytes in powers of 1,000."""
     for unit in ("B", "kB", "MB", "GB"):
         if number < 1000:

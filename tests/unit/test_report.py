@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import math
 import re
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ from synthetic_sweep import make_points, make_sweep
 from analysis.records import CheckpointRecord
 from analysis.report import build_report
 from analysis.report_data import goal_of, shown_path, winner_card
-from analysis.wording import NONE, duration, moment, number, seed_range
+from analysis.wording import NONE, duration, moment, number, return_text, seed_range, setting_text
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7*7 }}"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -336,6 +337,12 @@ def test_numbers_read_well():
         NONE, "0", "50,176", "0.001235", "1e-07", "200", "True", "relu",
     ]  # fmt: skip
     assert [duration(v) for v in (0.0, 42.2, 70.4, 7500)] == ["0.0 s", "42 s", "1 min 10 s", "2 h 5 min"]
+    assert [duration(v, tenths=False) for v in (0.4, 9.7, 59.6)] == ["0 s", "10 s", "1 min 0 s"]
+    assert [duration(v, none="-") for v in (math.nan, math.inf)] == ["-", "-"]
+    assert [return_text(v) for v in (None, 0.0, -78.25)] == [NONE, "0.0", "-78.2"]
+    assert [setting_text(v) for v in (None, 4096, 1e-3, 100000.0, [64, 64], True, "relu")] == [
+        "-", "4096", "0.001", "1e+05", "64x64", "True", "relu",
+    ]  # fmt: skip
     assert moment(0.0) == "1970-01-01 00:00 UTC"
     assert moment(None) == NONE
     assert [seed_range(s) for s in ((), (3,), (3, 4, 5), (3, 5))] == ["none", "3", "3 (3 to 5)", "2 (3, 5)"]

@@ -9,8 +9,8 @@ from synthetic_sweep import make_sweep
 from analysis.records import IterationRecord
 from analysis.selection import score_trial
 from analysis.tables import (
+    cell_value,
     env_steps_to,
-    format_value,
     groups_frame,
     iterations_frame,
     steps_to_solve_frame,
@@ -36,8 +36,8 @@ def iteration(number, *, episodes, training):
     [([64, 64], "64x64"), ((32,), "32"), ("relu", "relu"), (0, 0), (False, False), (None, None), (1e-7, 1e-7)],
 )
 def test_a_value_becomes_a_cell(value, expected):
-    assert format_value(value) == expected
-    assert type(format_value(value)) is type(expected)
+    assert cell_value(value) == expected
+    assert type(cell_value(value)) is type(expected)
 
 
 def test_one_row_a_trial(synthetic):

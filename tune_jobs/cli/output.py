@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from pydantic import BaseModel
 
-from analysis.wording import counted, format_duration, format_score, format_value
+from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -124,7 +124,7 @@ def _local_time(unix_time: float) -> str:
     try:
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_time))
     except (ValueError, OverflowError, OSError):
-        return "-"
+        return PLAIN_NONE
 
 
 def show_status(status: SweepStatus, *, as_json: bool) -> None:
@@ -136,7 +136,7 @@ def show_status(status: SweepStatus, *, as_json: bool) -> None:
         "sweep": status.sweep.name,
         "state": _state(status),
         "trials": f"{status.sweep.num_trials}: {_counts(status)}",
-        "run time": format_duration(status.sweep.run_time_s),
+        "run time": duration(status.sweep.run_time_s, none=PLAIN_NONE),
     }
     print_facts(make_console(), facts)
 
@@ -167,15 +167,15 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
         table.add_row(
             trial.trial_id,
             Text(trial.status, style=_STATUS_STYLES.get(trial.status, "")),
-            *(format_value(trial.point.get(name)) for name in names),
+            *(setting_text(trial.point.get(name)) for name in names),
             f"{trial.num_env_steps:,}",
-            format_duration(trial.time_s),
-            format_score(trial.training_return),
-            format_score(trial.evaluation_return),
-            format_score(trial.best_evaluation_return),
-            Text(_first_line(trial.error) if trial.status == "failed" else (trial.stop_reason or "-")),
+            duration(trial.time_s, none=PLAIN_NONE),
+            return_text(trial.training_return, none=PLAIN_NONE),
+            return_text(trial.evaluation_return, none=PLAIN_NONE),
+            return_text(trial.best_evaluation_return, none=PLAIN_NONE),
+            Text(_first_line(trial.error) if trial.status == "failed" else (trial.stop_reason or PLAIN_NONE)),
             *([trial.engine] if engines_differ else []),
-            *([", ".join(change.source_trial_id for change in trial.changes) or "-"] if copies else []),
+            *([", ".join(change.source_trial_id for change in trial.changes) or PLAIN_NONE] if copies else []),
         )
     console = make_console()
     console.print(table)
@@ -191,11 +191,11 @@ def show_best(best: BestRecord, *, as_json: bool) -> None:
 
 
 def _print_best(console: Console, best: BestRecord) -> None:
-    point = ", ".join(f"{name} {format_value(value)}" for name, value in best.point.items())
+    point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
     where = f"{best.checkpoint.trial_id}, iteration {best.checkpoint.iteration}"
     facts = {
         "best": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
-        "chosen by": f"{best.selection_score:.1f} mean evaluation return",
+        "chosen by": f"{return_text(best.selection_score)} mean evaluation return",
         "confirmed at": f"{_returns(best.confirmation)}; gap {best.optimism_gap:+.1f}",
         "random policy": _returns(best.random),
     }

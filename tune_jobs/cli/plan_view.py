@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from analysis.wording import counted, format_bytes, format_value
+from analysis.wording import bytes_text, counted, setting_text
 from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "search": _search_fact(spec),
         "scheduler": spec.scheduler.type,
         "env steps": f"at most {plan.max_env_steps:,} in all",
-        "disk": f"at most about {format_bytes(plan.max_disk_bytes)}",
+        "disk": f"at most about {bytes_text(plan.max_disk_bytes)}",
         "seeds": f"sweep {spec.seed}; evaluation {span(plan.evaluation_seeds)}; "
         f"confirmation {span(plan.confirmation_seeds)}",
     }
@@ -102,6 +102,6 @@ def _plan_table(plan: SweepPlan) -> Table:
     engines_differ = len(plan.engines) > 1
     table = make_table("trial", "seed", *names, *(["engine"] if engines_differ else []))
     for trial in plan.trials[:_MAX_TRIALS_SHOWN]:
-        values = [format_value(trial.point[name]) if trial.has_point else "by tpe" for name in names]
+        values = [setting_text(trial.point[name]) if trial.has_point else "by tpe" for name in names]
         table.add_row(trial.trial_id, str(trial.seed), *values, *([trial.engine] if engines_differ else []))
     return table

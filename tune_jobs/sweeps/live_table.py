@@ -16,7 +16,7 @@ from rich.text import Text
 
 from analysis.records import FINISHED, TrialRecord
 from analysis.selection import Selection
-from analysis.wording import format_duration, format_score, format_value
+from analysis.wording import PLAIN_NONE, duration, return_text, setting_text
 from tune_jobs.process.streams import quiet
 from tune_jobs.sweeps.monitor import SweepMonitor
 
@@ -33,7 +33,7 @@ def describe_point(record: TrialRecord) -> str:
     """A trial's sampled values in a line."""
     if not record.has_point:
         return "chosen at its start"
-    return ", ".join(f"{name} {format_value(value)}" for name, value in record.point.items()) or "no searched values"
+    return ", ".join(f"{name} {setting_text(value)}" for name, value in record.point.items()) or "no searched values"
 
 
 def render(monitor: SweepMonitor) -> RenderableType:
@@ -67,21 +67,21 @@ def _status_line(counts: dict[str, int]) -> Text:
 
 def _facts(monitor: SweepMonitor) -> RenderableType:
     estimate = monitor.estimate()
-    left = "?" if estimate.time_left_s is None else format_duration(estimate.time_left_s)
+    left = "?" if estimate.time_left_s is None else duration(estimate.time_left_s, tenths=False, none=PLAIN_NONE)
     rate = "?" if estimate.env_steps_per_s is None else f"{estimate.env_steps_per_s:,.0f}"
     grid = Table.grid(padding=(0, 2))
     grid.add_row("best so far", _best_text(monitor.best()))
     grid.add_row("env steps/s", f"{rate}   ({monitor.num_env_steps:,} env steps in all)")
     unfinished = any(record.status not in FINISHED for record in monitor.records.values())
     time_left = f"   left: about {left}" if unfinished and not monitor.stopping else ""
-    grid.add_row("time", f"{format_duration(monitor.elapsed_s)}{time_left}")
+    grid.add_row("time", f"{duration(monitor.elapsed_s, tenths=False)}{time_left}")
     return grid
 
 
 def _best_text(best: Selection | None) -> Text:
     if best is None:
         return Text("no evaluation yet", style="dim")
-    text = Text(f"{format_score(best.point_score)}", style="bold green")
+    text = Text(f"{return_text(best.point_score)}", style="bold green")
     text.append(
         f"  {describe_point(best.trial)}  ({best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps)",
         style="default",
@@ -102,8 +102,8 @@ def _running(monitor: SweepMonitor) -> Table:
             record.trial_id,
             describe_point(record),
             f"{record.num_env_steps:,}",
-            format_score(record.training_return),
-            format_score(record.evaluation_return),
+            return_text(record.training_return, none=PLAIN_NONE),
+            return_text(record.evaluation_return, none=PLAIN_NONE),
             "" if speed is None else f"{speed:,.0f}",
         )
     if len(running) > _MAX_RUNNING_ROWS:
@@ -117,14 +117,14 @@ def summary_line(monitor: SweepMonitor) -> str:
     estimate = monitor.estimate()
     best = monitor.best()
     words = [
-        f"{monitor.name}: {format_duration(monitor.elapsed_s)}",
+        f"{monitor.name}: {duration(monitor.elapsed_s, tenths=False)}",
         counts,
         f"{monitor.num_env_steps:,} env steps",
     ]
     if best is not None:
-        words.append(f"best {format_score(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})")
+        words.append(f"best {return_text(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})")
     if estimate.time_left_s:
-        words.append(f"about {format_duration(estimate.time_left_s)} left")
+        words.append(f"about {duration(estimate.time_left_s, tenths=False, none=PLAIN_NONE)} left")
     return "; ".join(words)
 
 
