@@ -167,9 +167,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        _sync(temporary)
+        sync(temporary)
         temporary.replace(path)
-        _sync_folder(path.parent)
+        sync(path.parent)  # the rename itself is on disk only once the folder is
     except OSError as error:
         raise _cannot_write(path, error) from error
     finally:
@@ -227,17 +227,16 @@ def sha256_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _sync(path: Path) -> None:
-    # "r+b", not "rb": Windows refuses to sync a file that is open for reading only.
-    with path.open("r+b") as file:
-        os.fsync(file.fileno())
+def sync(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on disk.
 
-
-def _sync_folder(folder: Path) -> None:
-    # The rename itself is on disk only once the folder is. Windows, and some network file systems, cannot do
-    # it.
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
+    Raises:
+        OSError: The file cannot be opened or synced; of a folder nothing is told, as Windows and some network file
+            systems cannot do it.
+    """
+    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
+        # Windows refuses to sync a file that is open for reading only; others may refuse to open it for writing.
+        descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:

@@ -7,7 +7,7 @@ import stat
 import pytest
 
 from policies.errors import CannotRunError
-from policies.files import atomic_path, sha256_file, write_atomic
+from policies.files import atomic_path, sha256_file, sync, write_atomic
 
 
 def test_text_and_bytes_are_written_and_replaced(tmp_path):
@@ -65,3 +65,22 @@ def test_the_content_is_on_disk_before_the_name_is(tmp_path, monkeypatch):
     monkeypatch.setattr(type(tmp_path), "replace", lambda *args: (events.append("replace"), replace(*args)))
     write_atomic(tmp_path / "a", "x")
     assert events == ["sync", "replace", "sync"]
+
+
+def test_a_file_that_nobody_may_write_is_synced_and_a_folder_that_cannot_be_is_no_error(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_text("x")
+    path.chmod(0o400)
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
+    sync(path)
+    sync(tmp_path)
+    assert synced == [path.stat().st_ino, tmp_path.stat().st_ino]
+
+    def refuse(descriptor):
+        raise OSError
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    sync(tmp_path)
+    with pytest.raises(OSError):  # noqa: PT011 (any)
+        sync(path)

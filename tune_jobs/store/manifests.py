@@ -7,15 +7,13 @@ score is in `results.jsonl` too, and `tune_jobs.store.candidates` compares them.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from analysis.records import CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
-from policies.files import refuse_others, sha256_file, write_plain
+from policies.files import refuse_others, sha256_file, sync, write_plain
 from tune_jobs.store.places import refuse_link
 from tune_jobs.store.record_files import dump_sealed, parse_record, read_json
 
@@ -32,7 +30,7 @@ def write_manifest(folder: Path, record: CheckpointRecord) -> None:
     }
     write_plain(folder / MANIFEST, dump_sealed(record, files=files))
     for path in [*folder.rglob("*"), folder]:
-        _sync(path)
+        sync(path)
 
 
 def read_manifest(checkpoint: Path) -> CheckpointRecord:
@@ -130,14 +128,3 @@ def _files_in(folder: Path) -> dict[str, Path]:
 
 def _shown(value: Any) -> str:
     return "missing" if value is None else repr(value)[:80]
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on disk."""
-    # Network file systems may not sync folders.
-    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
