@@ -12,10 +12,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
-Activation = Literal["linear", "relu", "tanh", "silu", "elu", "gelu"]
+from policies.activations import Activation
+
 Algorithm = Literal["ppo", "dqn", "random", "constant"]
 Initializer = Literal["torch", "he_uniform", "orthogonal"]
-ACTIVATIONS: tuple[str, ...] = ("linear", "relu", "tanh", "silu", "elu", "gelu")
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]

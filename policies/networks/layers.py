@@ -34,7 +34,7 @@ class Encoder(nn.Module):
     Args:
         observation_space: Shape (n,), or (height, width, channels) with convolutions.
         hidden_sizes: Units of each dense layer.
-        activation: A name of `policies.hyperparams.ACTIVATIONS`.
+        activation: A name of `policies.activations.ACTIVATIONS`.
         conv_filters: (channels, kernel, stride) of each convolution, without padding; None: none.
 
     Attributes:

@@ -13,39 +13,56 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 _aten = torch.ops.aten
 
-_FORWARD: dict[str, Callable[[Tensor], Tensor] | None] = {
-    "linear": None,
-    "relu": torch.relu_,
-    "tanh": torch.tanh_,
-    "silu": torch.nn.functional.silu,
-    "elu": torch.nn.functional.elu,
-    "gelu": torch.nn.functional.gelu,
+Floats = NDArray[np.float32]
+
+
+def _elu_backward(gradient: Tensor, kept: Tensor) -> Tensor:
+    return _aten.elu_backward(gradient, 1.0, 1.0, 1.0, False, kept)  # type: ignore[no-any-return]  # noqa: FBT003
+
+
+def _relu_backward(gradient: Tensor, kept: Tensor) -> Tensor:
+    return _aten.threshold_backward(gradient, kept, 0)  # type: ignore[no-any-return]
+
+
+def _relu_of_few(x: Floats) -> Floats:
+    return np.maximum(x, np.float32(0.0), out=x)
+
+
+def _tanh_of_few(x: Floats) -> Floats:
+    return np.tanh(x, out=x)
+
+
+@dataclass(frozen=True)
+class _Activation:
+    """One activation; `linear` has no functions."""
+
+    forward: Callable[[Tensor], Tensor] | None = None
+    backward: Callable[[Tensor, Tensor], Tensor] | None = None
+    """Gradient of the input, from that of the output and what the forward pass kept."""
+    keeps_input: bool = False
+    """Its derivative needs the input; else it follows from the output, which is computed in place."""
+    of_few: Callable[[Floats], Floats] | None = None
+    """The forward pass of few rows in NumPy; None: in torch."""
+
+
+_ACTIVATIONS = {
+    "linear": _Activation(),
+    "relu": _Activation(torch.relu_, _relu_backward, of_few=_relu_of_few),
+    "tanh": _Activation(torch.tanh_, _aten.tanh_backward, of_few=_tanh_of_few),
+    "silu": _Activation(functional.silu, _aten.silu_backward, keeps_input=True),
+    "elu": _Activation(functional.elu, _elu_backward, keeps_input=True),
+    "gelu": _Activation(functional.gelu, _aten.gelu_backward, keeps_input=True),
 }
-_KEEPS_INPUT = frozenset({"silu", "elu", "gelu"})
-"""Activations whose derivative needs the input; the others' follows from the output, which is computed in place."""
-
-
-def _input_gradient(activation: str, gradient: Tensor, kept: Tensor) -> Tensor:
-    """Gradient of an activation's input, from that of its output and what the forward pass kept."""
-    if activation == "relu":
-        return _aten.threshold_backward(gradient, kept, 0)  # type: ignore[no-any-return]
-    if activation == "tanh":
-        return _aten.tanh_backward(gradient, kept)  # type: ignore[no-any-return]
-    if activation == "silu":
-        return _aten.silu_backward(gradient, kept)  # type: ignore[no-any-return]
-    if activation == "elu":
-        return _aten.elu_backward(gradient, 1.0, 1.0, 1.0, False, kept)  # type: ignore[no-any-return]  # noqa: FBT003
-    if activation == "gelu":
-        return _aten.gelu_backward(gradient, kept)  # type: ignore[no-any-return]
-    return gradient
 
 
 class StackedNetworks:
@@ -54,7 +71,7 @@ class StackedNetworks:
     Args:
         num_networks: K.
         sizes: Inputs, units of each hidden layer, outputs.
-        activation: A name of `policies.hyperparams.ACTIVATIONS`.
+        activation: A name of `policies.activations.ACTIVATIONS`.
         device: Where the weights lie.
 
     Attributes:
@@ -70,7 +87,9 @@ class StackedNetworks:
         self.gradients = torch.zeros_like(self.weights)
         self.layers = self._views(self.weights)
         self._gradient_layers = self._views(self.gradients)
-        self._function = _FORWARD[activation]
+        self._function = _ACTIVATIONS[activation].forward
+        self._input_gradient = _ACTIVATIONS[activation].backward
+        self._keeps_input = _ACTIVATIONS[activation].keeps_input
         self._kept: list[tuple[Tensor, Tensor]] = []
 
     def _views(self, flat: Tensor) -> list[Tensor]:
@@ -98,7 +117,7 @@ class StackedNetworks:
 
     def _activate(self, inputs: Tensor, x: Tensor) -> Tensor:
         out = x if self._function is None else self._function(x)
-        self._kept.append((inputs, x if self.activation in _KEEPS_INPUT else out))
+        self._kept.append((inputs, x if self._keeps_input else out))
         return out
 
     def evaluate(self, x: Tensor, start: int, stop: int) -> Tensor:
@@ -116,7 +135,8 @@ class StackedNetworks:
         for number in range(len(self.layers) - 2, -1, -1):
             gradient = torch.bmm(gradient, self.layers[number + 1][:, :-1].transpose(1, 2))
             x, kept = self._kept[number]
-            gradient = _input_gradient(self.activation, gradient, kept)
+            if self._input_gradient is not None:
+                gradient = self._input_gradient(gradient, kept)
             if number == 0:
                 torch.bmm(x.transpose(1, 2), gradient, out=self._gradient_layers[0])
             else:
@@ -129,7 +149,7 @@ class StackedNetworks:
         torch.sum(gradient, dim=1, out=views[:, -1])
 
 
-def with_ones(x: NDArray[np.float32]) -> NDArray[np.float32]:
+def with_ones(x: Floats) -> Floats:
     """Rows with a last column of ones: what `StackedNetworks.forward` takes."""
     out = np.empty((*x.shape[:-1], x.shape[-1] + 1), dtype=np.float32)
     out[..., :-1] = x
@@ -147,7 +167,7 @@ class ActingNetworks:
 
     def __init__(self, networks: StackedNetworks, num_acting: int) -> None:
         self._networks, self._num_acting = networks, num_acting
-        self._activation = networks.activation
+        self._activation = _ACTIVATIONS[networks.activation]
         self.refresh()
 
     def refresh(self) -> None:
@@ -157,25 +177,19 @@ class ActingNetworks:
             values = layer[: self._num_acting].detach().cpu().numpy()
             self._layers.append((values[:, :-1], values[:, -1:]))
 
-    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, x: Floats) -> Floats:
         """Outputs, shape (num_acting, B, A), of inputs of shape (num_acting, B, D)."""
         for matrix, bias in self._layers[:-1]:
             x = np.matmul(x, matrix)
             x += bias
-            x = _activate(self._activation, x)
+            x = self._activate(x)
         matrix, bias = self._layers[-1]
-        out: NDArray[np.float32] = np.matmul(x, matrix)
+        out: Floats = np.matmul(x, matrix)
         out += bias
         return out
 
-
-def _activate(activation: str, x: NDArray[np.float32]) -> NDArray[np.float32]:
-    if activation == "tanh":
-        return np.tanh(x, out=x)
-    if activation == "relu":
-        return np.maximum(x, np.float32(0.0), out=x)
-    if activation == "linear":
-        return x
-    function = _FORWARD[activation]
-    assert function is not None
-    return function(torch.from_numpy(x)).numpy()
+    def _activate(self, x: Floats) -> Floats:
+        if self._activation.of_few is not None:
+            return self._activation.of_few(x)
+        function = self._activation.forward
+        return x if function is None else function(torch.from_numpy(x)).numpy()

@@ -24,8 +24,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.activations import ACTIVATIONS
 from policies.errors import SpecError
-from policies.hyperparams import ACTIVATIONS
 from policies.portable.convolution import output_shape
 
 NetworkKind = Literal["categorical", "gaussian", "q_values", "random", "constant", "module"]
@@ -45,7 +45,7 @@ class Layer:
     bias: NDArray[np.float32]
     """Shape (num_outputs,)."""
     activation: str = "linear"
-    """A name of `policies.hyperparams.ACTIVATIONS`."""
+    """A name of `policies.activations.ACTIVATIONS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class ConvLayer:
     stride: int
     """Pixels between two places of the kernel."""
     activation: str = "linear"
-    """A name of `policies.hyperparams.ACTIVATIONS`."""
+    """A name of `policies.activations.ACTIVATIONS`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ import pytest
 from packed_dqn import ROUNDING, add, compare, differences, make_stack, q_values_of
 from rounding import assert_network
 
-from policies.hyperparams import ACTIVATIONS, DQNHyperparams
+from policies.activations import ACTIVATIONS
+from policies.hyperparams import DQNHyperparams
 
 CASES = {}
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from packed_rllib import ROUNDING, ROWS, compare, differences, make_stack, sample
 
-from policies.hyperparams import ACTIVATIONS, PPOHyperparams
+from policies.activations import ACTIVATIONS
+from policies.hyperparams import PPOHyperparams
 
 CASES = {}
 FIRST_LAYER = "encoder.actor_encoder.mlp.0.weight"

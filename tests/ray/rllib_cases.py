@@ -7,9 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from policies.hyperparams import (
-    ACTIVATIONS,
-)
+from policies.activations import ACTIVATIONS
 
 MODULE = "default_policy"
 # Small, so that a case takes a tenth of a second; a case changes what it is about.

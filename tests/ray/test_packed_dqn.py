@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from packed_dqn import PHASES, ROUNDING, compare, differences
 
-from policies.hyperparams import ACTIVATIONS
+from policies.activations import ACTIVATIONS
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from packed_rllib import MODULE, ROUNDING, compare, differences, episodes_of, learner_of, make_stack, sample
 
-from policies.hyperparams import ACTIVATIONS
+from policies.activations import ACTIVATIONS
 from policies.packed.ppo import stack as ppo_stack
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]

@@ -12,8 +12,9 @@ from trials import make_task, run_trial
 
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
+from policies.activations import ACTIVATIONS
 from policies.errors import CheckpointError, NotFoundError
-from policies.hyperparams import ACTIVATIONS, make_hyperparams
+from policies.hyperparams import make_hyperparams
 from policies.portable.file import Layer, PolicyNetwork, read_policy, save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]

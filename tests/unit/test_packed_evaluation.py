@@ -10,10 +10,10 @@ from policy_factory import balancing_policy, make_policy, make_portable, registe
 import policies.packed.evaluation
 from policies.acting.evaluate import Evaluator
 from policies.acting.policy import NetworkPolicy, RandomPolicy
+from policies.activations import ACTIVATIONS
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError, NonFiniteWeightsError
-from policies.hyperparams import ACTIVATIONS
 from policies.packed.evaluation import evaluate_many
 from policies.portable.file import Layer, Normalization
 from policies.portable.forward import ForwardPass, ForwardPasses

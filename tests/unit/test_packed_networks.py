@@ -8,7 +8,7 @@ import torch
 from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 from rounding import assert_rounded, close
 
-from policies.hyperparams import ACTIVATIONS
+from policies.activations import ACTIVATIONS
 from policies.packed.member import MAX_GROUP, group_members, network_layouts, size_class
 from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm

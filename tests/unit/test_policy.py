@@ -12,8 +12,8 @@ from rounding import assert_rounded, dense
 
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
+from policies.activations import ACTIVATIONS
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
-from policies.hyperparams import ACTIVATIONS
 from policies.portable.file import save_policy
 
 register_test_envs()

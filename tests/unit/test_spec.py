@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from spec_errors import MINIMAL, errors, write
 
+from policies.activations import ACTIVATIONS
 from policies.errors import SpecError
-from policies.hyperparams import ACTIVATIONS
 from tune_jobs.spec.domains import Grid, Uniform
 from tune_jobs.spec.file import find_preset, list_presets, load_spec, read_preset
 from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name

@@ -1,0 +1,56 @@
+"""Every activation is known wherever networks are computed, and is the same function there."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from policies.activations import ACTIVATIONS
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from policies.networks import layers, parts
+from policies.packed import networks
+from policies.portable import forward
+
+TABLES = {
+    "torch's modules": layers._ACTIVATIONS,
+    "RLlib's names": parts.RLLIB_ACTIVATIONS,
+    "portable policies": forward._ACTIVATION_FUNCTIONS,
+    "packs": networks._ACTIVATIONS,
+}
+VALUES = [-20.0, -3.0, -0.5, -1e-6, 0.0, 1e-6, 0.7, 4.0, 30.0]
+
+
+@pytest.mark.parametrize("where", TABLES)
+def test_every_floor_knows_every_activation_and_no_other(where):
+    assert tuple(TABLES[where]) == ACTIVATIONS
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_a_sweep_file_may_name_each(algorithm):
+    for name in ACTIVATIONS:
+        assert HYPERPARAMS_BY_ALGORITHM[algorithm](activation=name).activation == name
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_all_compute_the_same_function(name):
+    x = np.array([VALUES], dtype=np.float32)
+    expected = x if name == "linear" else getattr(functional, name)(torch.from_numpy(x)).numpy()
+    module = layers._ACTIVATIONS[name]
+    assert module is None or np.array_equal(module()(torch.from_numpy(x)).numpy(), expected)
+    portable = forward._ACTIVATION_FUNCTIONS[name]
+    assert portable is None or np.allclose(portable(x.copy()), expected, rtol=1e-6, atol=1e-6)
+    packed = networks._ACTIVATIONS[name]
+    assert packed.forward is None or np.array_equal(packed.forward(torch.from_numpy(x.copy())).numpy(), expected)
+    assert packed.of_few is None or np.allclose(packed.of_few(x.copy()), expected, rtol=1e-6, atol=1e-6)
+    assert expected[0, VALUES.index(0.0)] == 0.0  # padding stays zero
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_the_gradients_of_packs_are_those_of_torch(name):
+    x = torch.tensor([VALUES], requires_grad=True)
+    packed = networks._ACTIVATIONS[name]
+    out = x if name == "linear" else getattr(functional, name)(x)
+    out.sum().backward()
+    kept = (x if packed.keeps_input else out).detach()
+    found = torch.ones_like(kept) if packed.backward is None else packed.backward(torch.ones_like(kept), kept)
+    assert torch.equal(found, x.grad)
