@@ -203,12 +203,14 @@ def check_initializer():
 
 @arrives("conv_filters")
 def check_conv_filters():
-    from tune_jobs.plan.engine_choice import why_not_packed
+    from tune_jobs.plan.engine_choice import why_not
+    from tune_jobs.spec.engines import engine_named
     from tune_jobs.spec.sweep_spec import SweepSpec
 
     spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "dqn"})
-    assert why_not_packed(spec, DQNHyperparams()) is None
-    assert "conv_filters" in why_not_packed(spec, DQNHyperparams(conv_filters=((16, 4, 2),)))
+    packed = engine_named("packed")
+    assert why_not(packed, spec, DQNHyperparams()) is None
+    assert "conv_filters" in why_not(packed, spec, DQNHyperparams(conv_filters=((16, 4, 2),)))
 
 
 @arrives("normalize_observations")

@@ -86,12 +86,14 @@ def check_initializer():
 @arrives
 def check_conv_filters():
     """Packs have none: the plan leaves such trials to RLlib."""
-    from tune_jobs.plan.engine_choice import why_not_packed
+    from tune_jobs.plan.engine_choice import why_not
+    from tune_jobs.spec.engines import engine_named
     from tune_jobs.spec.sweep_spec import SweepSpec
 
     spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "ppo"})
-    assert why_not_packed(spec, PPOHyperparams()) is None
-    assert "no convolutions" in why_not_packed(spec, PPOHyperparams(conv_filters=((4, 8, 4),)))
+    packed = engine_named("packed")
+    assert why_not(packed, spec, PPOHyperparams()) is None
+    assert "no convolutions" in why_not(packed, spec, PPOHyperparams(conv_filters=((4, 8, 4),)))
 
 
 @arrives

@@ -1,4 +1,4 @@
-"""Checkpoints of engine rllib whose pickles name modules as they were called before they moved into packages."""
+"""Checkpoints of before: pickles that name modules as they were called then, and manifests that name no engine."""
 
 import pickle
 import shutil
@@ -11,6 +11,7 @@ from policies.rllib.old_names import _MOVED, old_names
 from tune_jobs import restore
 
 SAMPLES = Path(__file__).parent / "samples" / "rllib_of_format_2"
+OLD_PACK = Path(__file__).parents[1] / "unit" / "samples" / "packed_of_format_2"
 
 
 @pytest.mark.ray
@@ -19,6 +20,18 @@ def test_a_sweep_of_before_is_restored_and_trains_on(ray_session, tmp_path, algo
     shutil.copytree(SAMPLES / algorithm, tmp_path / algorithm)
     # Raises unless its weights are those of the policy file beside it.
     algo = restore(tmp_path / algorithm / "t0000")
+    try:
+        before = algo.iteration
+        algo.train()
+        assert (before, algo.iteration) == (2, 3)
+    finally:
+        algo.stop()
+
+
+@pytest.mark.ray
+def test_a_pack_of_before_manifests_named_engines_is_restored_and_trains_on(ray_session, tmp_path):
+    shutil.copytree(OLD_PACK, tmp_path / "pack")
+    algo = restore(tmp_path / "pack" / "t0000")
     try:
         before = algo.iteration
         algo.train()

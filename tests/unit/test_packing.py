@@ -9,14 +9,16 @@ from spec_errors import MINIMAL, errors
 from policies.errors import EnvError, SpecError
 from policies.guard import guarded
 from policies.hyperparams import make_hyperparams
-from tune_jobs.plan.engine_choice import pack_key, why_not_packed
+from tune_jobs.plan.engine_choice import pack_key, why_not
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.drive import pending_record, write_new
 from tune_jobs.sweeps.resume import check_same_trials
 
+PACKED = engine_named("packed")
 IMAGES = {"env": {"id": "CartPole-v1", "pixels": True}, "hyperparams": {"conv_filters": [[4, 8, 4]]}}
 
 
@@ -76,11 +78,11 @@ def test_trials_with_convolutions_are_not_packed(monkeypatch):
     fields = {"space": {"conv_filters": {"grid": [None, [[4, 8, 4]]]}}, "num_samples": 3}
     space = load_spec({**MINIMAL, **fields})
     values = make_hyperparams("ppo", {"conv_filters": [[4, 8, 4]]})
-    assert why_not_packed(space, values) == "conv_filters is [[4, 8, 4]], and packs have no convolutions"
-    assert why_not_packed(space, make_hyperparams("ppo", {})) is None
+    assert why_not(PACKED, space, values) == "conv_filters is [[4, 8, 4]], and packs have no convolutions"
+    assert why_not(PACKED, space, make_hyperparams("ppo", {})) is None
     # Of a point that is not known, any of the space.
-    assert why_not_packed(space, None) == why_not_packed(space, values)
-    assert why_not_packed(load_spec({**MINIMAL, **TPE}), None) is None
+    assert why_not(PACKED, space, None) == why_not(PACKED, space, values)
+    assert why_not(PACKED, load_spec({**MINIMAL, **TPE}), None) is None
 
 
 def test_engines_are_chosen_trial_by_trial(monkeypatch):

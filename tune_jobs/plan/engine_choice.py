@@ -1,4 +1,4 @@
-"""Which engine trains a trial: many of them packed into one process, RLlib, or a baseline's own.
+"""Which engine of the table (`tune_jobs.spec.engines`) trains a trial.
 
 Words: a *pack* is one process of the packed engine; its trials are its *members*. Members whose *key* is the same are
 *stacked*: their weights lie in one array each, and one operation computes all of them.
@@ -6,9 +6,9 @@ Words: a *pack* is one process of the packed engine; its trials are its *members
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
@@ -18,14 +18,13 @@ from policies.hyperparams import (
     RandomHyperparams,
 )
 from tune_jobs.spec.domains import Domain
-from tune_jobs.spec.rules import is_baseline, why_none_is_packed
+from tune_jobs.spec.engines import Engine, engine_on_record, engines_for
+from tune_jobs.spec.rules import why_none
 
 if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
     from policies.packed.envs.vector import EnvKind
     from tune_jobs.spec.sweep_spec import SweepSpec
-
-Engine = Literal["packed", "rllib", "baseline"]
 
 _SHARED = ("num_envs", "normalize_observations")
 _SHARED_BY_PPO = ("vf_share_layers", "use_kl_loss", "train_batch_size", "minibatch_size", "num_epochs")
@@ -71,10 +70,10 @@ class PackPlan:
 class EngineChoice:
     """The engine of each trial."""
 
-    engines: tuple[Engine, ...]
-    """By the trial's index."""
+    engines: tuple[str, ...]
+    """Their names, by the trial's index."""
     notes: tuple[str, ...] = ()
-    """Which trials are not packed, and why."""
+    """Which trials are not trained by the engine that would come first, and why."""
 
 
 def pack_key(hyperparams: Hyperparams) -> tuple[Any, ...]:
@@ -88,25 +87,33 @@ def pack_key(hyperparams: Hyperparams) -> tuple[Any, ...]:
     return ("ppo", *shared)
 
 
-def why_not_packed(spec: SweepSpec, hyperparams: Hyperparams | None = None, env: EnvInfo | None = None) -> str | None:
-    """Why a trial cannot be trained in a pack, or None if it can.
+def why_not(
+    engine: Engine, spec: SweepSpec, hyperparams: Hyperparams | None = None, env: EnvInfo | None = None
+) -> str | None:
+    """Why an engine cannot train a trial, or None if it can, as long as its environment's seeds are not looked at.
 
     Args:
+        engine: The engine.
         spec: The sweep.
         hyperparams: Of the trial; None: its point is not known, and may be any of the space.
         env: The sweep's environment; None: it is not looked at.
     """
-    if (reason := why_none_is_packed(spec)) is not None:
+    if (reason := why_none(engine, spec)) is not None:
         return reason
+    reasons = (engine.why_not("convolutions", setting) for setting in _convolutions(spec, hyperparams, env))
+    return next((reason for reason in reasons if reason is not None), None)
+
+
+def _convolutions(spec: SweepSpec, hyperparams: Hyperparams | None, env: EnvInfo | None) -> Iterator[str]:
+    """What of a trial needs convolutions."""
     if hyperparams is not None:
         filters = None if isinstance(hyperparams, RandomHyperparams) else hyperparams.conv_filters
     else:
         filters = next((found for found in _possible_filters(spec) if found is not None), None)
     if filters is not None:
-        return f"conv_filters is {[list(one) for one in filters]}, and packs have no convolutions"
+        yield f"conv_filters is {[list(one) for one in filters]}"
     if env is not None and env.observes_images:
-        return f"{env.env_id} has images as observations, and packs have no convolutions"
-    return None
+        yield f"{env.env_id} has images as observations"
 
 
 def _possible_filters(spec: SweepSpec) -> list[Any]:
@@ -123,7 +130,7 @@ def choose_engines(
     recorded: Mapping[str, str],
     place: Callable[[int], str],
 ) -> EngineChoice:
-    """Choose the engine of each trial.
+    """Choose the engine of each trial: the first of the table that can train it, or the one that is wished for.
 
     Args:
         spec: The sweep; its `engine` is a wish.
@@ -133,36 +140,56 @@ def choose_engines(
         place: What messages call the trial of an index.
 
     Raises:
-        SpecError: The wish is that all are packed, and one cannot be.
+        SpecError: The wish is one engine, and it cannot train one of them.
+        CheckpointError: A trial's record names an engine that there is none of.
     """
-    engines: list[Engine] = []
-    if is_baseline(spec):
-        engines = ["baseline"] * len(trials)
-        return EngineChoice(tuple(engines))
-    why_not_seeded: str | None = None
-    is_checked = False
-    refused: dict[str, list[str]] = {}
+    able = engines_for(spec.algorithm)
+    wished = tuple(engine for engine in able if engine.name == spec.engine)
+    seeding = _Seeding(spec)
+    engines: list[str] = []
+    refused: dict[tuple[str, str, str], list[str]] = {}
     for index, (trial_id, hyperparams) in enumerate(trials):
-        if trial_id in recorded or spec.engine == "rllib":
-            engines.append("packed" if recorded.get(trial_id) == "packed" else "rllib")
+        if trial_id in recorded:
+            engines.append(engine_on_record(recorded[trial_id], spec.algorithm).name)
             continue
-        reason = why_not_packed(spec, hyperparams, env)
-        if reason is None:
-            if not is_checked:
-                why_not_seeded, is_checked = _why_not_seeded(spec), True
-            reason = why_not_seeded
-        if reason is not None:
-            if spec.engine == "packed":
-                raise SpecError(
-                    f"engine is packed, but {place(index)} cannot be: {reason}.",
-                    "Set engine to rllib, which can train it, or to auto, which packs what can be packed.",
-                )
-            refused.setdefault(reason, []).append(trial_id)
-        engines.append("packed" if reason is None else "rllib")
-    return EngineChoice(tuple(engines), tuple(_note(reason, ids, len(trials)) for reason, ids in refused.items()))
+        reasons: list[tuple[Engine, str]] = []
+        for engine in wished or able:
+            reason = why_not(engine, spec, hyperparams, env) or seeding.why_not(engine)
+            if reason is None:
+                engines.append(engine.name)
+                for other, why in reasons:
+                    refused.setdefault((other.trained, engine.title, why), []).append(trial_id)
+                break
+            reasons.append((engine, reason))
+        else:
+            first, reason = reasons[0]
+            raise SpecError(
+                f"engine is {spec.engine}, but {place(index)} cannot be: {reason}.",
+                f"Set engine to {able[-1].name}, which can train it, or to auto, which takes {first.name} where it is "
+                "possible.",
+            )
+    notes = (_note(trained, title, why, ids, len(trials)) for (trained, title, why), ids in refused.items())
+    return EngineChoice(tuple(engines), tuple(notes))
 
 
-def _why_not_seeded(spec: SweepSpec) -> str | None:
+class _Seeding:
+    """Whether the environment's episodes depend on their seeds alone; looked at once, and only if somebody asks."""
+
+    def __init__(self, spec: SweepSpec) -> None:
+        self._spec = spec
+        self._is_checked = False
+        self._fault: str | None = None
+
+    def why_not(self, engine: Engine) -> str | None:
+        """Why an engine cannot train in this environment, or None if it can."""
+        if "unseeded" not in engine.lacks:
+            return None
+        if not self._is_checked:
+            self._fault, self._is_checked = _seed_fault(self._spec), True
+        return None if self._fault is None else engine.why_not("unseeded", self._fault)
+
+
+def _seed_fault(spec: SweepSpec) -> str | None:
     """Why the environment's episodes do not depend on their seeds alone, or None if they do."""
     from policies.guard.guarded import check_seedable
 
@@ -175,9 +202,9 @@ def _why_not_seeded(spec: SweepSpec) -> str | None:
     return None
 
 
-def _note(reason: str, trial_ids: Sequence[str], num_trials: int) -> str:
+def _note(trained: str, title: str, reason: str, trial_ids: Sequence[str], num_trials: int) -> str:
     if len(trial_ids) == num_trials:
-        return f"No trial is packed, RLlib trains them all: {reason}."
+        return f"No trial is {trained}, {title} trains them all: {reason}."
     told = ", ".join(trial_ids) if len(trial_ids) <= _MOST_NAMED else f"{len(trial_ids):,} trials"
     is_ = "is" if len(trial_ids) == 1 else "are"
-    return f"{told} {is_} not packed, RLlib trains {'it' if is_ == 'is' else 'them'}: {reason}."
+    return f"{told} {is_} not {trained}, {title} trains {'it' if is_ == 'is' else 'them'}: {reason}."

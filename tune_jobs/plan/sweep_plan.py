@@ -21,7 +21,7 @@ from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
-from tune_jobs.plan.engine_choice import Engine, PackPlan, choose_engines, pack_key
+from tune_jobs.plan.engine_choice import PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
 from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
 from tune_jobs.plan.idle_notes import idle_notes
@@ -31,6 +31,7 @@ from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.tpe import check_installed
 from tune_jobs.spec.domains import num_points
+from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.rules import idle_settings
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -61,7 +62,13 @@ class TrialPlan:
     """All values, validated, as JSON."""
     has_point: bool = True
     """False: the search method chooses the point when the trial starts; point and hyperparams are empty until then."""
-    engine: Engine = "rllib"
+    engine: str = "rllib"
+    """Its name."""
+
+    @property
+    def is_packed(self) -> bool:
+        """Whether a pack trains it, together with others."""
+        return engine_named(self.engine).trains_many
 
 
 @dataclass(frozen=True)
@@ -152,7 +159,7 @@ def make_plan(
         spec,
         env,
         [values for _, values in points],
-        [trial.engine == "packed" for trial in first_trials],
+        [trial.is_packed for trial in first_trials],
         may_refuse=not records,
     )
     sizes = _sizes(spec, known)
@@ -163,7 +170,7 @@ def make_plan(
     members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
-        all_are_packed = all(trial.engine == "packed" for trial in trials)
+        all_are_packed = all(trial.is_packed for trial in trials)
         concurrent = packs.max_concurrent if all_are_packed else max(packs.max_concurrent, concurrent)
     return SweepPlan(
         trials=trials,
@@ -235,7 +242,7 @@ def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequ
     # Points that are chosen later have as many sub-environments as the others, or it is not known how many.
     fewest_known = min((values.num_envs for _, values in points if values is not None), default=1)
     for trial in to_run:
-        if trial.engine == "packed":
+        if trial.is_packed:
             values = points[trial.point_index][1]
             key = None if values is None else pack_key(values)
             fewest = fewest_known if values is None else values.num_envs

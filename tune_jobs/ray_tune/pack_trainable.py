@@ -30,28 +30,15 @@ from tune_jobs.store.ownership import Owner
 from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.training.pack_loop import PackLoop
 from tune_jobs.training.protocol import PackEngine
+from tune_jobs.training.registry import make_pack_engine
 
 if TYPE_CHECKING:
     from policies.acting.evaluate import Episodes
     from policies.acting.policy import Policy
-    from policies.packed.envs.vector import EnvKind
-
-
-def make_pack_engine(env_kind: EnvKind, num_env_processes: int) -> PackEngine:
-    """The engine that trains packs.
-
-    Args:
-        env_kind: How its environments step; see `PackPlan`.
-        num_env_processes: Processes that step them.
-    """
-    # Imported in the pack's process only: the driver imports this module too, and needs no torch.
-    from tune_jobs.training.packed import PackedEngine
-
-    return PackedEngine(env_kind=env_kind, num_env_processes=num_env_processes)
 
 
 class PackTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs a pack; `config` holds `sweep_folder`, `pack_id`, `env_kind` and `num_env_processes`."""
+    """Runs a pack; `config` holds `sweep_folder`, `pack_id`, `engine`, `env_kind` and `num_env_processes`."""
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error comes from there."""
@@ -88,7 +75,10 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
 
     def make_engine(self) -> PackEngine:
         """The engine of this pack."""
-        return make_pack_engine(self._config["env_kind"], self._config["num_env_processes"])
+        config = self._config
+        return make_pack_engine(
+            config["engine"], env_kind=config["env_kind"], num_env_processes=config["num_env_processes"]
+        )
 
     def evaluate(self, evaluator: Evaluator, policies: Sequence[Policy]) -> Sequence[Episodes | Exception]:
         """Greedy episodes of each policy, or why there are none."""

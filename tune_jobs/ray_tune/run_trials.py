@@ -142,6 +142,8 @@ class _Run:
             param_space={
                 **self._config,
                 "pack_id": tune.grid_search(list(driver.pack_ids)),
+                # Packs of a sweep are all of one engine: its members' records name it.
+                "engine": self.keeper.record(trial_ids[0]).engine,
                 "env_kind": plan.env_kind,
                 "num_env_processes": plan.num_env_processes,
             },

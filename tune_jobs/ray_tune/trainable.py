@@ -21,7 +21,6 @@ from typing import IO, Any
 import ray
 from ray import tune
 
-from policies.acting.baselines import BASELINES
 from policies.acting.evaluate import Evaluator
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules
@@ -30,6 +29,7 @@ from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
 from tune_jobs.ray_tune.early_stopping import METRIC, WORST_SCORE, grace_env_steps
+from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.logs import begin_log
 from tune_jobs.store.ownership import OWNER_FILE, Owner
@@ -37,6 +37,7 @@ from tune_jobs.store.progress import Progress
 from tune_jobs.store.recovery import latest_damaged
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.protocol import TrainingEngine, TrialTask
+from tune_jobs.training.registry import make_engine
 from tune_jobs.training.trial_loop import TrialLoop
 
 # Reporting every iteration of a fast env costs more than the iteration.
@@ -93,6 +94,7 @@ class TaskReader:
 
         Raises:
             NotFoundError: There is no such trial.
+            CheckpointError: Its record is damaged, or names an engine that there is none of.
         """
         spec, trial = self.spec, self.store.trial(trial_id).read_record()
         return TrialTask(
@@ -113,6 +115,7 @@ class TaskReader:
             failure_penalty=spec.env.failure_penalty,
             rl_module=spec.rl_module,
             changes=trial.changes,
+            engine=engine_on_record(trial.engine, spec.algorithm).name,
         )
 
 
@@ -150,18 +153,6 @@ def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
     }
 
 
-def make_engine(algorithm: str) -> TrainingEngine:
-    """The engine that trains an algorithm, or plays a baseline."""
-    if algorithm in BASELINES:
-        from tune_jobs.training.baseline import BaselineEngine
-
-        return BaselineEngine()
-    # Imported in the trial's process only: the driver imports this module too, and needs neither torch nor RLlib.
-    from tune_jobs.training.rllib import RLlibEngine
-
-    return RLlibEngine()
-
-
 def owner_of_run(config: Mapping[str, Any]) -> Owner | None:
     """The run that a process was started for; None: it was started for none."""
     return Owner(Path(config["sweep_folder"]) / OWNER_FILE, config["run"]) if config.get("run") else None
@@ -190,6 +181,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         note_signals()
         self._log = TrialLog()
         self._engine: TrainingEngine | None = None
+        self._engine_name = ""
         self._loop: TrialLoop | None = None
         self._evaluators: dict[str, Evaluator] = {}
         self._node = this_node()
@@ -244,13 +236,18 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             with watchdog(task.iteration_timeout_s, self._file):
                 self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
         self._grace = grace_env_steps(reader.spec.scheduler, reader.spec.stop.num_env_steps)
-        if self._engine is None:
-            # All trials of a sweep are of one algorithm, so this process never needs another engine.
-            self._engine = make_engine(task.algorithm)
-        loop = TrialLoop(task, self._engine, self._evaluators[key], under=self._run)
+        loop = TrialLoop(task, self._engine_of(task), self._evaluators[key], under=self._run)
         with watchdog(task.iteration_timeout_s, self._file):
             loop.open()
         return loop
+
+    def _engine_of(self, task: TrialTask) -> TrainingEngine:
+        """The engine of a trial, warm if the trial before it had the same."""
+        if self._engine is None or self._engine_name != task.engine:
+            if self._engine is not None:
+                self._engine.close()
+            self._engine, self._engine_name = make_engine(task.engine), task.engine
+        return self._engine
 
     def _watched(self, loop: TrialLoop) -> Progress:
         with watchdog(loop.task.iteration_timeout_s + REPORT_INTERVAL_S, self._file):

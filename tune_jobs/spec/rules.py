@@ -1,4 +1,4 @@
-"""Settings of a sweep that don't go with each other, and why none of its trials can be packed."""
+"""Settings of a sweep that don't go with each other, and why an engine can train none of its trials."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from policies.hyperparams import (
     RandomHyperparams,
 )
 from tune_jobs.spec.domains import Grid, num_points
+from tune_jobs.spec.engines import Engine, Need
 
 if TYPE_CHECKING:
     from tune_jobs.spec.sections import SweepFields
@@ -143,21 +144,26 @@ def _population_problems(spec: SweepFields) -> Found:
     return found
 
 
-def why_none_is_packed(spec: SweepFields) -> str | None:
-    """Why no trial of a sweep can be trained in a pack, as far as its file tells, or None."""
-    reasons = {
-        f"algorithm is {spec.algorithm}, which does not learn": is_baseline(spec),
-        f"rl_module is {spec.rl_module}, and packs have no networks but their own": spec.rl_module is not None,
-        "env.pixels is true, and packs have no convolutions": spec.env.pixels,
-        f"resources.num_env_runners is {spec.resources.num_env_runners}, and packs have no env runners": (
-            spec.resources.num_env_runners > 0
-        ),
-        "scheduler.type is pbt, whose trials go on from copies of each other": spec.scheduler.type == "pbt",
-        "scheduler.type is hyperband, which pauses trials until others have come as far": (
-            spec.scheduler.type == "hyperband"
-        ),
+def needs_of(spec: SweepFields) -> dict[Need, str]:
+    """What a sweep needs of its engine, as far as its file tells, each with the setting that needs it."""
+    runners = spec.resources.num_env_runners
+    found: dict[Need, tuple[bool, str]] = {
+        "rl_module": (spec.rl_module is not None, f"rl_module is {spec.rl_module}"),
+        "convolutions": (spec.env.pixels, "env.pixels is true"),
+        "env_runners": (runners > 0, f"resources.num_env_runners is {runners}"),
+        "copies": (spec.scheduler.type == "pbt", "scheduler.type is pbt"),
+        "pauses": (spec.scheduler.type == "hyperband", "scheduler.type is hyperband"),
     }
-    return next((reason for reason, applies in reasons.items() if applies), None)
+    return {need: setting for need, (is_needed, setting) in found.items() if is_needed}
+
+
+def why_none(engine: Engine, spec: SweepFields) -> str | None:
+    """Why an engine can train no trial of a sweep, as far as its file tells, or None."""
+    if spec.algorithm not in engine.algorithms:
+        which = ", which does not learn" if is_baseline(spec) else ""
+        return f"algorithm is {spec.algorithm}{which}"
+    reasons = (engine.why_not(need, setting) for need, setting in needs_of(spec).items())
+    return next((reason for reason in reasons if reason is not None), None)
 
 
 def is_baseline(spec: SweepFields) -> bool:

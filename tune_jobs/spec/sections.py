@@ -5,7 +5,7 @@ What has to be true of several fields together stands in `tune_jobs.spec.rules`.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -16,6 +16,7 @@ from pydantic import (
 
 from policies.hyperparams import Algorithm
 from tune_jobs.spec.domains import Domain, Number, WholeNumber
+from tune_jobs.spec.engines import ENGINES
 from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
 SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
@@ -155,6 +156,17 @@ def _from_text(key: str) -> BeforeValidator:
     return BeforeValidator(expand)
 
 
+_ASKED_FOR = [engine for engine in ENGINES if engine.can_be_asked_for]
+_ENGINE_WISHES = (
+    f"{'; '.join(f'{engine.name}: {engine.about}' for engine in _ASKED_FOR)}; "
+    f"auto: {_ASKED_FOR[0].name} where it is possible."
+)
+if TYPE_CHECKING:
+    EngineWish = str
+else:
+    EngineWish = Literal["auto", *(engine.name for engine in _ASKED_FOR)]
+
+
 class SweepFields(Section):
     """The fields of a sweep, each right by itself."""
 
@@ -187,11 +199,7 @@ class SweepFields(Section):
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
     checkpoints: CheckpointSpec = Field(default_factory=CheckpointSpec, description="What is kept of a trial.")
     resources: ResourcesSpec = Field(default_factory=ResourcesSpec, description="CPUs, GPUs, env runners.")
-    engine: Literal["auto", "packed", "rllib"] = Field(
-        "auto",
-        description="packed: many trials at once in each process; rllib: each trial in a process of its own, by RLlib; "
-        "auto: packed where it is possible.",
-    )
+    engine: EngineWish = Field("auto", description=_ENGINE_WISHES)
     max_retries: NonNegativeWhole = Field(2, description="How often a failed trial is tried again.")
     iteration_timeout_s: PositiveNumber = Field(
         600.0, description="An iteration that takes longer counts as a failure of its trial."

@@ -20,10 +20,11 @@ from pydantic import (
 
 from analysis.wording import counted
 from policies.errors import SpecError
+from tune_jobs.spec.engines import find_engine
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.messages import problems_of
 from tune_jobs.spec.problems import Problem, WrongSpecError
-from tune_jobs.spec.rules import search_problems, why_none_is_packed
+from tune_jobs.spec.rules import search_problems, why_none
 from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
 
 
@@ -80,7 +81,8 @@ def _section_problems(spec: SweepFields) -> list[Problem]:
     if resources.num_gpus > 1 and not resources.num_gpus.is_integer():
         text = f"{resources.num_gpus:g} is not allowed: use a fraction of one GPU, or a whole number of GPUs"
         problems.append(Problem("resources.num_gpus", text))
-    if spec.engine == "packed" and (reason := why_none_is_packed(spec)) is not None:
-        text = f"packed cannot train any of the trials: {reason}. Set auto, which takes what can"
+    wished = find_engine(spec.engine)
+    if wished is not None and (reason := why_none(wished, spec)) is not None and not wished.gives_way:
+        text = f"{wished.name} cannot train any of the trials: {reason}. Set auto, which takes what can"
         problems.append(Problem("engine", text))
     return problems

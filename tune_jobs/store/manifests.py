@@ -23,12 +23,19 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 _HINT = "Use another checkpoint of the trial, or restore the file from a backup."
 
 
-def write_manifest(folder: Path, record: CheckpointRecord) -> None:
-    """Write the manifest of a checkpoint folder that is filled and not seen yet, and wait until all is on disk."""
+def write_manifest(folder: Path, record: CheckpointRecord, engine: str = "") -> None:
+    """Write the manifest of a checkpoint folder that is filled and not seen yet, and wait until all is on disk.
+
+    Args:
+        folder: The folder.
+        record: What it scored.
+        engine: Name of the engine that wrote it; empty: it is not known, and the manifest does not say.
+    """
     files = {
         name: {"bytes": path.stat().st_size, "sha256": sha256_file(path)} for name, path in _files_in(folder).items()
     }
-    write_plain(folder / MANIFEST, dump_sealed(record, files=files))
+    named = {"engine": engine} if engine else {}
+    write_plain(folder / MANIFEST, dump_sealed(record, **named, files=files))
     for path in [*folder.rglob("*"), folder]:
         sync(path)
 
@@ -41,6 +48,17 @@ def read_manifest(checkpoint: Path) -> CheckpointRecord:
         CheckpointError: The manifest is damaged, or was changed after it was written.
     """
     return _read(checkpoint)[0]
+
+
+def read_engine_name(checkpoint: Path) -> str | None:
+    """The engine that a checkpoint's manifest names; None: it is from before manifests named any.
+
+    Raises:
+        NotFoundError: The folder or its manifest is missing.
+        CheckpointError: The manifest is damaged, or was changed after it was written.
+    """
+    engine: str | None = _read(checkpoint)[1].get("engine")
+    return engine
 
 
 def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
@@ -82,6 +100,8 @@ def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
             "Use another checkpoint of the trial, or delete this folder.",
         )
     data = read_json(path, "checkpoint manifest", is_sealed=True)
+    if not isinstance(engine := data.get("engine"), str | None):
+        raise CheckpointError(f"{path}: engine is {_shown(engine)}, not a name.", _HINT)
     return parse_record(data, path, CheckpointRecord, "checkpoint manifest"), data
 
 

@@ -156,12 +156,13 @@ class TrialStore(OwnedFolder):
             )
         return record
 
-    def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None]) -> None:
+    def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
         """Write a checkpoint folder whole: to a hidden name, hashed, synced, then renamed.
 
         Args:
             record: Its scores and iteration.
             write: Fills the folder it is given.
+            engine: Name of the engine that can go on from it; empty: the manifest names none.
 
         Raises:
             CheckpointError: Its place is a symbolic link.
@@ -172,7 +173,7 @@ class TrialStore(OwnedFolder):
             make_folder(temporary)
         try:
             write(temporary)
-            write_manifest(temporary, record)
+            write_manifest(temporary, record, engine)
             with self.owned():
                 # There is one if the trial went on from an earlier checkpoint and writes this iteration anew.
                 remove_folder(target)

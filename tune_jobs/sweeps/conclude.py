@@ -18,14 +18,16 @@ from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError,
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
-from policies.portable.file import PolicyNetwork, read_policy, save_policy
+from policies.portable.file import read_policy, save_policy
 from policies.suggestions import did_you_mean
+from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import choose, leave_out, read_trials
 from tune_jobs.store.places import refuse_links_in
 from tune_jobs.store.sweep_store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
 from tune_jobs.sweeps.storage import expanded, storage_folder
+from tune_jobs.training.registry import engine_of_checkpoint
 
 # The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
 FRESH_SEED = 2**31
@@ -279,21 +281,22 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
     return folder
 
 
-def find_trained_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, PolicyNetwork]:
-    """A verified checkpoint that can be trained on, and the network that was saved in it.
+def find_trained_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, Engine]:
+    """A verified checkpoint that can be trained on, and the engine that wrote it.
 
     Raises:
         NotFoundError: There is no such checkpoint.
-        CheckpointError: It is damaged, or a baseline's, which RLlib has no part in.
+        CheckpointError: It is damaged, or of an engine that RLlib has no part in, as a baseline's.
     """
     folder = find_checkpoint(source, storage)
-    saved = read_policy(folder)
-    if saved.algorithm in BASELINES:
+    saved, engine = read_policy(folder), engine_of_checkpoint(folder)
+    if engine.restore is None:
+        what = f"baseline {saved.algorithm}" if saved.algorithm in BASELINES else f"engine {engine.name}"
         raise CheckpointError(
-            f"{folder} is of the baseline {saved.algorithm}, which is no RLlib algorithm: there is nothing to restore.",
+            f"{folder} is of the {what}, which is no RLlib algorithm: there is nothing to restore.",
             "Load its policy with load_policy, or restore a trial of ppo or dqn.",
         )
-    return folder, saved.network
+    return folder, engine
 
 
 @guarding()

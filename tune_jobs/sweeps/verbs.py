@@ -350,10 +350,8 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
         CheckpointError: It is damaged, of a baseline, or does not restore to the very weights that were saved.
     """
     from tune_jobs.sweeps.conclude import find_trained_checkpoint
+    from tune_jobs.training.registry import restore_checkpoint
 
-    folder, network = find_trained_checkpoint(source, storage)
-    from policies.packed.to_rllib import algorithm_from_checkpoint
-    from policies.rllib import restore
-
-    is_packed = (folder / "packed").is_dir()
-    return algorithm_from_checkpoint(folder) if is_packed else restore.restore_algorithm(folder / "rllib", network)
+    folder, engine = find_trained_checkpoint(source, storage)
+    algorithm: Algorithm = restore_checkpoint(folder, engine)
+    return algorithm

@@ -45,6 +45,8 @@ class TrialTask:
     """Env steps the trial has done when it is built; the checkpoint it is built from may count another trial's."""
     num_iterations: int = 0
     """The same for iterations."""
+    engine: str = ""
+    """Name of the engine that trains it, which its checkpoints' manifests name; empty: they name none."""
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,11 @@ _LEARNER_STATS = {
 }
 
 
+def algorithm_from_checkpoint(checkpoint: Path) -> RLlibAlgorithm:
+    """A checkpoint of this engine as an RLlib Algorithm that trains on from it; see `restore_algorithm`."""
+    return restore_algorithm(checkpoint / RLLIB_FOLDER, read_policy(checkpoint).network)
+
+
 class RLlibEngine:
     """See `TrainingEngine`."""
 

@@ -331,7 +331,7 @@ class TrialLoop:
             self._engine.save(folder)
             save_policy(self._engine.policy(), folder, write=write_plain)
 
-        self._store.write_checkpoint(record, write)
+        self._store.write_checkpoint(record, write, self.task.engine)
         self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]
         self._best = _best_of(self._checkpoints)
         if self.task.changes:

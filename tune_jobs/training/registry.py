@@ -1,0 +1,75 @@
+"""Engines by their names: made, told from a checkpoint, and asked to restore one.
+
+The table is `tune_jobs.spec.engines`. What it names is imported here and not before it is used: the driver of a sweep
+needs neither ray's RLlib nor torch, and a pack's process needs no ray.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from policies.errors import CheckpointError
+from tune_jobs.spec.engines import ENGINES, Engine, engine_named
+from tune_jobs.store.manifests import read_engine_name
+from tune_jobs.training.protocol import PackEngine, TrainingEngine
+
+if TYPE_CHECKING:
+    from policies.packed.envs.vector import EnvKind
+
+
+def make_engine(name: str) -> TrainingEngine:
+    """An engine that trains one trial at a time."""
+    return cast("TrainingEngine", _loaded(engine_named(name).constructor)())
+
+
+def make_pack_engine(name: str, *, env_kind: EnvKind, num_env_processes: int) -> PackEngine:
+    """An engine that trains packs.
+
+    Args:
+        name: Its name.
+        env_kind: How its environments step; see `PackPlan`.
+        num_env_processes: Processes that step them.
+    """
+    made = _loaded(engine_named(name).constructor)(env_kind=env_kind, num_env_processes=num_env_processes)
+    return cast("PackEngine", made)
+
+
+def engine_of_checkpoint(checkpoint: Path) -> Engine:
+    """The engine that wrote a checkpoint: its manifest names it, or, in one of before, what the folder holds.
+
+    Raises:
+        NotFoundError: The folder is missing.
+        CheckpointError: The manifest is damaged, or this tune-jobs does not have the engine.
+    """
+    name = read_engine_name(checkpoint)
+    if name is not None:
+        return engine_named(name, f"The manifest of checkpoint {checkpoint}")
+    for engine in ENGINES:
+        if engine.old_state is not None and (checkpoint / engine.old_state).exists():
+            return engine
+    raise CheckpointError(
+        f"Checkpoint {checkpoint} holds the state of no engine that this tune-jobs has.",
+        "Use another checkpoint of the trial.",
+    )
+
+
+def restore_checkpoint(checkpoint: Path, engine: Engine) -> Any:
+    """A checkpoint as an RLlib `Algorithm` that trains on from it.
+
+    Args:
+        checkpoint: Its folder; callers check the manifest's hashes first.
+        engine: Its engine, which must be one that restores.
+
+    Raises:
+        CheckpointError: It does not restore to the very weights that were saved.
+    """
+    assert engine.restore is not None
+    return _loaded(engine.restore)(checkpoint)
+
+
+def _loaded(path: str) -> Any:
+    """What `module:name` names."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
