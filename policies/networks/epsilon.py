@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from policies.hyperparams import DQNHyperparams
+from policies.schedules import linear
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,10 @@ class EpsilonSchedule:
 
     def at(self, num_units: float) -> float:
         """Epsilon after so many env steps or episodes."""
-        share = max(0.0, num_units - self.start) / self.decay
+        decayed = max(0.0, num_units - self.start)
         if self.kind == "linear":
-            return self.initial + (self.final - self.initial) * min(1.0, share)
+            return linear(self.initial, self.final, self.decay, decayed)
+        share = decayed / self.decay
         if self.kind == "exponential":
             return self.final + (self.initial - self.final) * math.exp(-share)
         return max(self.final, self.initial * math.exp(-share))

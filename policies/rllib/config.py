@@ -74,7 +74,7 @@ def build_algorithm_config(
 
 
 def _schedule(value: float, final: float | None, num_env_steps: int | None) -> float | list[list[float]]:
-    """RLlib's form of a value that moves linearly to another one over so many env steps, or stays if there is none."""
+    """RLlib's form of `policies.schedules.linear`."""
     if final is None or num_env_steps is None:
         return value
     return [[0, value], [num_env_steps, final]]

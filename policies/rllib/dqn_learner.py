@@ -19,6 +19,7 @@ from torch import Tensor
 
 from policies.hyperparams import DQNHyperparams
 from policies.replay import ReplayBuffer, Transitions
+from policies.schedules import linear
 
 DISCOUNTS, WEIGHTS = "discounts", "weights"
 QF_PREDS, QF_NEXT_PREDS, QF_TARGET_NEXT_PREDS = "qf_preds", "qf_next_preds", "qf_target_next_preds"
@@ -72,10 +73,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
     def lr_at(self, num_env_steps: float) -> float:
         """The learning rate after so many env steps."""
         hyperparams = self.hyperparams
-        if hyperparams.lr_final is None or hyperparams.lr_decay_steps is None:
-            return hyperparams.lr
-        share = min(1.0, num_env_steps / hyperparams.lr_decay_steps)
-        return hyperparams.lr + (hyperparams.lr_final - hyperparams.lr) * share
+        return linear(hyperparams.lr, hyperparams.lr_final, hyperparams.lr_decay_steps, num_env_steps)
 
     def update_from_replay(
         self, replay: ReplayBuffer, num_updates: int, *, num_env_steps: int, num_new_steps: int, num_episodes: int

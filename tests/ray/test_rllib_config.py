@@ -7,6 +7,7 @@ field, another fails for a field without one.
 
 import dqn_cases  # noqa: F401 (its cases register themselves)
 import network_cases  # noqa: F401
+import numpy as np
 import ppo_cases  # noqa: F401
 import pytest
 from rllib_cases import (
@@ -25,6 +26,7 @@ from policies.hyperparams import (
     PPOHyperparams,
     make_hyperparams,
 )
+from policies.schedules import linear
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -102,3 +104,20 @@ def test_updates_per_env_step_are_the_same_with_env_runners(build):
     steps = env_steps(algo.train())
     assert steps >= 96
     assert abs(len(sizes) - 0.5 * steps) <= 8
+
+
+def test_rllib_moves_schedules_by_the_same_formula():
+    from ray.rllib.utils.schedules.scheduler import Scheduler
+
+    from policies.rllib.config import _schedule
+
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        start, final, num_steps = float(rng.random()), float(rng.random()), int(rng.integers(1, 10**6))
+        theirs = Scheduler(fixed_value_or_schedule=_schedule(start, final, num_steps), framework="torch")
+        for now in (0, num_steps // 2, num_steps - 1, int(rng.integers(0, num_steps))):
+            assert theirs.update(timestep=now) == linear(start, final, num_steps, now)
+        for now in (num_steps, num_steps + 1):
+            assert theirs.update(timestep=now) == pytest.approx(
+                linear(start, final, num_steps, now), rel=1e-15, abs=1e-16
+            )

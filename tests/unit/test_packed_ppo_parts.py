@@ -14,7 +14,6 @@ from policies.networks.layers import ObservationStatistics
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR
 from policies.packed.ppo import loss as ppo
 from policies.packed.ppo.gae import advantages_and_targets, standardise
-from policies.packed.ppo.group import scheduled
 from policies.packed.sampling import EpisodeTracker, Observations, one_hot
 
 M, B = 4, 200
@@ -111,13 +110,6 @@ def test_ratios_begin_at_one():
     parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
     close(parts.policy_loss, -batch.advantages.mean(dim=1))
     close(parts.kl, torch.zeros(M))
-
-
-def test_schedules():
-    assert scheduled(0.3, None, None, 50) == 0.3
-    assert scheduled(0.3, 0.1, 100, 50) == pytest.approx(0.2)
-    assert scheduled(0.3, 0.0, 100, 0) == 0.3
-    assert scheduled(0.3, 0.0, 100, 500) == 0.0
 
 
 # -- advantages

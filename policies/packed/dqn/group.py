@@ -20,9 +20,9 @@ from policies.packed.dqn.replay import Drawn, StackedReplay
 from policies.packed.member import TARGET_PREFIX, Member
 from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, StackedOptimizer, StackedRMSprop, clip_by_global_norm
-from policies.packed.ppo.group import scheduled
 from policies.packed.rows import StackedRows
 from policies.packed.sampling import Observations
+from policies.schedules import linear
 
 Floats = NDArray[np.float32]
 
@@ -121,7 +121,7 @@ class DQNGroup:
 
     def _lr(self, member: Member) -> float:
         item = member.hyperparams
-        return scheduled(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
+        return linear(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
 
     def _update(self, drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
         first, num_inputs = self._hyperparams[0], self._num_inputs

@@ -21,6 +21,7 @@ from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, clip_by_global_norm
 from policies.packed.ppo import loss as ppo
 from policies.packed.rows import StackedRows
+from policies.schedules import linear
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8  # RLlib leaves torch's defaults
 
@@ -41,13 +42,6 @@ class Batch:
     """Standardised, (M, R)."""
     value_targets: Floats
     """(M, R)."""
-
-
-def scheduled(start: float, final: float | None, num_steps: int | None, now: int) -> float:
-    """A value that moves linearly from start to final over so many env steps."""
-    if final is None or num_steps is None:
-        return start
-    return start + (final - start) * min(1.0, now / num_steps)
 
 
 class PPOGroup:
@@ -208,8 +202,8 @@ class PPOGroup:
         lr, entropy = [], []
         for member, item in zip(self.members, self._hyperparams, strict=True):
             now = member.num_env_steps
-            lr.append([scheduled(item.lr, item.lr_final, item.lr_decay_steps, now)])
-            entropy.append([scheduled(item.entropy_coeff, item.entropy_coeff_final, item.entropy_decay_steps, now)])
+            lr.append([linear(item.lr, item.lr_final, item.lr_decay_steps, now)])
+            entropy.append([linear(item.entropy_coeff, item.entropy_coeff_final, item.entropy_decay_steps, now)])
         column = torch.tensor(lr, device=self._device, dtype=torch.float32)
         self._optimizer.lr = column.repeat(self._rows.networks_per_member, 1)
         self._coefficients.entropy_coeff = torch.tensor(entropy, device=self._device, dtype=torch.float32)
