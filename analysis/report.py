@@ -1,7 +1,7 @@
 """The report of a sweep: one HTML file that needs nothing else; figures and tables also as files beside it.
 
-    report/index.html   figures as inline SVG, videos as base64: it can be mailed as it is
-    report/trials.csv, iterations.csv, steps_to_solve.csv, figures/*.png
+    index.html   figures as inline SVG, videos as base64: it can be mailed as it is
+    trials.csv, iterations.csv, steps_to_solve.csv, figures/*.png
 
 Everything in the page is escaped (error texts and env ids come from elsewhere), and the page's own content
 security policy keeps it from running or loading anything but its one script.
@@ -82,6 +82,7 @@ class _Picture:
 def build_report(
     folder: Path,
     *,
+    target: Path,
     sweep: SweepRecord,
     trials: Sequence[TrialRecord],
     results: Mapping[str, Sequence[IterationRecord]],
@@ -89,10 +90,11 @@ def build_report(
     videos: Mapping[str, Path],
     why_no_best: tuple[str, str] | None = None,
 ) -> Path:
-    """Write the report of a sweep into its folder.
+    """Write the report of a sweep.
 
     Args:
-        folder: The sweep folder; the report goes to `report/` in it.
+        folder: The sweep folder, as the report names it.
+        target: The folder that the report goes to.
         sweep: What was asked for, and where it ran.
         trials: All trials, in any status.
         results: Iterations by trial id, oldest first; a trial may have none.
@@ -106,7 +108,6 @@ def build_report(
     Raises:
         CannotRunError: A file cannot be written.
     """
-    target = folder / "report"
     goal = report_data.goal_of(sweep, best)
     write_csv(target / "trials.csv", trials_frame(trials, results, threshold=goal))
     write_csv(target / "iterations.csv", iterations_frame(results))

@@ -115,6 +115,11 @@ def save_policy(
     return folder / f"{stem}.json"
 
 
+def is_policy_folder(folder: Path) -> bool:
+    """Whether a folder holds a policy, by the name of its file; what is in it is not looked at."""
+    return (folder / "policy.json").is_file()
+
+
 def read_policy(path: Path) -> PortablePolicy:
     """Read a portable policy; nothing in the files is executed.
 

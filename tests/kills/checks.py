@@ -8,7 +8,8 @@ import re
 from pathlib import Path
 
 from policies.errors import TuneJobsError
-from tune_jobs.store.sweep_store import SweepStore, verify_checkpoint
+from tune_jobs.store.manifests import verify_checkpoint
+from tune_jobs.store.sweep_store import SweepStore
 
 # All that may lie in a sweep's folder; of a checkpoint what its manifest names.
 _ALLOWED = [

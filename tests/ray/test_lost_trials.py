@@ -12,7 +12,7 @@ from policies.errors import CheckpointError
 from tune_jobs.ray_tune.processes import RayWatch
 from tune_jobs.ray_tune.run_trials import RunJob, _TrialEvents, run_trials
 from tune_jobs.ray_tune.trainable import TrialTrainable, watchdog
-from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.record_keeper import RecordKeeper
 
 pytestmark = pytest.mark.ray
@@ -47,8 +47,8 @@ def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path, eve
 
 def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path):
     store = make_sweep(tmp_path / "mine", 1)
-    run = Owner.take(store.folder / OWNER_FILE)
-    Owner.take(store.folder / OWNER_FILE)
+    run = store.take()
+    store.take()
     store.tune_folder.mkdir()
 
     def everything():

@@ -18,8 +18,9 @@ from policies.acting.load import load_policy
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.portable.file import read_policy
 from tune_jobs.spec.seeds import trial_seeds
+from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.record_keeper import RecordKeeper
-from tune_jobs.store.sweep_store import SweepStore, verify_checkpoint
+from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]

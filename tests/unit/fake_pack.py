@@ -4,7 +4,7 @@ import dataclasses
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
-from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.pack_loop import PackLoop
 
 

@@ -12,7 +12,7 @@ from analysis.selection import rank_points
 from analysis.tables import trials_frame
 from policies.errors import CheckpointError
 from tune_jobs.store.copies import copied_folder, copy_latest_checkpoint, remove_uncounted_copies
-from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.trial_loop import TrialLoop
 
 

@@ -14,7 +14,7 @@ from policies.errors import CheckpointError
 from tune_jobs.store import record_files
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.recovery import latest_damaged
-from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.store.trial_store import TrialStore
 
 
 def flip_a_bit(path):

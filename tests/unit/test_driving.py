@@ -13,7 +13,7 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import load_spec
-from tune_jobs.store import sweep_store as store_module
+from tune_jobs.store import sweep_store, trial_store
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import drive as driving
@@ -59,7 +59,7 @@ def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with
     store, tmp_path, monkeypatch
 ):
     """What a kill leaves is what is there before each write."""
-    write, left = store_module.write_atomic, []
+    write, left = sweep_store.write_atomic, []
 
     def watched(path, data):
         left.append(shutil.copytree(store.folder, tmp_path / f"killed-{len(left)}" / "mine"))
@@ -67,7 +67,8 @@ def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with
 
     monkeypatch.setattr(resuming, "run_sweep", lambda store, *_, **__: [t.trial_id for t in store.read_trials()])
     with monkeypatch.context() as patch:
-        patch.setattr(store_module, "write_atomic", watched)
+        for module in (sweep_store, trial_store):
+            patch.setattr(module, "write_atomic", watched)
         all_ids = sweeps.extend(store.folder, 2, progress="none")
     assert all_ids == ["t0000", "t0001", "t0002", "t0003"]
     assert len(left) >= 3
@@ -181,10 +182,10 @@ def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(tmp_path
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("where", ["Owner.take", "SweepMonitor", "connected"])
+@pytest.mark.parametrize("where", ["SweepStore.take", "SweepMonitor", "connected"])
 def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp_path, monkeypatch, number, where):
     """Before the trials are prepared, too: "nothing was kept" would be wrong."""
-    original = getattr(driving.Owner, "take", None) if where == "Owner.take" else getattr(driving, where)
+    original = driving.SweepStore.take if where == "SweepStore.take" else getattr(driving, where)
 
     def interrupt(*args, **kwargs):
         if current()._ask is not None:

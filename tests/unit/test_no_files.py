@@ -24,7 +24,6 @@ from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.ownership import Owner
 from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.record_keeper import RecordKeeper
-from tune_jobs.store.recovery import write_log
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import resume as resuming
 from tune_jobs.sweeps import verbs as sweeps
@@ -118,7 +117,7 @@ USES = {
     "trials/t0001/results.jsonl": (sweeps.trials, sweeps.dataframe, lambda folder: candidates(trial(folder)), go_on),
     "trials/t0001/results.damaged": (lambda folder: trial(folder).results_path.write_bytes(b"half"), go_on),
     "trials/t0001/log.txt": (lambda folder: trial(folder).log_tail(),
-                             lambda folder: write_log(trial(folder).log_path, "it began")),
+                             lambda folder: trial(folder).write_log("it began")),
     "trials/t0001/.tally": (keep, go_on, lambda folder: read_tally(trial(folder).tally_path)),
     "trials/t0001/.owner": (go_on,),
     "trials/t0000/tensorboard": (scalars,),

@@ -13,7 +13,7 @@ from trial_runs import Trial
 
 from policies.errors import CheckpointError, EnvError
 from tune_jobs.store.ownership import Owner
-from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.store.trial_store import TrialStore
 
 
 def statuses(pack):

@@ -9,7 +9,8 @@ from analysis.records import CheckpointRecord, TrialRecord
 from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.store.pack_files import Assignment, PackFiles
 from tune_jobs.store.record_files import seal
-from tune_jobs.store.sweep_store import SweepStore, TrialStore
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.trial_store import TrialStore
 
 
 def edit(file, /, **changes):

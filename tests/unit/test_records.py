@@ -19,7 +19,8 @@ from analysis.records import (
     SweepRecord,
     TrialRecord,
 )
-from tune_jobs.store.sweep_store import SweepStore, read_manifest
+from tune_jobs.store.manifests import read_manifest
+from tune_jobs.store.sweep_store import SweepStore
 
 SYNTHETIC = make_sweep(points=[{"lr": 0.1}])
 CHANGE = ChangeRecord(

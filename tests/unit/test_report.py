@@ -61,6 +61,7 @@ class Page(HTMLParser):
 def report(tmp_path, synthetic, videos=None):
     path = build_report(
         tmp_path,
+        target=tmp_path / "report",
         sweep=synthetic.sweep,
         trials=synthetic.trials,
         results=synthetic.results,

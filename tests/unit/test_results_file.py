@@ -5,7 +5,7 @@ import json
 import pytest
 
 from analysis.records import IterationRecord
-from tune_jobs.store.sweep_store import TrialStore
+from tune_jobs.store.trial_store import TrialStore
 
 
 @pytest.fixture

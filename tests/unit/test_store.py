@@ -17,7 +17,9 @@ from analysis.records import (
     TrialRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from tune_jobs.store.sweep_store import SweepStore, TrialStore, list_sweep_stores, read_manifest, verify_checkpoint
+from tune_jobs.store.manifests import read_manifest, verify_checkpoint
+from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
+from tune_jobs.store.trial_store import TrialStore
 
 
 def make_sweep(**changes):

@@ -7,14 +7,14 @@ storage.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
-import secrets
 import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +26,6 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from policies.envs.modules import module_folders
 from policies.errors import CannotRunError, TuneJobsError
-from policies.files import write_atomic
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
 from tune_jobs.process.streams import quiet
@@ -41,7 +40,7 @@ from tune_jobs.ray_tune.connected_ray import (
 from tune_jobs.ray_tune.environment import prepare_environment, provide_token
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
-from tune_jobs.store.places import within
+from tune_jobs.store.probe import answer, probing
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
@@ -226,34 +225,23 @@ def check_storage(folder: Path) -> None:
     Raises:
         CannotRunError: A node does not, or has another version of tune-jobs; the message names it.
     """
-    token = secrets.token_hex(8)
-    probe = within(folder, ".probe")
-    probe.mkdir(parents=True, exist_ok=True)
-    write_atomic(probe / "question", token)
-    try:
+    with probing(folder) as probe:
         tasks = {}
         for node in alive_nodes():
             strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
             remote = ray.remote(num_cpus=0, max_retries=0)(_answer).options(scheduling_strategy=strategy)
             name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"
-            tasks[name] = (remote.remote(str(probe), node["NodeID"]), probe / node["NodeID"])
-        for name, (task, answer) in tasks.items():
-            _check_answer(name, task, answer, token)
-    finally:
-        for path in probe.iterdir():
-            path.unlink(missing_ok=True)
-        probe.rmdir()
+            tasks[name] = (remote.remote(probe.place, node["NodeID"]), node["NodeID"])
+        for name, (task, node_id) in tasks.items():
+            _check_answer(name, task, folder, functools.partial(probe.is_same, machine=node_id))
 
 
-def _answer(probe: str, node_id: str) -> tuple[str, str]:
-    """On a node: read the question, leave an answer; returns both what was read and the version there."""
-    question = Path(probe, "question").read_text(encoding="utf-8")
-    write_atomic(Path(probe, node_id), question)
-    return question, version("tune-jobs")
+def _answer(place: str, node_id: str) -> tuple[str, str]:
+    """On a node: what is read there of the question, and the version there."""
+    return answer(place, node_id), version("tune-jobs")
 
 
-def _check_answer(name: str, task: Any, answer: Path, token: str) -> None:
-    folder = answer.parent.parent
+def _check_answer(name: str, task: Any, folder: Path, is_same: Callable[[str], bool]) -> None:
     storage_hint = "Choose storage that every node reaches (a network file system) with --storage."
     try:
         question, their_version = ray.get(task, timeout=_PROBE_TIMEOUT_S)
@@ -274,7 +262,7 @@ def _check_answer(name: str, task: Any, answer: Path, token: str) -> None:
         raise CannotRunError(
             f"Node {name} cannot use the sweep folder {folder}: {_last_line(cause)}", storage_hint
         ) from error
-    if question != token or not _holds(answer, token):
+    if not is_same(question):
         raise CannotRunError(f"Node {name} sees another folder under the name {folder}.", storage_hint)
     if their_version != version("tune-jobs"):
         raise CannotRunError(
@@ -287,10 +275,3 @@ def _last_line(error: Exception) -> str:
     if isinstance(error, TuneJobsError):
         return error.message
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
-
-
-def _holds(path: Path, content: str) -> bool:
-    try:
-        return path.read_text(encoding="utf-8") == content
-    except OSError:
-        return False

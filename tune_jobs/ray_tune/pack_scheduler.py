@@ -25,7 +25,7 @@ from tune_jobs.ray_tune.early_stopping import grace_env_steps
 from tune_jobs.ray_tune.trainable import compared_by
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import candidates
-from tune_jobs.store.pack_files import Assignment, PackFiles
+from tune_jobs.store.contract import Assignment, Pack
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.store.sweep_store import SweepStore
@@ -55,7 +55,7 @@ class _Controller:
 
 
 class _Pack:
-    def __init__(self, files: PackFiles) -> None:
+    def __init__(self, files: Pack) -> None:
         self.files = files
         self.members: dict[str, None] = {}
         self.ending: set[str] = set()
@@ -106,7 +106,7 @@ class PackDriver:
         self._num_failures: Counter[str] = Counter()
         self._num_deaths: Counter[str] = Counter()
         num_packs = min(plan.num_packs, len(trial_ids))
-        self._packs = {f"p{i:02d}": _Pack(PackFiles(store.folder, f"p{i:02d}")) for i in range(num_packs)}
+        self._packs = {f"p{i:02d}": _Pack(store.pack(f"p{i:02d}")) for i in range(num_packs)}
         for index, pack in enumerate(self._packs.values()):
             # Fewer than there is room for are spread evenly.
             self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))

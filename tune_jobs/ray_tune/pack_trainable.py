@@ -1,6 +1,6 @@
 """The Ray Tune Trainable of a pack: one process that trains many trials at once, for as long as there are any.
 
-Tune gives it a sweep folder and a pack id. Whom to train it reads from `packs/<pack>.json` before every step; what to
+Tune gives it a sweep folder and a pack id. Whom to train it reads from its assignment before every step; what to
 train is in the sweep folder, so a pack that is started again goes on from what its members left there.
 """
 
@@ -26,8 +26,7 @@ from tune_jobs.ray_tune.trainable import (
     this_node,
     watchdog,
 )
-from tune_jobs.store.ownership import Owner
-from tune_jobs.store.pack_files import PackFiles
+from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.pack_loop import PackLoop
 from tune_jobs.training.protocol import PackEngine
 from tune_jobs.training.registry import make_pack_engine
@@ -43,9 +42,9 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error comes from there."""
         self._config = config
-        self._files = PackFiles(Path(config["sweep_folder"]), config["pack_id"])
+        self._files = SweepStore(Path(config["sweep_folder"])).pack(config["pack_id"])
         run = owner_of_run(config)
-        self._owner = Owner.take(self._files.owner_path, run)
+        self._owner = self._files.take(run)
         end_with_driver(config, self._owner)
         note_signals()
         self._log = TrialLog()

@@ -1,7 +1,7 @@
 """Runs a sweep's trials with Ray Tune, and keeps their records up to date.
 
 Tune decides which trial runs where and when; what a trial is and how far it got is in the sweep folder, written here
-(`trial.json`) and by the trials' own processes. Tune's own folder is a cache that every run begins anew.
+(their records) and by the trials' own processes. Tune's own folder is a cache that every run begins anew.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Ownership
 from tune_jobs.store.copies import remove_uncounted_copies
 from tune_jobs.store.logs import died_by
-from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
-from tune_jobs.store.places import remove_folder, within
+from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 from tune_jobs.store.sweep_store import SweepStore
@@ -74,10 +74,9 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     """
     prepare_environment()
     store = SweepStore(job.sweep_folder)
-    owner_path = within(store.folder, OWNER_FILE)
-    owner = Owner.take(owner_path) if job.run is None else Owner(owner_path, job.run)
+    owner = store.take() if job.run is None else store.owner(job.run)
     with owner.held():
-        remove_folder(store.tune_folder)
+        store.clear_tune_folder()
         for trial_id in job.trial_ids:
             remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
     wanted = set(job.trial_ids)
@@ -110,7 +109,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 class _Run:
     """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
 
-    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Owner, watch: RayWatch) -> None:
+    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Ownership, watch: RayWatch) -> None:
         self._job = job
         self._watch = watch
         self._store = self.store = store

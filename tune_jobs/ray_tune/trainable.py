@@ -31,8 +31,8 @@ from policies.parents import end_with_parent, is_gone
 from tune_jobs.ray_tune.early_stopping import METRIC, WORST_SCORE, grace_env_steps
 from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
+from tune_jobs.store.contract import Ownership
 from tune_jobs.store.logs import begin_log
-from tune_jobs.store.ownership import OWNER_FILE, Owner
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.recovery import latest_damaged
 from tune_jobs.store.sweep_store import SweepStore
@@ -153,12 +153,12 @@ def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
     }
 
 
-def owner_of_run(config: Mapping[str, Any]) -> Owner | None:
+def owner_of_run(config: Mapping[str, Any]) -> Ownership | None:
     """The run that a process was started for; None: it was started for none."""
-    return Owner(Path(config["sweep_folder"]) / OWNER_FILE, config["run"]) if config.get("run") else None
+    return SweepStore(Path(config["sweep_folder"])).owner(config["run"]) if config.get("run") else None
 
 
-def end_with_driver(config: Mapping[str, Any], *owners: Owner | None) -> None:
+def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> None:
     """End this process when its driver has gone, however it went, or another process owns what it works for.
 
     A driver that is killed takes its Ray along, whose processes this one is a child of. In a Ray that stays there, it

@@ -20,6 +20,7 @@ from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.yaml import parse_yaml
+from tune_jobs.store.names import SWEEP_RECORD
 
 # What the characters that are read may take up at most, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
@@ -137,7 +138,7 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
     except WrongSpecError as error:
         told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
         raise CheckpointError(
-            f"sweep.json of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
+            f"{SWEEP_RECORD} of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
             "Restore it from a backup, or use the version of tune-jobs that stands in it.",
         ) from error
 

@@ -22,7 +22,8 @@ from policies.files import read_regular
 from policies.portable.file import PortablePolicy, read_policy
 from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.results_file import MAX_RESULTS_BYTES
-from tune_jobs.store.sweep_store import SweepStore, TrialStore
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.trial_store import TrialStore
 
 _LOG = logging.getLogger(__name__)
 _BEGINNING = re.compile(rb'\{"iteration":\s*(\d{1,18}),')

@@ -14,15 +14,17 @@ from pathlib import Path
 
 from analysis.records import ChangeRecord, CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.store.manifests import verify_checkpoint
+from tune_jobs.store.names import COPIES_FOLDER
 from tune_jobs.store.places import remove_folder, within
-from tune_jobs.store.sweep_store import TrialStore, verify_checkpoint
+from tune_jobs.store.trial_store import TrialStore
 
 _ATTEMPTS = 5
 
 
 def copied_folder(trial: TrialStore, iteration: int) -> Path:
     """Where a trial's copy of another's checkpoint lies, taken over at an iteration of its own."""
-    return within(trial.folder, "copied", f"{iteration:06d}")
+    return within(trial.folder, COPIES_FOLDER, f"{iteration:06d}")
 
 
 def copy_latest_checkpoint(source: TrialStore, target: TrialStore, iteration: int) -> CheckpointRecord:
@@ -82,7 +84,7 @@ def pending_copy(trial: TrialStore, change: ChangeRecord | None, latest_iteratio
 
 def remove_uncounted_copies(trial: TrialStore, changes: Sequence[ChangeRecord]) -> None:
     """Delete copies that do not count, of a driver that was killed before it wrote so; for the driver, at its start."""
-    folder = within(trial.folder, "copied")
+    folder = within(trial.folder, COPIES_FOLDER)
     counted = {copied_folder(trial, change.iteration).name for change in changes}
     if folder.is_dir():
         for path in folder.iterdir():
@@ -94,4 +96,4 @@ def remove_uncounted_copies(trial: TrialStore, changes: Sequence[ChangeRecord]) 
 
 def remove_copies(trial: TrialStore) -> None:
     """Delete a trial's copies: it has a newer checkpoint of its own."""
-    remove_folder(within(trial.folder, "copied"))
+    remove_folder(within(trial.folder, COPIES_FOLDER))

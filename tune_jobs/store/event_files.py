@@ -15,6 +15,7 @@ from pathlib import Path
 
 from analysis.records import TrialRecord
 from policies.files import open_to_append
+from tune_jobs.store.names import EVENTS_FOLDER, TRIALS_FOLDER
 from tune_jobs.store.places import within
 
 _FILE_VERSION = b"brain.Event:2"
@@ -54,7 +55,7 @@ class ScalarWriter:
     def flush(self) -> None:
         """Append what was added to the files."""
         for trial_id, data in self._unwritten.items():
-            folder = within(self._folder, "trials", trial_id, "tensorboard")
+            folder = within(self._folder, TRIALS_FOLDER, trial_id, EVENTS_FOLDER)
             with open_to_append(within(folder, self._name)) as file:
                 file.write(data)
         self._unwritten.clear()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from analysis.records import FINISHED
 from policies.files import is_abandoned
+from tune_jobs.store import names
 from tune_jobs.store.places import remove_folder
 
 if TYPE_CHECKING:
@@ -20,8 +21,10 @@ if TYPE_CHECKING:
 def remove_leftovers(store: SweepStore) -> None:
     """Remove what nobody finishes any more; the sweep's lock has to be held."""
     trials = store.read_trials()
-    named = ("best", "packs", "report", "report/figures", *(f"trials/{trial.trial_id}" for trial in trials))
-    for folder in (store.folder, *(store.folder / name for name in named)):
+    report = store.folder / names.REPORT_FOLDER
+    parts = (store.folder / names.BEST_FOLDER, store.folder / names.PACKS_FOLDER, report, report / names.FIGURES_FOLDER)
+    of_trials = (store.folder / names.TRIALS_FOLDER / trial.trial_id for trial in trials)
+    for folder in (store.folder, *parts, *of_trials):
         if folder.is_dir() and not folder.is_symlink():
             for path in folder.glob(".*"):
                 if is_abandoned(path):
@@ -32,6 +35,6 @@ def remove_leftovers(store: SweepStore) -> None:
         if trial.status in FINISHED:
             store.trial(trial.trial_id).remove_leftovers()
     # The nodes of a cluster are asked about the storage under the lock: nobody is asking now.
-    probe = store.folder / ".probe"
+    probe = store.folder / names.PROBE_FOLDER
     if probe.is_dir() and not probe.is_symlink():
         remove_folder(probe)

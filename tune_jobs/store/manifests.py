@@ -14,10 +14,10 @@ from typing import Any
 from analysis.records import CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import refuse_others, sha256_file, sync, write_plain
+from tune_jobs.store.names import MANIFEST
 from tune_jobs.store.places import refuse_link
 from tune_jobs.store.record_files import dump_sealed, parse_record, read_json
 
-MANIFEST = "manifest.json"
 _POLICY_FILES = ("policy.json", "policy.safetensors")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _HINT = "Use another checkpoint of the trial, or restore the file from a backup."
@@ -38,6 +38,11 @@ def write_manifest(folder: Path, record: CheckpointRecord, engine: str = "") -> 
     write_plain(folder / MANIFEST, dump_sealed(record, **named, files=files))
     for path in [*folder.rglob("*"), folder]:
         sync(path)
+
+
+def is_checkpoint(folder: Path) -> bool:
+    """Whether a folder is a checkpoint's, by its manifest; what it says is not looked at."""
+    return (folder / MANIFEST).is_file()
 
 
 def read_manifest(checkpoint: Path) -> CheckpointRecord:

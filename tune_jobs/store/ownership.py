@@ -25,9 +25,10 @@ from pathlib import Path
 
 from policies.errors import CannotRunError
 from policies.files import open_regular, refuse_others
+from tune_jobs.store.names import OWNER
 from tune_jobs.store.places import within
+from tune_jobs.store.trial_contract import Ownership
 
-OWNER_FILE = ".owner"
 # One write of this many bytes replaces all that was there: a kill leaves the old content or the new.
 _LINE_BYTES = 128
 _PATIENCE_S = 60.0
@@ -68,7 +69,7 @@ class Owner:
                 os.close(descriptor)
 
     @classmethod
-    def take(cls, path: Path, under: Owner | None = None) -> Owner:
+    def take(cls, path: Path, under: Ownership | None = None) -> Owner:
         """Become the owner; whoever was it before has lost it.
 
         Args:
@@ -184,13 +185,13 @@ class OwnedFolder:
         """Its path."""
         raise NotImplementedError
 
-    def take(self, under: Owner | None = None) -> None:
+    def take(self, under: Ownership | None = None) -> None:
         """Become the process that writes here; see `Owner.take`.
 
         Raises:
             OwnershipLostError: `under` is another's by now.
         """
-        self._owner = Owner.take(within(self.folder, OWNER_FILE), under)
+        self._owner = Owner.take(within(self.folder, OWNER), under)
 
     def owned(self) -> AbstractContextManager[None]:
         """What is entered around each write; nothing to who only reads, and has not taken the folder.

@@ -6,25 +6,17 @@ The process that drives the sweep writes `<pack>.json`, the pack reads it before
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from policies.errors import MALFORMED, CheckpointError, NotFoundError
 from policies.files import read_regular, write_atomic
+from tune_jobs.store import names
 from tune_jobs.store.logs import begin_log, log_tail
-from tune_jobs.store.ownership import OWNER_FILE
-from tune_jobs.store.places import check_trial_id, within
+from tune_jobs.store.ownership import Owner
+from tune_jobs.store.places import check_pack_id, check_trial_id, within
+from tune_jobs.store.trial_contract import Assignment, Ownership
 
-
-@dataclass(frozen=True)
-class Assignment:
-    """Whom a pack is to train."""
-
-    trial_ids: tuple[str, ...] = ()
-    """Its members, in the order in which they came; whom it trains and who is not named is to be ended."""
-    num_failures: Mapping[str, int] = field(default_factory=dict)
-    """How often a member has failed by itself in this run; those that have not are not named."""
+__all__ = ["Assignment", "PackFiles"]
 
 
 class PackFiles:
@@ -33,26 +25,37 @@ class PackFiles:
     Args:
         sweep_folder: The sweep's folder.
         pack_id: `p00` and so on.
+
+    Raises:
+        NotFoundError: No pack is called so.
     """
 
     def __init__(self, sweep_folder: Path, pack_id: str) -> None:
-        self.pack_id = pack_id
+        self.pack_id = check_pack_id(pack_id)
         self._sweep_folder = sweep_folder
 
     @property
     def assignment_path(self) -> Path:
         """Of `<pack>.json`."""
-        return within(self._sweep_folder, "packs", f"{self.pack_id}.json")
+        return within(self._sweep_folder, names.PACKS_FOLDER, f"{self.pack_id}.json")
 
     @property
     def log_path(self) -> Path:
         """Of `<pack>.log`."""
-        return within(self._sweep_folder, "packs", f"{self.pack_id}.log")
+        return within(self._sweep_folder, names.PACKS_FOLDER, f"{self.pack_id}.log")
 
     @property
     def owner_path(self) -> Path:
         """Of what says which process is the pack."""
-        return within(self._sweep_folder, "packs", f".{self.pack_id}{OWNER_FILE}")
+        return within(self._sweep_folder, names.PACKS_FOLDER, f".{self.pack_id}{names.OWNER}")
+
+    def take(self, under: Ownership | None = None) -> Owner:
+        """Become the process that is this pack; see `Owner.take`.
+
+        Raises:
+            OwnershipLostError: `under` is another's by now.
+        """
+        return Owner.take(self.owner_path, under)
 
     def write(self, assignment: Assignment) -> None:
         """Replace the assignment."""

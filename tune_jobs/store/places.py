@@ -17,6 +17,7 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError
 
 _CHECKPOINT_NAME = re.compile(r"[0-9]{6,19}")
 _TRIAL_ID = re.compile(TRIAL_ID_PATTERN)
+_PACK_ID = re.compile(r"p[0-9]{2,9}")
 
 
 def is_trial_id(name: str) -> bool:
@@ -34,6 +35,17 @@ def check_trial_id(name: str) -> str:
         raise NotFoundError(
             f"{name[:80]!r} is no trial's id; they are t0000, t0001 and so on.", "List them with `tune-jobs trials`."
         )
+    return name
+
+
+def check_pack_id(name: str) -> str:
+    """Return a pack's id if a pack can be called so.
+
+    Raises:
+        NotFoundError: It cannot.
+    """
+    if _PACK_ID.fullmatch(name) is None:
+        raise NotFoundError(f"{name[:80]!r} is no pack's id; they are p00, p01 and so on.")
     return name
 
 

@@ -13,8 +13,8 @@ from typing import Any
 from analysis.records import TrialRecord
 from policies.envs.tallies import Reached, read_tally
 from policies.errors import fit
+from tune_jobs.store.contract import Ownership
 from tune_jobs.store.event_files import ScalarWriter
-from tune_jobs.store.ownership import Owner
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.sweep_store import SweepStore
 
@@ -48,7 +48,7 @@ class RecordKeeper:
         trial_ids: Sequence[str],
         listener: Listener,
         clock: Callable[[], float] = time.monotonic,
-        run: Owner | None = None,
+        run: Ownership | None = None,
     ) -> None:
         self._store = store
         self._run = run
@@ -153,9 +153,7 @@ class RecordKeeper:
 
     def _forget_tally(self, trial_id: str) -> None:
         """What is in a process's tally is in the record now, or its trial is over."""
-        # Where it is a folder, it is no tally, and read by nobody.
-        with contextlib.suppress(OSError):
-            self._store.trial(trial_id).tally_path.unlink(missing_ok=True)
+        self._store.trial(trial_id).forget_tally()
 
     def flush(self) -> None:
         """Write what is due: first what was written longest ago."""

@@ -7,28 +7,17 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import time
 from pathlib import Path
 
 from analysis.records import FORMAT_VERSION, CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import RefusedFileError, open_to_append, read_regular
+from tune_jobs.store.manifests import verify_checkpoint
+from tune_jobs.store.names import DAMAGED_FOLDER, DAMAGED_RESULTS, MANIFEST, RESULTS
 from tune_jobs.store.places import within
 from tune_jobs.store.record_files import seal
-from tune_jobs.store.results_file import ResultsFile, read_results
-from tune_jobs.store.sweep_store import MANIFEST, TrialStore, verify_checkpoint
-
-DAMAGED_FOLDER = "damaged"
-DAMAGED_RESULTS = "results.damaged"
-
-
-def write_log(path: Path, text: str) -> None:
-    """Append to a trial's log what concerns this trial, whatever the process prints elsewhere."""
-    line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
-    with open_to_append(path) as file:
-        # What an env raised may be no text that UTF-8 has.
-        file.write(line.encode(errors="backslashreplace"))
+from tune_jobs.store.results_file import ResultsFile
+from tune_jobs.store.trial_store import TrialStore
 
 
 def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
@@ -43,7 +32,7 @@ def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
         CheckpointError: They cannot be read now.
     """
     try:
-        found = read_results(trial.results_path)
+        found = trial.read_results()
     except CheckpointError as error:
         if not isinstance(error.__cause__, RefusedFileError):
             raise
@@ -55,10 +44,8 @@ def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
             file.write(b"".join(content + b"\n" for content in unreadable))
     if found.tail:
         # What every kill may leave, and no damage: it is done again.
-        write_log(
-            trial.log_path, f"{trial.trial_id}: results.jsonl ended within a line; it is kept in {DAMAGED_RESULTS}"
-        )
-    return found, [f"results.jsonl: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
+        trial.write_log(f"{trial.trial_id}: {RESULTS} ended within a line; it is kept in {DAMAGED_RESULTS}")
+    return found, [f"{RESULTS}: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
 
 
 def take_up_checkpoints(trial: TrialStore) -> tuple[list[CheckpointRecord], list[str]]:

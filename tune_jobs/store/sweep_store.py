@@ -1,32 +1,27 @@
-"""The sweep folder: who writes what, and how it is read back.
+"""A sweep in a folder: the local store. See `contract.Sweep` for who may write what and when.
 
-Layout: see `docs/design.md`, "On disk". Who may write: the process that drives a sweep holds the folder's lock and
-writes `sweep.json` and every `trial.json`; the process that trains a trial writes that trial's `results.jsonl`,
-`checkpoints/` and `log.txt`. Everybody may read at any time: a file appears whole or not at all.
+Layout: see `docs/design.md`, "On disk"; what the parts are called is in `names`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from analysis.records import BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from policies.files import absolute, open_to_append, write_atomic
+from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
+from policies.errors import CannotRunError, NotFoundError, SpecError
+from policies.files import absolute, write_atomic
+from policies.portable.file import PortablePolicy, save_policy
+from tune_jobs.store import names
 from tune_jobs.store.locks import held, is_held
-from tune_jobs.store.logs import log_tail
-from tune_jobs.store.manifests import MANIFEST, read_manifest, verify_checkpoint, write_manifest
-from tune_jobs.store.ownership import OwnedFolder
+from tune_jobs.store.ownership import Owner
+from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.places import (
-    check_trial_id,
-    checkpoint_iteration,
     is_trial_id,
-    make_folder,
     parts_of,
     refuse_link,
     refuse_links_in,
@@ -35,176 +30,7 @@ from tune_jobs.store.places import (
     within,
 )
 from tune_jobs.store.record_files import dump, dump_sealed, read_record
-from tune_jobs.store.results_file import read_results
-
-_LOG = logging.getLogger(__name__)
-
-__all__ = [
-    "MANIFEST", "SweepStore", "TrialStore", "list_sweep_stores", "name_taken", "read_manifest", "verify_checkpoint",
-]  # fmt: skip
-
-
-class TrialStore(OwnedFolder):
-    """One trial's folder; the process that trains the trial has taken it."""
-
-    def __init__(self, sweep_folder: Path, trial_id: str) -> None:
-        self.sweep_folder = sweep_folder
-        self.trial_id = check_trial_id(trial_id)
-
-    # Looked at anew each time: what is no link now may be one when the trial goes on.
-
-    @property
-    def folder(self) -> Path:
-        """The trial's folder."""
-        return within(self.sweep_folder, "trials", self.trial_id)
-
-    @property
-    def record_path(self) -> Path:
-        """Of trial.json."""
-        return within(self.folder, "trial.json")
-
-    @property
-    def results_path(self) -> Path:
-        """Of results.jsonl."""
-        return within(self.folder, "results.jsonl")
-
-    @property
-    def log_path(self) -> Path:
-        """Of log.txt."""
-        return within(self.folder, "log.txt")
-
-    @property
-    def tally_path(self) -> Path:
-        """Of the file that says how far a trial is whose process runs, or did not end by itself."""
-        return within(self.folder, ".tally")
-
-    @property
-    def checkpoints_folder(self) -> Path:
-        """Where its checkpoints lie."""
-        return within(self.folder, "checkpoints")
-
-    def checkpoint_folder(self, iteration: int) -> Path:
-        """Where the checkpoint of an iteration lies, or would."""
-        return within(self.checkpoints_folder, f"{iteration:06d}")
-
-    def read_record(self) -> TrialRecord:
-        """trial.json.
-
-        Raises:
-            NotFoundError: There is none.
-            CheckpointError: It is damaged, of a newer format, or another trial's.
-        """
-        record = read_record(self.record_path, TrialRecord, "trial record")
-        if record.trial_id != self.trial_id:
-            raise CheckpointError(
-                f"{self.record_path} is of trial {record.trial_id}, but lies in the folder of {self.trial_id}.",
-                "Restore the file from a backup.",
-            )
-        return record
-
-    def write_record(self, record: TrialRecord) -> None:
-        """Replace trial.json."""
-        write_atomic(self.record_path, dump(record))
-
-    def append_iterations(self, records: Sequence[IterationRecord]) -> None:
-        """Append lines to results.jsonl; a line torn by a kill is dropped when it is read."""
-        if not records:
-            return
-        text = "".join(dump(record, indent=None) for record in records)
-        with self.owned(), open_to_append(self.results_path) as file:
-            file.write(text.encode())
-
-    def read_iterations(self) -> list[IterationRecord]:
-        """Every line of results.jsonl that can be read, in order, with a warning for others; empty without a file."""
-        found = read_results(self.results_path)
-        for bad in found.bad:
-            _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
-        return found.records
-
-    def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
-        """Replace results.jsonl by these lines: those up to the checkpoint a trial goes on from."""
-        text = "".join(dump(record, indent=None) for record in records)
-        with self.owned():
-            write_atomic(self.results_path, text)
-
-    def checkpoints(self) -> list[CheckpointRecord]:
-        """The complete checkpoints, oldest first (those being written have no final name yet).
-
-        Raises:
-            CheckpointError: A manifest is damaged, or of another checkpoint than lies there.
-        """
-        return [self.checkpoint(iteration) for iteration in self.checkpoint_iterations()]
-
-    def checkpoint_iterations(self) -> list[int]:
-        """Those that have a checkpoint, damaged or not, in order."""
-        numbers = (checkpoint_iteration(path.name) for path in parts_of(self.checkpoints_folder))
-        return sorted(number for number in numbers if number is not None)
-
-    def checkpoint(self, iteration: int) -> CheckpointRecord:
-        """The manifest of an iteration's checkpoint.
-
-        Raises:
-            NotFoundError: There is none.
-            CheckpointError: It is damaged, or of another checkpoint.
-        """
-        folder = self.checkpoint_folder(iteration)
-        record = read_manifest(folder)
-        if (record.trial_id, record.iteration) != (self.trial_id, iteration):
-            raise CheckpointError(
-                f"The manifest of checkpoint {folder} is of trial {record.trial_id}, iteration {record.iteration}.",
-                "Delete this folder; the trial goes on from its other checkpoints.",
-            )
-        return record
-
-    def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
-        """Write a checkpoint folder whole: to a hidden name, hashed, synced, then renamed.
-
-        Args:
-            record: Its scores and iteration.
-            write: Fills the folder it is given.
-            engine: Name of the engine that can go on from it; empty: the manifest names none.
-
-        Raises:
-            CheckpointError: Its place is a symbolic link.
-        """
-        target = self.checkpoint_folder(record.iteration)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
-        with self.owned():
-            make_folder(temporary)
-        try:
-            write(temporary)
-            write_manifest(temporary, record, engine)
-            with self.owned():
-                # There is one if the trial went on from an earlier checkpoint and writes this iteration anew.
-                remove_folder(target)
-                temporary.replace(target)
-        except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
-
-    def delete_checkpoint(self, record: CheckpointRecord) -> None:
-        """Remove a checkpoint: first from sight, then from disk.
-
-        Raises:
-            CheckpointError: Its place is a symbolic link.
-        """
-        folder = self.checkpoint_folder(record.iteration)
-        hidden = folder.with_name(f".{folder.name}.deleted")
-        with self.owned():
-            remove_folder(hidden)
-            folder.replace(hidden)
-        remove_folder(hidden)
-
-    def remove_leftovers(self) -> None:
-        """Delete half-written or half-deleted checkpoints of a process that was killed."""
-        if self.checkpoints_folder.is_dir():
-            for folder in self.checkpoints_folder.iterdir():
-                if folder.name.startswith(".") and not folder.is_symlink():
-                    remove_folder(folder)
-
-    def log_tail(self, num_lines: int = 15) -> str:
-        """See `logs.log_tail`: of the trial's last process."""
-        return log_tail(self.log_path, f"trial {self.trial_id}", num_lines)
+from tune_jobs.store.trial_store import TrialStore
 
 
 class SweepStore:
@@ -213,31 +39,35 @@ class SweepStore:
     def __init__(self, folder: Path) -> None:
         # Ray takes only absolute paths for storage ("URI has empty scheme" otherwise).
         self.folder = absolute(folder)
-        self.record_path = self.folder / "sweep.json"
-        self._stop_path = self.folder / ".stop"
-        self._lock_path = self.folder / ".lock"
-        self._driver_lock_path = self.folder / ".driver-lock"
+        self.record_path = self.folder / names.SWEEP_RECORD
+        self._stop_path = self.folder / names.STOP_REQUEST
+        self._lock_path = self.folder / names.LOCK
+        self._driver_lock_path = self.folder / names.DRIVER_LOCK
         self._made: list[Path] = []
 
     @property
     def best_folder(self) -> Path:
         """The winner's policy, its evaluation and films; without links."""
-        return refuse_links_in(self.folder / "best")
+        return refuse_links_in(self.folder / names.BEST_FOLDER)
 
     @property
     def report_folder(self) -> Path:
         """The report."""
-        return within(self.folder, "report")
+        return within(self.folder, names.REPORT_FOLDER)
 
     @property
     def tune_folder(self) -> Path:
         """Ray Tune's own state."""
-        return within(self.folder, "tune")
+        return within(self.folder, names.RAY_TUNE_FOLDER)
+
+    def clear_tune_folder(self) -> None:
+        """Delete Ray Tune's state of an earlier run."""
+        remove_folder(self.tune_folder)
 
     @property
     def driver_log(self) -> Path:
         """What Ray and RLlib print in the process that drives the sweep."""
-        return within(self.folder, "driver.log")
+        return within(self.folder, names.DRIVER_LOG)
 
     @property
     def name(self) -> str:
@@ -266,7 +96,7 @@ class SweepStore:
                 self.folder.mkdir()
             except FileExistsError as error:
                 raise name_taken(self.folder) from error
-            (self.folder / "trials").mkdir()
+            (self.folder / names.TRIALS_FOLDER).mkdir()
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
             raise CannotRunError(
@@ -280,6 +110,20 @@ class SweepStore:
         with contextlib.suppress(OSError):
             for folder in self._made:
                 folder.rmdir()
+
+    @contextlib.contextmanager
+    def rehearsal(self) -> Iterator[SweepStore]:
+        """A sweep's folder beside this one, made and removed, with a hidden name so that nobody finds this one taken.
+
+        Raises:
+            CannotRunError: The storage folder cannot be written.
+        """
+        other = SweepStore(self.folder.with_name(f".{self.name}.{secrets.token_hex(4)}"))
+        other.create()
+        try:
+            yield other
+        finally:
+            other.discard()
 
     def read_record(self) -> SweepRecord:
         """sweep.json.
@@ -303,6 +147,14 @@ class SweepStore:
         """
         return TrialStore(self.folder, trial_id)
 
+    def pack(self, pack_id: str) -> PackFiles:
+        """The files of one pack.
+
+        Raises:
+            NotFoundError: No pack is called so.
+        """
+        return PackFiles(self.folder, pack_id)
+
     def checkpoint_folder(self, record: CheckpointRecord) -> Path:
         """Where a checkpoint lies.
 
@@ -313,7 +165,7 @@ class SweepStore:
 
     def read_trials(self) -> list[TrialRecord]:
         """Every trial's record, by index."""
-        folders = parts_of(within(self.folder, "trials"))
+        folders = parts_of(within(self.folder, names.TRIALS_FOLDER))
         stores = [self.trial(path.name) for path in folders if is_trial_id(path.name)]
         records = [store.read_record() for store in stores if store.record_path.is_file()]
         return sorted(records, key=lambda record: record.index)
@@ -324,16 +176,48 @@ class SweepStore:
         Raises:
             NotFoundError: No best policy has been chosen yet.
         """
-        path = within(self.best_folder, "evaluation.json")
+        path = within(self.best_folder, names.BEST_RECORD)
         if not path.is_file():
             raise NotFoundError(
                 f"Sweep {self.name} has no best policy yet.", f"Choose it with `tune-jobs best {self.name}`."
             )
         return read_record(path, BestRecord, "best record", is_sealed=True)
 
-    def write_best(self, record: BestRecord) -> None:
-        """Replace best/evaluation.json."""
-        write_atomic(self.best_folder / "evaluation.json", dump_sealed(record))
+    def has_best(self) -> bool:
+        """Whether a best policy has been chosen."""
+        return (self.best_folder / names.BEST_RECORD).is_file()
+
+    def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
+        """Replace what is known of the winner, and its policy; who sees the record finds the policy.
+
+        Args:
+            record: best/evaluation.json.
+            policy: The winner; None: the one that is there.
+        """
+        if policy is not None:
+            save_policy(policy, self.best_folder)
+        write_atomic(self.best_folder / names.BEST_RECORD, dump_sealed(record))
+
+    @property
+    def best_policy_path(self) -> Path:
+        """Of the winner's policy."""
+        return self.best_folder / names.BEST_POLICY
+
+    def films(self) -> dict[str, Path]:
+        """The films that there are: before_mp4, after_mp4, after_gif, before_after_mp4."""
+        folder = self.best_folder
+        return {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
+
+    @contextlib.contextmanager
+    def writing_films(self) -> Iterator[Mapping[str, Path]]:
+        """Where to write films in the block, by the names that `films` has."""
+        folder = self.best_folder
+        yield {key: folder / name for key, name in names.FILMS.items()}
+
+    @contextlib.contextmanager
+    def writing_report(self) -> Iterator[Path]:
+        """The folder to write the report into in the block; without links."""
+        yield refuse_links_in(self.report_folder)
 
     def request_stop(self) -> None:
         """Ask the process that drives this sweep to stop."""
@@ -346,6 +230,22 @@ class SweepStore:
     def clear_stop_request(self) -> None:
         """Forget the request."""
         remove_file(self._stop_path)
+
+    def take(self) -> Owner:
+        """Become the run of this sweep; whatever an earlier run has left can't write any more.
+
+        Raises:
+            CannotRunError: The folder cannot be written or locked.
+        """
+        return Owner.take(self._owner_path)
+
+    def owner(self, token: str) -> Owner:
+        """The run that another process has taken and passed the token of."""
+        return Owner(self._owner_path, token)
+
+    @property
+    def _owner_path(self) -> Path:
+        return within(self.folder, names.OWNER)
 
     def is_driven(self) -> bool:
         """Whether a process drives this sweep now (on this machine, or on one that shares locks with it)."""
@@ -385,7 +285,7 @@ class SweepStore:
 def name_taken(folder: Path) -> SpecError:
     """The error for a new sweep whose folder is there already."""
     go_on = f"go on with it: `tune-jobs resume {folder.name}`"
-    other = go_on if SweepStore(folder).exists() else "remove that folder: it has no sweep.json"
+    other = go_on if SweepStore(folder).exists() else f"remove that folder: it has no {names.SWEEP_RECORD}"
     hint = f"Choose another name with --name, or {other}."
     return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 

@@ -18,14 +18,14 @@ from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError,
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
-from policies.portable.file import read_policy, save_policy
+from policies.portable.file import is_policy_folder, read_policy
 from policies.suggestions import did_you_mean
 from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import choose, leave_out, read_trials
-from tune_jobs.store.places import refuse_links_in
-from tune_jobs.store.sweep_store import MANIFEST, SweepStore, list_sweep_stores, verify_checkpoint
+from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
+from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
 from tune_jobs.sweeps.storage import expanded, storage_folder
 from tune_jobs.training.registry import engine_of_checkpoint
 
@@ -89,8 +89,7 @@ def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
         confirmation=run_evaluation(policy, env_id, env_args, seeds, timeout_s),
         random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
     )
-    save_policy(portable, store.best_folder)
-    store.write_best(record)
+    store.write_best(record, portable)
     return record
 
 
@@ -158,16 +157,16 @@ def find_policy(
     path = expanded(text)
     store: SweepStore | None = None
     timeout_s = CALL_TIMEOUT_S
-    if (path / MANIFEST).is_file():
+    if is_checkpoint(path):
         verify_checkpoint(path)
         policy = load_policy(path)
-    elif path.is_file() or (path / "policy.json").is_file():
+    elif path.is_file() or is_policy_folder(path):
         policy = load_policy(path)
     else:
         store, trial_id = _sweep_and_trial(text, storage)
         timeout_s = stored_spec(store.read_record()).iteration_timeout_s
         if trial_id is None:
-            if not (store.best_folder / "evaluation.json").is_file():
+            if not store.has_best():
                 choose_best(store)
             policy = load_policy(store.best_folder)
         else:
@@ -268,11 +267,11 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
         CheckpointError: It is damaged.
     """
     folder = expanded(source)
-    if not (folder / MANIFEST).is_file():
+    if not is_checkpoint(folder):
         store, trial_id = _sweep_and_trial(str(source), storage)
         if trial_id is not None:
             record = best_checkpoint(store, trial_id)
-        elif (store.best_folder / "evaluation.json").is_file():
+        elif store.has_best():
             record = store.read_best().checkpoint
         else:
             record = choose_best(store).checkpoint
@@ -310,31 +309,25 @@ def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
     before = random_policy(source.env_id, source.env_args, source.timeout_s)
-    names = {
-        "before_mp4": "before.mp4",
-        "after_mp4": "after.mp4",
-        "after_gif": "after.gif",
-        "before_after_mp4": "before_after.mp4",
-    }
-    paths = {key: store.best_folder / name for key, name in names.items()}
     # A baseline has not been trained: it is shown as what it is.
     trained = not isinstance(source.policy, RandomPolicy | ConstantPolicy)
     first = "before training: random" if trained else before.description
     second = f"after training: {best.checkpoint.trial_id}" if trained else source.policy.description
-    record_comparison(
-        before,
-        source.policy,
-        env_id=source.env_id,
-        env_args=source.env_args,
-        seed=chosen,
-        captions=(first, second),
-        left_mp4=paths["before_mp4"],
-        right_mp4=paths["after_mp4"],
-        right_gif=paths["after_gif"],
-        both_mp4=paths["before_after_mp4"],
-        timeout_s=source.timeout_s,
-    )
-    return paths
+    with store.writing_films() as paths:
+        record_comparison(
+            before,
+            source.policy,
+            env_id=source.env_id,
+            env_args=source.env_args,
+            seed=chosen,
+            captions=(first, second),
+            left_mp4=paths["before_mp4"],
+            right_mp4=paths["after_mp4"],
+            right_gif=paths["after_gif"],
+            both_mp4=paths["before_after_mp4"],
+            timeout_s=source.timeout_s,
+        )
+    return dict(paths)
 
 
 def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]:
@@ -365,21 +358,19 @@ def make_report(store: SweepStore, why_no_best: TuneJobsError | None = None) -> 
             why_no_best = error
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None
-    videos = {
-        key: path
-        for key, name in (("before", "before.mp4"), ("after", "after.mp4"))
-        if (path := store.best_folder / name).is_file()
-    }
-    refuse_links_in(store.report_folder)  # which it writes to
-    return build_report(
-        store.folder,
-        sweep=store.read_record(),
-        trials=read_trials(store),
-        results=read_results(store),
-        best=best,
-        why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
-        videos=videos if why_no_best is None else {},
-    )
+    films = store.films()
+    videos = {name: films[key] for name, key in (("before", "before_mp4"), ("after", "after_mp4")) if key in films}
+    with store.writing_report() as target:
+        return build_report(
+            store.folder,
+            target=target,
+            sweep=store.read_record(),
+            trials=read_trials(store),
+            results=read_results(store),
+            best=best,
+            why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
+            videos=videos if why_no_best is None else {},
+        )
 
 
 def _known_best(store: SweepStore) -> BestRecord:

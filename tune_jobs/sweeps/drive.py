@@ -24,8 +24,9 @@ from tune_jobs.ray_tune.address import check_address
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.closing import close_run
+from tune_jobs.store.contract import Ownership
 from tune_jobs.store.leftovers import remove_leftovers
-from tune_jobs.store.ownership import OWNER_FILE, Owner, OwnershipLostError
+from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult
@@ -168,7 +169,7 @@ def _run_sweep(
     progress: str,
 ) -> SweepResult:
     # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
-    run = Owner.take(store.folder / OWNER_FILE)
+    run = store.take()
     todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
     if todo:
         if current().came:
@@ -204,7 +205,7 @@ def _run_trials(
     plan: SweepPlan,
     todo: tuple[str, ...],
     monitor: SweepMonitor,
-    run: Owner,
+    run: Ownership,
     *,
     address: str | None,
     machine: Machine | None,
@@ -304,7 +305,7 @@ class _Finish:
 
         try:
             self.best = finish.choose_best(self._store)
-            self.artifacts["policy"] = self._store.best_folder / "policy.json"
+            self.artifacts["policy"] = self._store.best_policy_path
         except TuneJobsError as error:
             self._why = error
         self.failed = self._why is not None

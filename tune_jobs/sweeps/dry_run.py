@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from policies.arguments import checked
@@ -12,7 +10,6 @@ from tune_jobs.plan.machine import local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.plan.user_code import Source, load_source
 from tune_jobs.spec.sweep_spec import SweepSpec
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.drive import connected
 from tune_jobs.sweeps.storage import choose_store, stem_of, storage_folder
 
@@ -45,24 +42,13 @@ def planned(
     store = choose_store(spec.name, stem_of(source), storage_folder(storage))
     if address is None:
         plan = make_plan(spec, local_machine())
-        with _probe(store):
+        with store.rehearsal():
             return spec, plan
     with connected(address, None) as connection:
         plan = make_plan(spec, connection.machine)
-        with _probe(store) as folder:
-            _check_nodes(folder)
+        with store.rehearsal() as rehearsed:
+            _check_nodes(rehearsed.folder)
         return spec, plan
-
-
-@contextlib.contextmanager
-def _probe(store: SweepStore) -> Iterator[Path]:
-    """Make a sweep's folder, under a hidden name of its own so that nobody finds the name taken, and remove it."""
-    probe = SweepStore(store.folder.with_name(f".{store.name}.{secrets.token_hex(4)}"))
-    probe.create()
-    try:
-        yield probe.folder
-    finally:
-        probe.discard()
 
 
 def _check_nodes(folder: Path) -> None:

@@ -13,6 +13,7 @@ from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.names import SWEEP_RECORD
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.drive import connected, machine_here, pending_record, run_sweep, settled
 from tune_jobs.sweeps.outcome import SweepResult
@@ -71,9 +72,9 @@ def check_same_trials(store: SweepStore, plan: SweepPlan) -> None:
         same = trial is not None and (not trial.has_point or trial.hyperparams == record.first_hyperparams)
         if trial is None or trial.seed != record.seed or not same:
             raise CannotRunError(
-                f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: sweep.json was changed, "
-                "or was written by a version that draws other points.",
-                "Restore sweep.json, or launch a new sweep.",
+                f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: {SWEEP_RECORD} was "
+                "changed, or was written by a version that draws other points.",
+                f"Restore {SWEEP_RECORD}, or launch a new sweep.",
             )
 
 

@@ -25,7 +25,6 @@ from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
 from policies.portable.file import PortablePolicy
 from tune_jobs.store.ownership import Owner, OwnershipLostError
 from tune_jobs.store.progress import Progress
-from tune_jobs.store.recovery import write_log
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.protocol import IterationStats, PackEngine, TrialTask
 from tune_jobs.training.trial_loop import TrialLoop
@@ -369,4 +368,4 @@ def _describe(task: TrialTask, error: Exception) -> str:
 
 def _log(task: TrialTask, text: str) -> None:
     """Append to a member's own log; the output of the process goes to the pack's."""
-    write_log(SweepStore(task.sweep_folder).trial(task.trial_id).log_path, text)
+    SweepStore(task.sweep_folder).trial(task.trial_id).write_log(text)

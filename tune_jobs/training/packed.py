@@ -21,6 +21,7 @@ from policies.packed.stack import Stack, make_stack
 from policies.packed.state import STATE_FOLDER, check_shapes, load_member, save_member
 from policies.portable.file import PortablePolicy
 from tune_jobs.plan.engine_choice import pack_key
+from tune_jobs.store.names import TRIAL_RECORD
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
 
@@ -166,7 +167,7 @@ def _restored(fresh: Member, checkpoint: Path) -> Member:
     if member.hyperparams != fresh.hyperparams or member.seed != fresh.seed:
         raise CheckpointError(
             f"Checkpoint {checkpoint} is of other hyperparameters or another seed than trial {fresh.member_id} has.",
-            "Restore trial.json, or use another checkpoint of the trial.",
+            f"Restore {TRIAL_RECORD}, or use another checkpoint of the trial.",
         )
     check_shapes(member, fresh.weights)
     return member

@@ -6,7 +6,6 @@ another node, in another process, goes on from its latest checkpoint.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections import deque
@@ -23,10 +22,12 @@ from policies.envs.tallies import Reached, begin_tally, end_tally
 from policies.errors import NonFiniteWeightsError
 from policies.files import write_plain
 from policies.portable.file import save_policy
+from tune_jobs.store.contract import Ownership
 from tune_jobs.store.copies import pending_copy, remove_copies
-from tune_jobs.store.ownership import Owner, OwnershipLostError
+from tune_jobs.store.names import RESULTS
+from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
-from tune_jobs.store.recovery import take_up_checkpoints, take_up_copy, take_up_results, write_log
+from tune_jobs.store.recovery import take_up_checkpoints, take_up_copy, take_up_results
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.protocol import IterationStats, TrainingEngine, TrialTask
 
@@ -53,7 +54,7 @@ class TrialLoop:
         engine: TrainingEngine,
         evaluator: Evaluator,
         clock: Callable[[], float] = time.perf_counter,
-        under: Owner | None = None,
+        under: Ownership | None = None,
     ) -> None:
         self.task = task
         self._engine = engine
@@ -122,7 +123,7 @@ class TrialLoop:
             folder = self._store.checkpoint_folder(latest.iteration)
         self._take_up_results(start)
         for note in self._notes:
-            write_log(self._store.log_path, f"{self.task.trial_id}: {note}")
+            self._store.write_log(f"{self.task.trial_id}: {note}")
         with self._store.owned():
             self._tally = begin_tally(self.task.trial_id, self._store.tally_path, _reached(self._last))
         done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
@@ -141,7 +142,7 @@ class TrialLoop:
         changed_at = max((change.iteration for change in self.task.changes if change.iteration <= iteration), default=0)
         kept = [record for record in found.records if record.iteration <= iteration]
         time_s = 0.0
-        if self._store.results_path.exists():
+        if self._store.has_results():
             self._store.keep_iterations(kept)
         for record in kept:
             if record.iteration > changed_at:
@@ -161,7 +162,7 @@ class TrialLoop:
         )  # fmt: skip
         if contradicts:
             self._notes.append(
-                f"results.jsonl: iteration {iteration} says {self._last.num_env_steps} env steps; its checkpoint says "
+                f"{RESULTS}: iteration {iteration} says {self._last.num_env_steps} env steps; its checkpoint says "
                 f"{start.num_env_steps}, from which the trial goes on."
             )
         if contradicts or self._last.iteration < iteration:
@@ -352,8 +353,7 @@ class TrialLoop:
     ) -> Progress:
         if status != "running":
             end_tally(self.task.trial_id)
-            with self._store.owned(), contextlib.suppress(OSError):  # a folder is no tally
-                self._store.tally_path.unlink(missing_ok=True)
+            self._store.forget_tally()
         return Progress(
             iteration=self._last.iteration,
             num_env_steps=self._last.num_env_steps,

@@ -1,0 +1,221 @@
+"""The folder of one trial: its record, results, checkpoints, log and tally.
+
+See `contract.Trial` for who may write what and when. Checkpoints of other trials that it goes on from are in
+`copies`, what was damaged in `recovery`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
+from policies.errors import CheckpointError
+from policies.files import open_to_append, write_atomic
+from tune_jobs.store import names
+from tune_jobs.store.logs import log_tail
+from tune_jobs.store.manifests import read_manifest, verify_checkpoint, write_manifest
+from tune_jobs.store.ownership import OwnedFolder
+from tune_jobs.store.places import check_trial_id, checkpoint_iteration, make_folder, parts_of, remove_folder, within
+from tune_jobs.store.record_files import dump, read_record
+from tune_jobs.store.results_file import ResultsFile, read_results
+
+_LOG = logging.getLogger(__name__)
+
+
+class TrialStore(OwnedFolder):
+    """One trial's folder; the process that trains the trial has taken it."""
+
+    def __init__(self, sweep_folder: Path, trial_id: str) -> None:
+        self.sweep_folder = sweep_folder
+        self.trial_id = check_trial_id(trial_id)
+
+    # Looked at anew each time: what is no link now may be one when the trial goes on.
+
+    @property
+    def folder(self) -> Path:
+        """The trial's folder."""
+        return within(self.sweep_folder, names.TRIALS_FOLDER, self.trial_id)
+
+    @property
+    def record_path(self) -> Path:
+        """Of trial.json."""
+        return within(self.folder, names.TRIAL_RECORD)
+
+    @property
+    def results_path(self) -> Path:
+        """Of results.jsonl."""
+        return within(self.folder, names.RESULTS)
+
+    @property
+    def log_path(self) -> Path:
+        """Of log.txt."""
+        return within(self.folder, names.TRIAL_LOG)
+
+    @property
+    def tally_path(self) -> Path:
+        """Of the file that says how far a trial is whose process runs, or did not end by itself."""
+        return within(self.folder, names.TALLY)
+
+    @property
+    def checkpoints_folder(self) -> Path:
+        """Where its checkpoints lie."""
+        return within(self.folder, names.CHECKPOINTS_FOLDER)
+
+    def checkpoint_folder(self, iteration: int) -> Path:
+        """Where the checkpoint of an iteration lies, or would."""
+        return within(self.checkpoints_folder, f"{iteration:06d}")
+
+    def read_record(self) -> TrialRecord:
+        """trial.json.
+
+        Raises:
+            NotFoundError: There is none.
+            CheckpointError: It is damaged, of a newer format, or another trial's.
+        """
+        record = read_record(self.record_path, TrialRecord, "trial record")
+        if record.trial_id != self.trial_id:
+            raise CheckpointError(
+                f"{self.record_path} is of trial {record.trial_id}, but lies in the folder of {self.trial_id}.",
+                "Restore the file from a backup.",
+            )
+        return record
+
+    def write_record(self, record: TrialRecord) -> None:
+        """Replace trial.json."""
+        write_atomic(self.record_path, dump(record))
+
+    def append_iterations(self, records: Sequence[IterationRecord]) -> None:
+        """Append lines to results.jsonl; a line torn by a kill is dropped when it is read."""
+        if not records:
+            return
+        text = "".join(dump(record, indent=None) for record in records)
+        with self.owned(), open_to_append(self.results_path) as file:
+            file.write(text.encode())
+
+    def read_results(self) -> ResultsFile:
+        """What can be read of results.jsonl, and what can't; see `Trial.read_results`."""
+        return read_results(self.results_path)
+
+    def read_iterations(self) -> list[IterationRecord]:
+        """Every line of results.jsonl that can be read, in order, with a warning for others; empty without a file."""
+        found = self.read_results()
+        for bad in found.bad:
+            _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
+        return found.records
+
+    def has_results(self) -> bool:
+        """Whether there is a results.jsonl, with lines or without."""
+        return self.results_path.exists()
+
+    def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
+        """Replace results.jsonl by these lines: those up to the checkpoint a trial goes on from."""
+        text = "".join(dump(record, indent=None) for record in records)
+        with self.owned():
+            write_atomic(self.results_path, text)
+
+    def checkpoints(self) -> list[CheckpointRecord]:
+        """The complete checkpoints, oldest first (those being written have no final name yet).
+
+        Raises:
+            CheckpointError: A manifest is damaged, or of another checkpoint than lies there.
+        """
+        return [self.checkpoint(iteration) for iteration in self.checkpoint_iterations()]
+
+    def checkpoint_iterations(self) -> list[int]:
+        """Those that have a checkpoint, damaged or not, in order."""
+        numbers = (checkpoint_iteration(path.name) for path in parts_of(self.checkpoints_folder))
+        return sorted(number for number in numbers if number is not None)
+
+    def checkpoint(self, iteration: int) -> CheckpointRecord:
+        """The manifest of an iteration's checkpoint.
+
+        Raises:
+            NotFoundError: There is none.
+            CheckpointError: It is damaged, or of another checkpoint.
+        """
+        folder = self.checkpoint_folder(iteration)
+        record = read_manifest(folder)
+        if (record.trial_id, record.iteration) != (self.trial_id, iteration):
+            raise CheckpointError(
+                f"The manifest of checkpoint {folder} is of trial {record.trial_id}, iteration {record.iteration}.",
+                "Delete this folder; the trial goes on from its other checkpoints.",
+            )
+        return record
+
+    def verify_checkpoint(self, iteration: int) -> CheckpointRecord:
+        """Check every file of a checkpoint; see `Trial.verify_checkpoint`."""
+        return verify_checkpoint(self.checkpoint_folder(iteration))
+
+    def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
+        """Write a checkpoint folder whole: to a hidden name, hashed, synced, then renamed.
+
+        Args:
+            record: Its scores and iteration.
+            write: Fills the folder it is given.
+            engine: Name of the engine that can go on from it; empty: the manifest names none.
+
+        Raises:
+            CheckpointError: Its place is a symbolic link.
+        """
+        target = self.checkpoint_folder(record.iteration)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
+        with self.owned():
+            make_folder(temporary)
+        try:
+            write(temporary)
+            write_manifest(temporary, record, engine)
+            with self.owned():
+                # There is one if the trial went on from an earlier checkpoint and writes this iteration anew.
+                remove_folder(target)
+                temporary.replace(target)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+
+    def delete_checkpoint(self, record: CheckpointRecord) -> None:
+        """Remove a checkpoint: first from sight, then from disk.
+
+        Raises:
+            CheckpointError: Its place is a symbolic link.
+        """
+        folder = self.checkpoint_folder(record.iteration)
+        hidden = folder.with_name(f".{folder.name}.deleted")
+        with self.owned():
+            remove_folder(hidden)
+            folder.replace(hidden)
+        remove_folder(hidden)
+
+    def remove_leftovers(self) -> None:
+        """Delete half-written or half-deleted checkpoints of a process that was killed."""
+        if self.checkpoints_folder.is_dir():
+            for folder in self.checkpoints_folder.iterdir():
+                if folder.name.startswith(".") and not folder.is_symlink():
+                    remove_folder(folder)
+
+    def forget_tally(self) -> None:
+        """Delete the tally: what it says is in the record, or the trial is over.
+
+        Raises:
+            OwnershipLostError: This process had taken the trial, and another one has it now.
+        """
+        # Where it is a folder, it is no tally, and read by nobody.
+        with self.owned(), contextlib.suppress(OSError):
+            self.tally_path.unlink(missing_ok=True)
+
+    def write_log(self, text: str) -> None:
+        """Append a line to the log: what concerns this trial, whatever its process prints elsewhere."""
+        line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
+        with open_to_append(self.log_path) as file:
+            # What an env raised may be no text that UTF-8 has.
+            file.write(line.encode(errors="backslashreplace"))
+
+    def log_tail(self, num_lines: int = 15) -> str:
+        """See `logs.log_tail`: of the trial's last process."""
+        return log_tail(self.log_path, f"trial {self.trial_id}", num_lines)
