@@ -3,6 +3,7 @@
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table
 # make bench   the benchmarks, beside their peers, in one table
+# make docs    the site of all documentation, into site/: open site/index.html
 
 PYTHON ?= python3
 VENV := .venv
@@ -11,7 +12,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test lint types learn kills bench clean
+.PHONY: install sweep test lint types learn kills bench docs clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -31,8 +32,12 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 # Box2D has wheels for some versions of Python only: without it what needs it is skipped, with the reason.
 $(VENV)/installed-test: $(VENV)/installed
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[test,docs]'
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[box2d]' || echo "Box2D cannot be installed here"
+	@touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 $(VENV)/installed-bench: $(VENV)/installed
@@ -66,5 +71,10 @@ kills: $(VENV)/installed-test
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m tests.benchmarks
 
+# Warnings, links that lead nowhere among them, are errors; with --quiet they would not be.
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+	@echo site/index.html
+
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build site *.egg-info .mypy_cache .ruff_cache .pytest_cache

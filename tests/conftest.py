@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 PLUGIN = Path(__file__).parent / "ray" / "env_plugin"
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
 # Under nohup, or in a shell's background, signals are ignored, here and in what is started here. Tests of signals need
 # processes that get them: those that are started find the default in the place of a handler.
@@ -34,7 +35,8 @@ def env_plugin(tmp_path_factory):
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: tune-jobs-test-envs\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text("[gymnasium.envs]\n__root__ = tune_jobs_test_envs:register\n")
-    paths = [str(PLUGIN), str(folder)]
+    # The examples are run in their folders, by a Ray that is started there; this one is there for all tests.
+    paths = [str(PLUGIN), str(folder), str(EXAMPLES / "own_env"), str(EXAMPLES / "own_module")]
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(paths + ([before] if before else []))
     sys.path[:0] = paths

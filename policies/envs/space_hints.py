@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-_HOW = "Wrap it in a module of your own, as README's 'Other spaces' shows"
+_HOW = "Wrap it in a module of your own, as 'Other spaces' in docs/guides/own-environment.md shows"
 _MAX_COMBINATIONS = 10_000
 
 

@@ -66,6 +66,6 @@ def show(rows: Sequence[tuple[str, ...]], num_seeds: int) -> None:
 
 
 def markdown(rows: Sequence[tuple[str, ...]]) -> str:
-    """The table for a README."""
+    """The table for docs/presets.md."""
     lines = [HEADINGS, ("---",) * len(HEADINGS), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |" for cells in lines)

@@ -12,6 +12,8 @@ OWN = {"policies", "analysis", "tune_jobs"}
 # Why something is required that nothing here imports; by distribution.
 NOT_IMPORTED = {
     "build": "the tests build the wheel by `python -m build`",
+    "mkdocs-material": "the theme of the site",
+    "mkdocstrings-python": "a plugin of MkDocs",
     "mypy": "a command",
     "ruff": "a command",
     "pandas-stubs": "types, for mypy",
@@ -58,7 +60,7 @@ def test_the_code_imports_what_it_requires_and_requires_what_it_imports(project,
 
 def test_the_extras_are_what_the_tests_import(project, pytestconfig):
     optional = project["optional-dependencies"]
-    extras = distributions([text for name in ("test", "bench", "box2d", "tpe") for text in optional[name]])
+    extras = distributions([text for name in ("test", "docs", "bench", "box2d", "tpe") for text in optional[name]])
     used = imported(pytestconfig.rootpath, ["tests"])
     assert used - extras - distributions(project["dependencies"]) == set()
     assert extras - used == set(NOT_IMPORTED)

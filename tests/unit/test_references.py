@@ -20,7 +20,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("policies", "analysis", "tune_jobs")
 CODE = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
-TESTS = sorted((ROOT / "tests").rglob("*.py"))
+TESTS = [*sorted((ROOT / "tests").rglob("*.py")), *sorted((ROOT / "docs" / "examples").rglob("*.py"))]
 # CHANGELOG.md names what was: it is not looked at.
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # What decisions were made against has names too; of theirs, files and commands are looked at.

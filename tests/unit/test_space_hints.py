@@ -82,7 +82,7 @@ def refusal(monkeypatch):
 
 @pytest.fixture
 def own_module(tmp_path, monkeypatch):
-    """Writes a module of the user's own, as README shows one, with an expression in it."""
+    """Writes a module of the user's own, as docs/guides/own-environment.md shows one, with an expression in it."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def write(expression):

@@ -1,0 +1,182 @@
+"""Tables of the site that are drawn from the code: fields, hyperparameters, domains, commands, presets, decisions.
+
+Types and ranges are taken from the JSON Schema of the sweep file, which is what editors check by.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.cli.commands import cli
+from tune_jobs.spec.file import json_schema, list_presets
+
+Schema = Mapping[str, Any]
+
+DECISIONS = Path(__file__).parents[1] / "decisions"
+_TYPES = {
+    "integer": "whole number",
+    "number": "number",
+    "string": "text",
+    "boolean": "`true` or `false`",
+    "null": "`null`",
+    "object": "mapping",
+}
+
+
+def sweep_fields() -> str:
+    """The fields of a sweep file, and under a heading each those of its sections."""
+    schema = json_schema()
+    definitions = schema["$defs"]
+    # Empty counts as left out, whatever the field is: the page says so once.
+    fields = {name: field if field.get("default", "") is None else _without_null(field)
+              for name, field in schema["properties"].items()}  # fmt: skip
+    sections = {name: section for name, field in fields.items() if (section := _section(field)) is not None}
+    links = {section: f"mapping, [below](#{name})" for name, section in sections.items()}
+    parts = [_fields({**schema, "properties": fields}, links)]
+    for name, section in sections.items():
+        inner = definitions[section]
+        parts.append(f"## {name}\n\n{inner['description']}\n\n{_fields(inner)}")
+    return "\n\n".join(parts)
+
+
+def hyperparameters() -> str:
+    """The hyperparameters of each algorithm."""
+    definitions = json_schema()["$defs"]
+    parts = []
+    for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items():
+        schema = definitions[model.__name__]
+        parts.append(f"## {algorithm}\n\n{_paragraphs(schema['description'])}\n\n{_fields(schema)}")
+    return "\n\n".join(parts)
+
+
+def domains() -> str:
+    """What may stand in a space."""
+    definitions = json_schema()["$defs"]
+    references = re.findall(r"#/\$defs/(\w+)", json.dumps(definitions["Domain"]))
+    rows = []
+    for name in dict.fromkeys(references):
+        ((kind, field),) = definitions[name]["properties"].items()
+        rows.append((f"`{kind}`", field["description"], definitions[name]["description"]))
+    return _table(("domain", "takes", "gives"), rows)
+
+
+def commands() -> str:
+    """What `--help` prints of each command."""
+    parts = []
+    for name, command in cli.commands.items():
+        # The terminal's width is no business of a page.
+        with click.Context(command, info_name=f"tune-jobs {name}", terminal_width=100) as context:
+            parts.append(f"### {name}\n\n```text\n{command.get_help(context)}\n```")
+    return "\n\n".join(parts)
+
+
+def presets() -> str:
+    """Every preset, with its file."""
+    parts = []
+    for preset in list_presets():
+        facts = {
+            "Source": preset.source, "Shows": preset.shows, "Expected": preset.expected, "Env steps": preset.env_steps,
+            "Time": preset.time,
+        }  # fmt: skip
+        lines = "\n".join(f"- {label}: {_escaped(text)}" for label, text in facts.items() if text)
+        text = "\n\n".join(part for part in (_escaped(preset.title) + ".", lines, _escaped(preset.description)) if part)
+        parts.append(f"### {preset.name}\n\n{text}\n\n```yaml\n{_without_comment(preset.text)}```")
+    return "\n\n".join(parts)
+
+
+def decisions() -> str:
+    """Links to the decisions, by their headings."""
+    found = [(path.name, path.read_text(encoding="utf-8")) for path in sorted(DECISIONS.glob("[0-9]*.md"))]
+    return "\n".join(f"- [{text.partition(chr(10))[0].lstrip('# ')}]({name})" for name, text in found)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    function.__name__.replace("_", "-"): function
+    for function in (sweep_fields, hyperparameters, domains, commands, presets, decisions)
+}
+
+
+def _fields(schema: Schema, links: Mapping[str, str] = {}) -> str:
+    """A table of a mapping's fields; `links` has the words for fields that are mappings themselves, by definition."""
+    required = schema.get("required", ())
+    rows = [
+        (
+            f"`{name}`",
+            " or ".join(dict.fromkeys(_values(field, links))),
+            "must be given" if name in required else _default(field),
+            _escaped(field.get("description", "")),
+        )
+        for name, field in schema["properties"].items()
+    ]
+    return _table(("field", "values", "default", "meaning"), rows)
+
+
+def _values(field: Schema, links: Mapping[str, str]) -> list[str]:
+    """Types and ranges of a field, each in words."""
+    if "$ref" in field:
+        return [links[_section(field) or ""]]
+    if "anyOf" in field:
+        return [words for kind in field["anyOf"] for words in _values(kind, links)]
+    if "prefixItems" in field:
+        return [f"[{', '.join(words for item in field['prefixItems'] for words in _values(item, links))}]"]
+    if "items" in field:
+        return [f"list of: {words}" for words in _values(field["items"], links)]
+    if "enum" in field:
+        return [", ".join(f"`{value}`" for value in field["enum"])]
+    return [" ".join(filter(None, (_TYPES[field.get("type", "object")], _range(field))))]
+
+
+def _range(field: Schema) -> str:
+    low, high = field.get("minimum"), field.get("maximum")
+    if low is not None and high is not None:
+        return f"from {low:,g} to {high:,g}"
+    limits = [("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<")]
+    return ", ".join(f"{sign} {field[key]:,g}" for key, sign in limits if key in field)
+
+
+def _section(field: Schema) -> str | None:
+    """The definition of the mapping that a field is, if it is one."""
+    for kind in (field, *field.get("anyOf", ())):
+        if "$ref" in kind:
+            return str(kind["$ref"]).rpartition("/")[2]
+        if kind is not field and (inner := _section(kind)) is not None:
+            return inner
+    return None
+
+
+def _without_null(field: Schema) -> Schema:
+    kinds = [kind for kind in field.get("anyOf", ()) if kind != {"type": "null"}]
+    return {**field, "anyOf": kinds} if kinds else field
+
+
+def _default(field: Schema) -> str:
+    if "default" in field:
+        default = field["default"]
+        return f"`{default if isinstance(default, str) else json.dumps(default)}`"
+    return "" if _section(field) is not None else "empty"
+
+
+def _table(headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [headings, ("---",) * len(headings), *rows]
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
+
+
+def _paragraphs(text: str) -> str:
+    return re.sub(r"\n(?!\n)\s*", "\n", text)
+
+
+def _escaped(text: str) -> str:
+    """A text that is no Markdown, as Markdown."""
+    return re.sub(r"([\\*_<\[#])", r"\\\1", text)
+
+
+def _without_comment(text: str) -> str:
+    """A preset's file without the comment that it begins with, which the page tells."""
+    return re.sub(r"\A(?:#.*\n)*", "", text)

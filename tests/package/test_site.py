@@ -1,0 +1,114 @@
+"""The site of the documentation: it builds without a warning, its links lead somewhere, and it needs no network."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tune_jobs.spec.domains import DOMAIN_KINDS
+from tune_jobs.spec.file import list_presets
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+pytest.importorskip("mkdocs")
+
+ROOT = Path(__file__).parents[2]
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+MOST_WORDS = 1_300
+
+
+class Page(HTMLParser):
+    """What a page links to and loads, its anchors and its text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.loads, self.anchors, self.text = [], [], set(), ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.anchors |= {found["id"]} if "id" in found else set()
+        if tag == "a" and found.get("href"):
+            self.links.append(found["href"])
+        elif tag == "link" and found.get("rel") not in ("prev", "next", "canonical"):
+            self.loads.append(found["href"])
+        elif found.get("src"):
+            self.loads.append(found["src"])
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)]
+    env = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr  # of warnings, too
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    return {path: Page(path.read_text()) for path in sorted(site.rglob("*.html"))}
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= MOST_WORDS
+
+
+def test_every_link_leads_to_a_page_and_a_place_on_it(site, pages):
+    lost = set()
+    for path, page in pages.items():
+        if path.name == "404.html":  # its links are of a server's root
+            continue
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not target.is_file() or (parts.fragment and parts.fragment not in pages[target].anchors):
+                lost.add(f"{path.relative_to(site)}: {link}")
+    assert lost == set()
+
+
+def test_nothing_is_loaded_from_elsewhere(site, pages):
+    loaded = {(path.relative_to(site), load) for path, page in pages.items() for load in page.loads}
+    assert {(path, load) for path, load in loaded if urlsplit(load).scheme not in ("", "data")} == set()
+    styles = "".join(path.read_text() for path in site.rglob("*.css"))
+    assert re.findall(r"url\(\s*['\"]?(?:https?:)?//|@import", styles) == []
+    # The theme fetches a library where there are diagrams.
+    assert not any('class="mermaid"' in path.read_text() for path in pages)
+
+
+def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site, pages):
+    def text(name):
+        return pages[site / name].text
+
+    fields = {name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields}
+    assert {name for name in fields if name not in text("reference/hyperparameters.html")} == set()
+    known = [*SweepSpec.model_fields, *DOMAIN_KINDS]
+    assert {name for name in known if name not in text("reference/sweep-file.html")} == set()
+    assert {preset.name for preset in list_presets() if preset.expected not in text("presets.html")} == set()
+    assert not any("<!-- table" in path.read_text() for path in pages)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_search_works_in_files_that_no_server_serves(site, tmp_path):
+    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
+    page = f"{(site / 'index.html').as_uri()}?q=vf_clip_param"
+    done = subprocess.run(
+        [CHROMIUM, *flags.split(), "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path}/profile",
+         "--virtual-time-budget=20000", "--dump-dom", page],
+        capture_output=True, text=True, check=True, timeout=600,
+    )  # fmt: skip
+    found = re.findall(r'href="([^"#?]*)[^"]*" class="md-search-result__link"', done.stdout)
+    assert (site / "reference" / "hyperparameters.html").as_uri() in found
