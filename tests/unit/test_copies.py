@@ -11,7 +11,7 @@ from analysis.records import ChangeRecord, CheckpointRecord, TrialRecord
 from analysis.selection import rank_points
 from analysis.tables import trials_frame
 from policies.errors import CheckpointError
-from tune_jobs.store.copies import copied_folder, copy_latest_checkpoint, remove_uncounted_copies
+from tune_jobs.store.copies import copy_latest_checkpoint, remove_uncounted_copies
 from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.trial_loop import TrialLoop
 
@@ -55,7 +55,7 @@ def taken_over(tmp_path, better, iteration=5, episodes=lambda iteration: (20.0,)
 def test_the_trial_goes_on_at_its_own_count_from_the_others_checkpoint(tmp_path, better):
     taken_over(tmp_path, better)
     after = Trial(tmp_path, engine=Recording(), changes=(change(5),))
-    assert after.engine.checkpoint == copied_folder(after.store, 5)
+    assert after.engine.checkpoint == after.store.copied_checkpoint(5)
     assert after.engine.iteration == 20
     assert (after.engine.task.num_iterations, after.engine.task.num_env_steps) == (5, 500)
     assert after.loop.iteration == 5
@@ -80,7 +80,7 @@ def test_a_copy_without_a_change_in_the_record_does_not_count(tmp_path, better):
 def test_a_copy_counts_before_the_trials_own_checkpoint_of_the_same_iteration_which_stays(tmp_path, better):
     taken_over(tmp_path, better, iteration=10)
     after = Trial(tmp_path, engine=Recording(), changes=(change(10),))
-    assert after.engine.checkpoint == copied_folder(after.store, 10)
+    assert after.engine.checkpoint == after.store.copied_checkpoint(10)
     assert 10 in after.kept
 
 
@@ -90,11 +90,11 @@ def test_a_trial_that_is_opened_again_before_it_saved_goes_on_from_the_copy_and_
     first = Trial(tmp_path, engine=Recording(), changes=(change(5),), scores=lambda i: -1.0)
     first.run_to(8)
     again = Trial(tmp_path, engine=Recording(), changes=(change(5),), scores=lambda i: -1.0)
-    assert (again.engine.checkpoint, again.loop.iteration) == (copied_folder(again.store, 5), 5)
+    assert (again.engine.checkpoint, again.loop.iteration) == (again.store.copied_checkpoint(5), 5)
     again.run_to(10)
     last = Trial(tmp_path, engine=Recording(), changes=(change(5),))
     assert last.engine.checkpoint == last.store.checkpoint_folder(10)
-    assert not copied_folder(last.store, 5).exists()
+    assert not last.store.copied_checkpoint(5).exists()
 
 
 def test_a_pause_before_any_training_saves_nothing_with_the_score_of_other_weights(tmp_path, better):
@@ -121,7 +121,7 @@ def test_the_training_return_is_of_the_new_weights_alone(tmp_path, better):
 
 def test_a_damaged_copy_is_set_aside_and_the_trial_goes_on_from_its_own_checkpoint(tmp_path, better):
     taken_over(tmp_path, better)
-    (copied_folder(TrialStore(tmp_path, "t0000"), 5) / "engine.json").write_text("{}")
+    (TrialStore(tmp_path, "t0000").copied_checkpoint(5) / "engine.json").write_text("{}")
     trial = Trial(tmp_path, engine=Recording(), changes=(change(5),))
     assert trial.engine.checkpoint == trial.store.checkpoint_folder(5)
     assert trial.loop.iteration == 5
@@ -134,7 +134,7 @@ def test_a_damaged_checkpoint_is_not_copied(tmp_path, better):
     own = TrialStore(tmp_path, "t0000")
     with pytest.raises(CheckpointError, match=r"engine\.json"):
         copy_latest_checkpoint(better, own, 5)
-    assert not copied_folder(own, 5).exists()
+    assert not own.copied_checkpoint(5).exists()
 
 
 def test_a_checkpoint_that_is_deleted_while_it_is_copied_gives_way_to_the_newer_one(tmp_path, better, monkeypatch):
@@ -191,7 +191,7 @@ def test_copies_that_do_not_count_are_removed(tmp_path, better):
     taken_over(tmp_path, better)
     store = TrialStore(tmp_path, "t0000")
     for name in (".000007", "000007"):
-        shutil.copytree(copied_folder(store, 5), store.folder / "copied" / name)
+        shutil.copytree(store.copied_checkpoint(5), store.folder / "copied" / name)
     remove_uncounted_copies(store, (change(5),))
     assert [path.name for path in (store.folder / "copied").iterdir()] == ["000005"]
     remove_uncounted_copies(store, ())

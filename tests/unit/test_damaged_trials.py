@@ -13,7 +13,6 @@ from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError
 from tune_jobs.store import record_files
 from tune_jobs.store.record_files import seal
-from tune_jobs.store.recovery import latest_damaged
 from tune_jobs.store.trial_store import TrialStore
 
 
@@ -76,7 +75,7 @@ def test_a_checkpoint_set_aside_twice_is_kept_twice(tmp_path):
         (trial.store.checkpoint_folder(4) / "engine.json").write_text("{}")
     Trial(tmp_path)
     assert sorted(path.name for path in (trial.store.folder / "damaged").iterdir()) == ["000004", "000004-2"]
-    assert latest_damaged(trial.store) == 4
+    assert trial.store.latest_damaged() == 4
 
 
 def test_a_whole_checkpoint_that_does_not_restore_is_an_error_and_no_older_one_is_taken(tmp_path):

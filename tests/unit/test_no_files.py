@@ -91,7 +91,7 @@ def keep(folder):
 
 
 def scalars(folder):
-    writer = ScalarWriter(folder)
+    writer = ScalarWriter(SweepStore(folder))
     writer.write(SweepStore(folder).trial("t0000").read_record(), evaluated=True)
     writer.flush()
 

@@ -106,7 +106,7 @@ def write_films(store):
 
 
 def scalars(store):
-    writer = ScalarWriter(store.folder)
+    writer = ScalarWriter(store)
     writer.write(store.trial("t0001").read_record(), evaluated=True)
     writer.flush()
 

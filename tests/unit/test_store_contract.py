@@ -23,6 +23,7 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError, Spec
 from policies.files import open_to_append
 from tune_jobs.store.contract import Assignment
 from tune_jobs.store.ownership import OwnershipLostError
+from tune_jobs.store.probe import answer
 
 SWEEP, TRIAL, RESULTS = "sweep.json", "trials/t0000/trial.json", "trials/t0000/results.jsonl"
 BEST, PACK = "best/evaluation.json", "packs/p00.json"
@@ -116,10 +117,17 @@ def test_a_sweep_is_there_from_its_record_on_and_sweeps_are_listed_by_name(harne
     assert harness.storage().sweep("a").exists()
 
 
-def test_a_name_is_given_once(sweep, another):
-    with pytest.raises(SpecError, match="mine"):
+def test_a_name_is_given_once(harness, sweep, another):
+    for take in (another().create, lambda: harness.storage().new_sweep("mine")):
+        with pytest.raises(SpecError, match="'mine' is already") as raised:
+            take()
+        assert "remove that folder" in raised.value.hint
+    sweep.write_record(make_sweep())
+    with pytest.raises(SpecError) as raised:
         another().create()
+    assert "tune-jobs resume mine" in raised.value.hint
     another().discard()
+    assert harness.storage().new_sweep("mine").name == "mine"
     another().create()
 
 
@@ -311,6 +319,7 @@ def test_results_are_appended_and_replaced(trial, another):
 
 def test_of_damaged_results_the_others_are_read(harness, trial, caplog):
     trial.append_iterations([make_iteration(1)])
+    assert trial.scores_of({1}) == {1: [(100, None)]}
     written = harness.content("mine", RESULTS)
     last = make_iteration(3).model_dump_json().encode()
     harness.put("mine", RESULTS, written + b'\xff{"iteration": 2\n' + last + b'\n{"iteration": 4, "num')
@@ -320,6 +329,9 @@ def test_of_damaged_results_the_others_are_read(harness, trial, caplog):
     assert found.tail == b'{"iteration": 4, "num'
     assert [record.iteration for record in trial.read_iterations()] == [1, 3]
     assert "line 2" in caplog.text
+    assert trial.scores_of({2, 3, 9}) == {3: [(300, None)]}
+    harness.put("mine", RESULTS, harness.content("mine", RESULTS) * 2)
+    assert trial.scores_of([1, 3])[3] == [(300, None)] * 2
 
 
 # -- checkpoints
@@ -427,6 +439,66 @@ def test_an_edited_score_and_another_checkpoints_manifest_are_refused(harness, t
     assert trial.checkpoint(4).evaluation_return == 2.0
 
 
+def test_the_engine_that_is_named_is_in_the_manifest(harness, trial):
+    trial.write_checkpoint(make_checkpoint(3), fill, engine="packed")
+    assert json.loads(harness.content("mine", PLACE + "manifest.json"))["engine"] == "packed"
+
+
+# -- checkpoints of others, and what was damaged
+
+
+def test_a_copy_stays_when_its_checkpoint_is_deleted(sweep, trial, another):
+    other = sweep.trial("t0001")
+    record = make_checkpoint(4, trial_id="t0001")
+    assert not trial.copied_checkpoint(7).exists()
+    for content in ("abc", "newer"):
+        other.write_checkpoint(record, lambda folder: fill(folder, content))  # noqa: B023 (called at once)
+        for iteration in (7, 9):
+            assert trial.copy_checkpoint(other.checkpoint_folder(4), iteration) == record
+        other.delete_checkpoint(record)
+        assert (another().trial("t0000").copied_checkpoint(7) / "state" / "weights").read_text() == content
+    assert trial.checkpoint_iterations() == []
+    trial.remove_copies(keep=[9, 11])
+    assert [trial.copied_checkpoint(iteration).exists() for iteration in (7, 9)] == [False, True]
+    trial.remove_copies()
+    trial.remove_copies()
+    assert not another().trial("t0000").copied_checkpoint(9).exists()
+
+
+def test_nothing_is_copied_of_a_checkpoint_that_is_damaged_or_gone(harness, sweep, trial):
+    other = sweep.trial("t0001")
+    other.write_checkpoint(make_checkpoint(3, trial_id="t0001"), fill)
+    trial.copy_checkpoint(other.checkpoint_folder(3), 7)
+    harness.put("mine", PLACE.replace("t0000", "t0001") + "state/weights", b"abd")
+    before = harness.keys("mine")
+    with pytest.raises(CheckpointError, match="state/weights"):
+        trial.copy_checkpoint(other.checkpoint_folder(3), 7)
+    with pytest.raises((OSError, NotFoundError)):
+        trial.copy_checkpoint(other.checkpoint_folder(4), 7)
+    assert harness.keys("mine") == before
+    assert (trial.copied_checkpoint(7) / "state" / "weights").read_text() == "abc"
+
+
+def test_what_is_set_aside_is_kept_and_taken_for_nothing(harness, trial, another):
+    assert trial.latest_damaged() == 0
+    trial.take()
+    places = []
+    for content in ("one", "two"):
+        trial.write_checkpoint(make_checkpoint(3), lambda folder: fill(folder, content))  # noqa: B023 (called at once)
+        places.append(trial.set_aside(trial.checkpoint_folder(3)))
+    trial.append_iterations([make_iteration(1)])
+    places.append(trial.set_aside_results())
+    assert len(set(places)) == 3
+    kept = [harness.content("mine", f"trials/t0000/{place}/state/weights") for place in places[:2]]
+    assert kept == [b"one", b"two"]
+    assert b'"iteration"' in harness.content("mine", f"trials/t0000/{places[2]}")
+    found = another().trial("t0000")
+    assert (found.checkpoint_iterations(), found.has_results(), found.latest_damaged()) == ([], False, 3)
+    trial.keep_damaged_results([b"\xff", b"{"])
+    trial.keep_damaged_results([b"["])
+    assert harness.content("mine", "trials/t0000/results.damaged") == b"\xff\n{\n[\n"
+
+
 # -- who writes: locks, and owners by epoch
 
 
@@ -490,6 +562,10 @@ def test_who_lost_a_trial_writes_nothing_of_it(harness, trial, another):
         lambda: trial.write_checkpoint(make_checkpoint(2), fill),
         lambda: trial.write_checkpoint(make_checkpoint(1), lambda folder: fill(folder, "other")),
         lambda: trial.delete_checkpoint(make_checkpoint(1)),
+        lambda: trial.set_aside(trial.checkpoint_folder(1)),
+        trial.set_aside_results,
+        lambda: trial.keep_damaged_results([b"x"]),
+        trial.remove_copies,
         trial.forget_tally,
         trial.owned().__enter__,
     ):
@@ -643,7 +719,25 @@ def test_a_report_is_written_over_the_one_before(harness, sweep):
         assert harness.content("mine", "report/index.html") == text
 
 
-# -- of this machine alone
+def test_events_are_appended(harness, trial):
+    for data in (b"one", b"two"):
+        trial.append_events("events.1", data)
+    assert harness.content("mine", "trials/t0000/tensorboard/events.1") == b"onetwo"
+
+
+# -- of machines
+
+
+def test_who_sees_the_same_sweep_can_answer(harness, sweep):
+    before = harness.keys("mine")
+    with sweep.probing() as probe:
+        assert not probe.is_same("", "node")
+        question = answer(probe.place, "node")
+        assert probe.is_same(question, "node")
+        assert not probe.is_same(question, "other")
+        assert not probe.is_same(f"{question}x", "node")
+    assert not probe.is_same(question, "node")
+    assert harness.keys("mine") == before
 
 
 def test_ray_tunes_state_is_begun_anew_and_the_driver_prints_to_a_file(sweep, another):

@@ -7,6 +7,7 @@ import pytest
 from synthetic_sweep import make_sweep
 
 from tune_jobs.store.event_files import ScalarWriter
+from tune_jobs.store.sweep_store import SweepStore
 
 event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
 crc32c = pytest.importorskip("tensorboardX.crc32c")
@@ -37,7 +38,7 @@ def files(folder, trial_id):
 def test_scalars_are_read_back(tmp_path):
     first, second = make_sweep().trials[:2]
     first = first.model_copy(update={"num_env_steps": 300_000, "time_s": 2.0, "training_return": -3.5})
-    writer = ScalarWriter(tmp_path)
+    writer = ScalarWriter(SweepStore(tmp_path))
     writer.write(first, evaluated=False)
     writer.write(
         second.model_copy(update={"num_env_steps": 0, "time_s": 0.0, "training_return": None}), evaluated=False
@@ -61,7 +62,7 @@ def test_scalars_are_read_back(tmp_path):
 def test_a_run_that_goes_on_writes_a_file_of_its_own(tmp_path):
     trial = make_sweep().trials[0]
     for _ in range(2):
-        writer = ScalarWriter(tmp_path)
+        writer = ScalarWriter(SweepStore(tmp_path))
         writer.write(trial, evaluated=True)
         writer.flush()
     assert [len(read(path)) for path in files(tmp_path, trial.trial_id)] == [2, 2]

@@ -40,7 +40,8 @@ from tune_jobs.ray_tune.connected_ray import (
 from tune_jobs.ray_tune.environment import prepare_environment, provide_token
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
-from tune_jobs.store.probe import answer, probing
+from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.probe import answer
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
@@ -225,7 +226,7 @@ def check_storage(folder: Path) -> None:
     Raises:
         CannotRunError: A node does not, or has another version of tune-jobs; the message names it.
     """
-    with probing(folder) as probe:
+    with open_sweep(folder).probing() as probe:
         tasks = {}
         for node in alive_nodes():
             strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)

@@ -18,8 +18,8 @@ from ray.exceptions import RayActorError
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError
 from tune_jobs.ray_tune.run_trials import RunJob, run_trials
+from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.record_keeper import Listener
-from tune_jobs.store.sweep_store import SweepStore
 
 _POLL_INTERVAL_S = 0.5
 # A little of a resource that only the head has: nodes come and go, and the sweep would end with the actor's.
@@ -39,7 +39,7 @@ class RemoteDriver:
         Raises:
             CannotRunError: Another driver runs this sweep.
         """
-        with SweepStore(job.sweep_folder).driver_lock():
+        with open_sweep(job.sweep_folder).driver_lock():
             run_trials(job, self._take)
 
     def _take(self, record: TrialRecord) -> None:

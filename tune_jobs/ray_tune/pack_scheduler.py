@@ -25,10 +25,9 @@ from tune_jobs.ray_tune.early_stopping import grace_env_steps
 from tune_jobs.ray_tune.trainable import compared_by
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import candidates
-from tune_jobs.store.contract import Assignment, Pack
+from tune_jobs.store.contract import Assignment, Pack, Sweep
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import RecordKeeper
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.pack_loop import MemberReport
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ class PackDriver:
 
     def __init__(
         self,
-        store: SweepStore,
+        store: Sweep,
         spec: SweepSpec,
         plan: PackPlan,
         trial_ids: Sequence[str],

@@ -26,7 +26,7 @@ from tune_jobs.ray_tune.trainable import (
     this_node,
     watchdog,
 )
-from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.training.pack_loop import PackLoop
 from tune_jobs.training.protocol import PackEngine
 from tune_jobs.training.registry import make_pack_engine
@@ -42,7 +42,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error comes from there."""
         self._config = config
-        self._files = SweepStore(Path(config["sweep_folder"])).pack(config["pack_id"])
+        self._files = open_sweep(Path(config["sweep_folder"])).pack(config["pack_id"])
         run = owner_of_run(config)
         self._owner = self._files.take(run)
         end_with_driver(config, self._owner)

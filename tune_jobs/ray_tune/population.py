@@ -20,8 +20,8 @@ from tune_jobs.plan.sweep_plan import point_hyperparams
 from tune_jobs.ray_tune.early_stopping import METRIC, WORST_SCORE, OnEvaluations
 from tune_jobs.search.mutation import mutate, mutation_generator
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Sweep
 from tune_jobs.store.copies import copy_latest_checkpoint
-from tune_jobs.store.sweep_store import SweepStore
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController
@@ -44,7 +44,7 @@ class PopulationScheduler(OnEvaluations, PopulationBasedTraining):  # type: igno
         change: Changes fields of a trial's record, on disk too.
     """
 
-    def __init__(self, spec: SweepSpec, store: SweepStore, read: ReadRecord, change: Change) -> None:
+    def __init__(self, spec: SweepSpec, store: Sweep, read: ReadRecord, change: Change) -> None:
         super().__init__(
             time_attr="num_env_steps",
             metric=METRIC,

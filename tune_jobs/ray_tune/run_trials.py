@@ -34,13 +34,13 @@ from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
-from tune_jobs.store.contract import Ownership
+from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
+from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.logs import died_by
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
-from tune_jobs.store.sweep_store import SweepStore
 
 # How long running trials may take to save a checkpoint once they were asked to stop; then they are ended.
 STOP_GRACE_S = 20.0
@@ -73,7 +73,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         CannotRunError: A part of Ray died; the records are written.
     """
     prepare_environment()
-    store = SweepStore(job.sweep_folder)
+    store = open_sweep(job.sweep_folder)
     owner = store.take() if job.run is None else store.owner(job.run)
     with owner.held():
         store.clear_tune_folder()
@@ -109,7 +109,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 class _Run:
     """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
 
-    def __init__(self, job: RunJob, store: SweepStore, listener: Listener, owner: Ownership, watch: RayWatch) -> None:
+    def __init__(self, job: RunJob, store: Sweep, listener: Listener, owner: Ownership, watch: RayWatch) -> None:
         self._job = job
         self._watch = watch
         self._store = self.store = store
@@ -214,9 +214,7 @@ def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
 class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
     """Ends the run when there is nothing to do, or once the running trials have saved, or took too long to."""
 
-    def __init__(
-        self, store: SweepStore, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch
-    ) -> None:
+    def __init__(self, store: Sweep, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch) -> None:
         self._watch = watch
         self._store = store
         self._keeper = keeper
@@ -245,7 +243,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
 class _TrialEvents(tune.Callback):  # type: ignore[misc]
     """Tells the keeper of records what Tune does with the trials."""
 
-    def __init__(self, store: SweepStore, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
+    def __init__(self, store: Sweep, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
         self._store = store
         self._keeper = keeper
         self._timeout_s = timeout_s

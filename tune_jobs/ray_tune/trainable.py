@@ -32,10 +32,9 @@ from tune_jobs.ray_tune.early_stopping import METRIC, WORST_SCORE, grace_env_ste
 from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Ownership
+from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.logs import begin_log
 from tune_jobs.store.progress import Progress
-from tune_jobs.store.recovery import latest_damaged
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.protocol import TrainingEngine, TrialTask
 from tune_jobs.training.registry import make_engine
 from tune_jobs.training.trial_loop import TrialLoop
@@ -85,7 +84,7 @@ class TaskReader:
     """
 
     def __init__(self, sweep_folder: Path) -> None:
-        self.store = SweepStore(sweep_folder)
+        self.store = open_sweep(sweep_folder)
         self.sweep = self.store.read_record()
         self.spec = stored_spec(self.sweep)
 
@@ -155,7 +154,7 @@ def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
 
 def owner_of_run(config: Mapping[str, Any]) -> Ownership | None:
     """The run that a process was started for; None: it was started for none."""
-    return SweepStore(Path(config["sweep_folder"])).owner(config["run"]) if config.get("run") else None
+    return open_sweep(Path(config["sweep_folder"])).owner(config["run"]) if config.get("run") else None
 
 
 def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> None:
@@ -286,7 +285,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         latest = _latest_iteration(folder, trial_id)
         # Newer where the trial went on after a pause and its process died: Tune goes back to the pause's pointer.
         # Older where the one it points to was damaged, and the trial has gone on from the one before.
-        known = max(latest, latest_damaged(SweepStore(folder).trial(trial_id)))
+        known = max(latest, open_sweep(folder).trial(trial_id).latest_damaged())
         if pointer["trial_id"] == trial_id and known < pointer["iteration"]:
             raise CheckpointError(
                 f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is {latest}.",
@@ -305,4 +304,4 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
 def _latest_iteration(folder: Path, trial_id: str) -> int:
     """Of a trial's checkpoints on disk, damaged or not; 0: it has none."""
-    return max(SweepStore(folder).trial(trial_id).checkpoint_iterations(), default=0)
+    return max(open_sweep(folder).trial(trial_id).checkpoint_iterations(), default=0)

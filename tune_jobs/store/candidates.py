@@ -8,32 +8,21 @@ points and seeds apart is not taken from `trial.json` but follows from the trial
 from __future__ import annotations
 
 import functools
-import json
 import logging
-import re
-from collections import defaultdict
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
 from analysis.selection import Selection, select_best
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
-from policies.files import read_regular
 from policies.portable.file import PortablePolicy, read_policy
-from tune_jobs.store.manifests import verify_checkpoint
-from tune_jobs.store.results_file import MAX_RESULTS_BYTES
-from tune_jobs.store.sweep_store import SweepStore
-from tune_jobs.store.trial_store import TrialStore
+from tune_jobs.store.contract import Sweep, Trial
+from tune_jobs.store.names import RESULTS
+from tune_jobs.store.results_file import Scored
 
 _LOG = logging.getLogger(__name__)
-_BEGINNING = re.compile(rb'\{"iteration":\s*(\d{1,18}),')
-"""Of a line as it is written; others are read whole to know of which iteration they are."""
-
-_Numbers = tuple[object, object]
-"""Env steps and evaluation return."""
 
 
-def read_trials(store: SweepStore) -> list[TrialRecord]:
+def read_trials(store: Sweep) -> list[TrialRecord]:
     """The trials, by index, with those checkpoints on disk that may be chosen.
 
     What the records say of checkpoints is not asked: a killed driver's may lag behind what is on disk.
@@ -51,7 +40,7 @@ def read_trials(store: SweepStore) -> list[TrialRecord]:
     return sorted(records, key=lambda record: record.index)
 
 
-def candidates(trial: TrialStore) -> list[CheckpointRecord]:
+def candidates(trial: Trial) -> list[CheckpointRecord]:
     """A trial's checkpoints that may be chosen, oldest first; a warning names each of the others."""
     known: list[CheckpointRecord] = []
     for iteration in trial.checkpoint_iterations():
@@ -61,11 +50,15 @@ def candidates(trial: TrialStore) -> list[CheckpointRecord]:
             # Gone since, if its trial runs on.
             if trial.checkpoint_folder(iteration).exists():
                 leave_out(error)
-    recorded = _recorded(trial.results_path, {record.iteration for record in known})
+    recorded: Mapping[int, Sequence[Scored]] = {}
+    try:
+        recorded = trial.scores_of({record.iteration for record in known})
+    except CheckpointError as error:
+        leave_out(error)
     return [record for record in known if _agrees(trial, record, recorded.get(record.iteration, []))]
 
 
-def choose(store: SweepStore, trials: Sequence[TrialRecord]) -> tuple[Selection, PortablePolicy]:
+def choose(store: Sweep, trials: Sequence[TrialRecord]) -> tuple[Selection, PortablePolicy]:
     """The best whose checkpoint is whole, and its policy; a warning names what would have come before it.
 
     Args:
@@ -79,9 +72,8 @@ def choose(store: SweepStore, trials: Sequence[TrialRecord]) -> tuple[Selection,
     while True:
         selection = select_best(remaining)
         try:
-            folder = store.checkpoint_folder(selection.checkpoint)
-            verify_checkpoint(folder)
-            return selection, read_policy(folder)
+            store.trial(selection.checkpoint.trial_id).verify_checkpoint(selection.checkpoint.iteration)
+            return selection, read_policy(store.checkpoint_folder(selection.checkpoint))
         except NotFoundError as error:
             leave_out(error)
             remaining = [_without(record, selection.checkpoint) for record in remaining]
@@ -111,7 +103,7 @@ def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:
     return {"index": index, "point_index": index // seeds, "seed_index": index % seeds}
 
 
-def _agrees(trial: TrialStore, checkpoint: CheckpointRecord, lines: Sequence[_Numbers]) -> bool:
+def _agrees(trial: Trial, checkpoint: CheckpointRecord, lines: Sequence[Scored]) -> bool:
     """Whether a checkpoint says the same as the results of its iteration, if there are any."""
     # A line may be lost; two are there where two processes wrote at once.
     if checkpoint.evaluation_return is None or not lines:
@@ -122,31 +114,8 @@ def _agrees(trial: TrialStore, checkpoint: CheckpointRecord, lines: Sequence[_Nu
     leave_out(
         CheckpointError(
             f"Checkpoint {trial.checkpoint_folder(checkpoint.iteration)} says that it scored "
-            f"{checkpoint.evaluation_return:g} after {checkpoint.num_env_steps} env steps; {trial.results_path.name} "
+            f"{checkpoint.evaluation_return:g} after {checkpoint.num_env_steps} env steps; {RESULTS} "
             f"says {score} after {steps}."
         )
     )
     return False
-
-
-def _recorded(path: Path, wanted: set[int]) -> dict[int, list[_Numbers]]:
-    """What a trial's results say of some iterations; lines that cannot be read say nothing."""
-    found: defaultdict[int, list[_Numbers]] = defaultdict(list)
-    try:
-        lines = read_regular(path, MAX_RESULTS_BYTES).split(b"\n")[:-1]
-    except FileNotFoundError:
-        return found
-    except OSError as error:
-        leave_out(CheckpointError(f"{path} cannot be read: {error.strerror or error}."))
-        return found
-    for line in lines:
-        begins = _BEGINNING.match(line)
-        if begins is not None and int(begins[1]) not in wanted:
-            continue
-        try:
-            data = json.loads(line)
-            if data["iteration"] in wanted:
-                found[data["iteration"]].append((data["num_env_steps"], data["evaluation_return"]))
-        except (ValueError, LookupError, TypeError, RecursionError):
-            continue
-    return found

@@ -9,10 +9,10 @@ from typing import NoReturn
 
 from analysis.records import FINISHED
 from policies.errors import CannotRunError, TuneJobsError
-from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.contract import Sweep
 
 
-def end_process(store: SweepStore, error: CannotRunError) -> NoReturn:
+def end_process(store: Sweep, error: CannotRunError) -> NoReturn:
     """Write down how the run ended, say why, and end this process as it stands; from any thread."""
     from tune_jobs.process.streams import say_at_last
 
@@ -22,7 +22,7 @@ def end_process(store: SweepStore, error: CannotRunError) -> NoReturn:
     os._exit(error.exit_code)
 
 
-def close_run(store: SweepStore, started: float | None = None) -> None:
+def close_run(store: Sweep, started: float | None = None) -> None:
     """Write down how the run that began then ended; None: it had not begun."""
     interrupted = False
     for trial in store.read_trials():

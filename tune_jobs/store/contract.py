@@ -39,6 +39,7 @@ from typing import Protocol
 
 from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
 from policies.portable.file import PortablePolicy
+from tune_jobs.store.probe import Probe
 from tune_jobs.store.trial_contract import Assignment, Ownership, Pack, Trial
 
 __all__ = ["Assignment", "Ownership", "Pack", "Storage", "Sweep", "Trial"]
@@ -169,6 +170,16 @@ class Sweep(Protocol):
         """The run whose token another process has passed on."""
         ...
 
+    def probing(self) -> AbstractContextManager[Probe]:
+        """Ask, in the block, whether other machines see this very sweep; for who holds its lock, before they run it.
+
+        Each is told the probe's `place` and calls `probe.answer` with it; nothing of it is left after the block.
+
+        Raises:
+            CannotRunError: The sweep cannot be written.
+        """
+        ...
+
     def request_stop(self) -> None:
         """Ask the driver to stop; anybody may."""
         ...
@@ -263,6 +274,15 @@ class Storage(Protocol):
 
         Raises:
             NotFoundError: No sweep can be called so.
+        """
+        ...
+
+    def new_sweep(self, name: str) -> Sweep:
+        """The sweep of a name that is likely free; `Sweep.create` decides.
+
+        Raises:
+            NotFoundError: No sweep can be called so.
+            SpecError: It is taken; the message says what to do with what is there.
         """
         ...
 

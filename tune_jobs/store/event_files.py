@@ -11,12 +11,9 @@ import socket
 import struct
 import time
 from collections import defaultdict
-from pathlib import Path
 
 from analysis.records import TrialRecord
-from policies.files import open_to_append
-from tune_jobs.store.names import EVENTS_FOLDER, TRIALS_FOLDER
-from tune_jobs.store.places import within
+from tune_jobs.store.contract import Sweep
 
 _FILE_VERSION = b"brain.Event:2"
 # Protocol buffers: number of the field, and how it is written.
@@ -28,11 +25,11 @@ class ScalarWriter:
     """Writes a trial's returns and speed against its env steps.
 
     Args:
-        sweep_folder: Files go to trials/<trial id>/tensorboard in it.
+        sweep: Whose trials they are.
     """
 
-    def __init__(self, sweep_folder: Path) -> None:
-        self._folder = sweep_folder
+    def __init__(self, sweep: Sweep) -> None:
+        self._sweep = sweep
         # Of this run: one that goes on with a trial writes a further file beside the earlier ones.
         self._name = f"events.out.tfevents.{int(time.time()):010d}.{time.time_ns() % 10**9:09d}.{socket.gethostname()}"
         self._begun: set[str] = set()
@@ -55,9 +52,7 @@ class ScalarWriter:
     def flush(self) -> None:
         """Append what was added to the files."""
         for trial_id, data in self._unwritten.items():
-            folder = within(self._folder, TRIALS_FOLDER, trial_id, EVENTS_FOLDER)
-            with open_to_append(within(folder, self._name)) as file:
-                file.write(data)
+            self._sweep.trial(trial_id).append_events(self._name, bytes(data))
         self._unwritten.clear()
 
 

@@ -6,7 +6,7 @@ from pathlib import Path, PurePath
 
 from policies.errors import NotFoundError
 from tune_jobs.store.contract import Storage, Sweep
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
+from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores, name_taken
 
 
 def open_storage(folder: Path) -> Storage:
@@ -34,6 +34,12 @@ class LocalStorage:
         if "\0" in name or name in ("", ".", "..") or PurePath(name).name != name:
             raise NotFoundError(f"{name[:80]!r} is no sweep's name.", "List the sweeps with `tune-jobs list`.")
         return SweepStore(self._folder / name)
+
+    def new_sweep(self, name: str) -> SweepStore:
+        """See `Storage.new_sweep`."""
+        if self.is_taken(name):
+            raise name_taken(self.sweep(name).folder)
+        return self.sweep(name)
 
     def is_taken(self, name: str) -> bool:
         """See `Storage.is_taken`."""

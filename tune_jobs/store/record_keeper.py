@@ -13,10 +13,9 @@ from typing import Any
 from analysis.records import TrialRecord
 from policies.envs.tallies import Reached, read_tally
 from policies.errors import fit
-from tune_jobs.store.contract import Ownership
+from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.progress import Progress
-from tune_jobs.store.sweep_store import SweepStore
 
 Listener = Callable[[TrialRecord], None]
 
@@ -44,7 +43,7 @@ class RecordKeeper:
 
     def __init__(
         self,
-        store: SweepStore,
+        store: Sweep,
         trial_ids: Sequence[str],
         listener: Listener,
         clock: Callable[[], float] = time.monotonic,
@@ -56,7 +55,7 @@ class RecordKeeper:
         self._others = [record for record in store.read_trials() if record.trial_id not in self._records]
         self._listener = listener
         self._clock = clock
-        self._scalars = ScalarWriter(store.folder)
+        self._scalars = ScalarWriter(store)
         # Trials whose record on disk is not the newest, and when it was written.
         self._changed: set[str] = set()
         self._written_at: dict[str, float] = {}

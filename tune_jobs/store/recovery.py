@@ -11,16 +11,16 @@ from pathlib import Path
 
 from analysis.records import FORMAT_VERSION, CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
-from policies.files import RefusedFileError, open_to_append, read_regular
+from policies.files import RefusedFileError, read_regular
+from tune_jobs.store.contract import Trial
 from tune_jobs.store.manifests import verify_checkpoint
-from tune_jobs.store.names import DAMAGED_FOLDER, DAMAGED_RESULTS, MANIFEST, RESULTS
+from tune_jobs.store.names import DAMAGED_RESULTS, MANIFEST, RESULTS
 from tune_jobs.store.places import within
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.results_file import ResultsFile
-from tune_jobs.store.trial_store import TrialStore
 
 
-def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
+def take_up_results(trial: Trial) -> tuple[ResultsFile, list[str]]:
     """Read a trial's results, and set aside what of them cannot be read.
 
     The lines stay in results.jsonl until the trial writes what it goes on with.
@@ -36,19 +36,18 @@ def take_up_results(trial: TrialStore) -> tuple[ResultsFile, list[str]]:
     except CheckpointError as error:
         if not isinstance(error.__cause__, RefusedFileError):
             raise
-        target = set_aside(trial, trial.results_path)
+        target = trial.set_aside_results()
         return ResultsFile(), [f"{error.message} It is kept as {target}; the trial goes on without it."]
     unreadable = [bad.content for bad in found.bad] + ([found.tail] if found.tail else [])
     if unreadable:
-        with trial.owned(), open_to_append(within(trial.folder, DAMAGED_RESULTS)) as file:
-            file.write(b"".join(content + b"\n" for content in unreadable))
+        trial.keep_damaged_results(unreadable)
     if found.tail:
         # What every kill may leave, and no damage: it is done again.
         trial.write_log(f"{trial.trial_id}: {RESULTS} ended within a line; it is kept in {DAMAGED_RESULTS}")
     return found, [f"{RESULTS}: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
 
 
-def take_up_checkpoints(trial: TrialStore) -> tuple[list[CheckpointRecord], list[str]]:
+def take_up_checkpoints(trial: Trial) -> tuple[list[CheckpointRecord], list[str]]:
     """The checkpoints a trial goes on with, the last of them verified; damaged ones are set aside.
 
     Of the older ones only the manifests are read: the files are checked before they are used.
@@ -69,56 +68,32 @@ def take_up_checkpoints(trial: TrialStore) -> tuple[list[CheckpointRecord], list
     while known:
         folder = trial.checkpoint_folder(known[-1].iteration)
         try:
-            verify_checkpoint(folder)
+            trial.verify_checkpoint(known[-1].iteration)
             break
         except NotFoundError as error:
             damaged.append((_damaged(folder, error), error))
             known.pop()
     start = f"checkpoint {known[-1].iteration:06d}" if known else "its start: no older one is whole"
     notes = [
-        f"checkpoint {folder.name} is damaged and kept as {set_aside(trial, folder)}; "
+        f"checkpoint {folder.name} is damaged and kept as {trial.set_aside(folder)}; "
         f"the trial goes on from {start}. {error.message}"
         for folder, error in damaged
     ]
     return known, notes
 
 
-def take_up_copy(trial: TrialStore, folder: Path) -> tuple[Path | None, list[str]]:
+def take_up_copy(trial: Trial, folder: Path) -> tuple[Path | None, list[str]]:
     """Another trial's checkpoint that this one goes on from, verified; None, and set aside, if it is damaged."""
     try:
         verify_checkpoint(folder)
     except NotFoundError as error:
-        target = set_aside(trial, _damaged(folder, error), prefix="copied-")
+        target = trial.set_aside(_damaged(folder, error), prefix="copied-")
         note = (
             f"the copied checkpoint {folder.name} is damaged and kept as {target}; the trial goes on from its own "
             f"latest checkpoint, with the values it was given. {error.message}"
         )
         return None, [note]
     return folder, []
-
-
-def set_aside(trial: TrialStore, folder: Path, prefix: str = "") -> str:
-    """Move a folder to where nobody takes it for a checkpoint, or what is no file to where nobody takes it for one.
-
-    Returns:
-        Where it lies now, from the trial's folder.
-    """
-    target = within(trial.folder, DAMAGED_FOLDER, f"{prefix}{folder.name}")
-    number = 1
-    while target.exists():
-        number += 1
-        target = target.with_name(f"{prefix}{folder.name}-{number}")
-    with trial.owned():
-        target.parent.mkdir(exist_ok=True)
-        if folder.exists():
-            folder.replace(target)
-    return f"{DAMAGED_FOLDER}/{target.name}"
-
-
-def latest_damaged(trial: TrialStore) -> int:
-    """Of the checkpoints of a trial that were set aside, the latest one's iteration; 0: there is none."""
-    names = [folder.name.partition("-")[0] for folder in (trial.folder / DAMAGED_FOLDER).glob("[0-9]*")]
-    return max((int(name) for name in names if name.isdecimal()), default=0)
 
 
 def _damaged(folder: Path, error: NotFoundError) -> Path:

@@ -10,8 +10,11 @@ fewest are left out that let the others agree: one number that is far too large 
 
 from __future__ import annotations
 
+import json
+import re
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,9 +24,14 @@ from analysis.records import IterationRecord
 from policies.errors import CheckpointError
 from policies.files import read_regular
 
+_BEGINNING = re.compile(rb'\{"iteration":\s*(\d{1,18}),')
+"""Of a line as it is written; others are read whole to know of which iteration they are."""
 _SHOWN_BYTES = 60
-MAX_RESULTS_BYTES = 2**30
+_MAX_BYTES = 2**30
 """Of a trial of a million iterations."""
+
+Scored = tuple[object, object]
+"""Env steps and evaluation return."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,7 @@ def read_results(path: Path) -> ResultsFile:
         CheckpointError: It is there and cannot be read at all.
     """
     try:
-        *lines, tail = read_regular(path, MAX_RESULTS_BYTES).split(b"\n")
+        *lines, tail = read_regular(path, _MAX_BYTES).split(b"\n")
     except FileNotFoundError:
         return ResultsFile()
     except OSError as error:
@@ -76,6 +84,32 @@ def read_results(path: Path) -> ResultsFile:
     kept = [kept[index] for index in _rising([record.num_env_steps for _, _, record in kept], strictly=False)]
     bad += _contradictions(read, {number for number, _, _ in kept})
     return ResultsFile([record for _, _, record in kept], sorted(bad, key=lambda line: line.number), tail)
+
+
+def read_scores(path: Path, wanted: Collection[int]) -> dict[int, list[Scored]]:
+    """What a trial's results say of some iterations; lines that cannot be read say nothing.
+
+    Raises:
+        CheckpointError: The file is there and cannot be read at all.
+    """
+    found: defaultdict[int, list[Scored]] = defaultdict(list)
+    try:
+        lines = read_regular(path, _MAX_BYTES).split(b"\n")[:-1]
+    except FileNotFoundError:
+        return found
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}.") from error
+    for line in lines:
+        begins = _BEGINNING.match(line)
+        if begins is not None and int(begins[1]) not in wanted:
+            continue
+        try:
+            data = json.loads(line)
+            if data["iteration"] in wanted:
+                found[data["iteration"]].append((data["num_env_steps"], data["evaluation_return"]))
+        except (ValueError, LookupError, TypeError, RecursionError):
+            continue
+    return found
 
 
 def _contradictions(read: Sequence[tuple[int, bytes, IterationRecord]], kept: set[int]) -> list[BadLine]:

@@ -10,6 +10,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
@@ -29,6 +30,7 @@ from tune_jobs.store.places import (
     remove_folder,
     within,
 )
+from tune_jobs.store.probe import Probe, probing
 from tune_jobs.store.record_files import dump, dump_sealed, read_record
 from tune_jobs.store.trial_store import TrialStore
 
@@ -246,6 +248,10 @@ class SweepStore:
     @property
     def _owner_path(self) -> Path:
         return within(self.folder, names.OWNER)
+
+    def probing(self) -> AbstractContextManager[Probe]:
+        """Ask whether other machines see this very folder; see `Sweep.probing`."""
+        return probing(self.folder)
 
     def is_driven(self) -> bool:
         """Whether a process drives this sweep now (on this machine, or on one that shares locks with it)."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
-from tune_jobs.store.results_file import ResultsFile
+from tune_jobs.store.results_file import ResultsFile, Scored
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,14 @@ class Trial(Protocol):
         """
         ...
 
+    def scores_of(self, iterations: Collection[int]) -> Mapping[int, Sequence[Scored]]:
+        """What the results say of some iterations, once for each line of one that can be read.
+
+        Raises:
+            CheckpointError: As `read_results`.
+        """
+        ...
+
     def has_results(self) -> bool:
         """Whether anything has been written as results, readable or not."""
         ...
@@ -216,11 +224,83 @@ class Trial(Protocol):
         """
         ...
 
+    # -- checkpoints of other trials that it goes on from, by the iteration of its own at which it took them over
+
+    def copy_checkpoint(self, folder: Path, iteration: int) -> CheckpointRecord:
+        """Copy a checkpoint whole, and verify the copy; the driver does it, between two iterations of the trial.
+
+        Args:
+            folder: As `checkpoint_folder` of the other trial gave it.
+            iteration: Iterations that this trial has done; a copy of the same is replaced.
+
+        Raises:
+            OSError: Something of it is gone, as its trial has deleted it; nothing was copied.
+            NotFoundError: The same, or it is damaged.
+        """
+        ...
+
+    def copied_checkpoint(self, iteration: int) -> Path:
+        """A local folder with a copy, to read only; one that does not exist if there is none."""
+        ...
+
+    def remove_copies(self, keep: Collection[int] = ()) -> None:
+        """Delete all copies but those of some iterations.
+
+        Raises:
+            OwnershipLostError: This process had taken the trial, and another one has it now.
+        """
+        ...
+
+    # -- what was damaged: set aside, never deleted
+
+    def keep_damaged_results(self, lines: Sequence[bytes]) -> None:
+        """Keep lines that can't be read; they stay in the results until `keep_iterations`.
+
+        Raises:
+            OwnershipLostError: Another process has taken the trial.
+        """
+        ...
+
+    def set_aside_results(self) -> str:
+        """Move what is in the place of the results and can't be read at all; returns where it is, for a message.
+
+        Raises:
+            OwnershipLostError: Another process has taken the trial; it is where it was.
+        """
+        ...
+
+    def set_aside(self, path: Path, prefix: str = "") -> str:
+        """Move a checkpoint or a copy to where nobody takes it for one; several of one iteration are all kept.
+
+        Args:
+            path: As `checkpoint_folder` or `copied_checkpoint` gave it.
+            prefix: Put before its name.
+
+        Returns:
+            Where it is now, for a message.
+
+        Raises:
+            OwnershipLostError: Another process has taken the trial; it is where it was.
+        """
+        ...
+
+    def latest_damaged(self) -> int:
+        """The latest iteration of a checkpoint that was set aside; 0: there is none."""
+        ...
+
     def remove_leftovers(self) -> None:
         """Remove what a killed process had half written or half deleted; for who has taken the trial."""
         ...
 
-    # -- its log and its tally
+    # -- its curves, log and tally
+
+    def append_events(self, name: str, data: bytes) -> None:
+        """Append to one of the trial's event files, which TensorBoard reads; the driver does it.
+
+        Raises:
+            CannotRunError: It cannot be written.
+        """
+        ...
 
     @property
     def log_path(self) -> Path:

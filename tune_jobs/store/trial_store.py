@@ -12,7 +12,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
@@ -24,7 +24,7 @@ from tune_jobs.store.manifests import read_manifest, verify_checkpoint, write_ma
 from tune_jobs.store.ownership import OwnedFolder
 from tune_jobs.store.places import check_trial_id, checkpoint_iteration, make_folder, parts_of, remove_folder, within
 from tune_jobs.store.record_files import dump, read_record
-from tune_jobs.store.results_file import ResultsFile, read_results
+from tune_jobs.store.results_file import ResultsFile, Scored, read_results, read_scores
 
 _LOG = logging.getLogger(__name__)
 
@@ -110,6 +110,19 @@ class TrialStore(OwnedFolder):
             _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
         return found.records
 
+    def scores_of(self, iterations: Collection[int]) -> dict[int, list[Scored]]:
+        """What results.jsonl says of some iterations; see `Trial.scores_of`."""
+        return read_scores(self.results_path, iterations)
+
+    def keep_damaged_results(self, lines: Sequence[bytes]) -> None:
+        """Append lines to results.damaged."""
+        with self.owned(), open_to_append(within(self.folder, names.DAMAGED_RESULTS)) as file:
+            file.write(b"".join(line + b"\n" for line in lines))
+
+    def set_aside_results(self) -> str:
+        """Move what is in the place of results.jsonl; see `Trial.set_aside`."""
+        return self.set_aside(self.results_path)
+
     def has_results(self) -> bool:
         """Whether there is a results.jsonl, with lines or without."""
         return self.results_path.exists()
@@ -191,6 +204,63 @@ class TrialStore(OwnedFolder):
             remove_folder(hidden)
             folder.replace(hidden)
         remove_folder(hidden)
+
+    def copied_checkpoint(self, iteration: int) -> Path:
+        """Where the copy of another trial's checkpoint lies that was taken over at an iteration, or would."""
+        return within(self._copies_folder, f"{iteration:06d}")
+
+    @property
+    def _copies_folder(self) -> Path:
+        return within(self.folder, names.COPIES_FOLDER)
+
+    def copy_checkpoint(self, folder: Path, iteration: int) -> CheckpointRecord:
+        """Copy another trial's checkpoint, and verify the copy; see `Trial.copy_checkpoint`."""
+        final = self.copied_checkpoint(iteration)
+        temporary = final.with_name(f".{final.name}")
+        try:
+            remove_folder(temporary)
+            # Links stay links, which `verify_checkpoint` refuses: what they point to is not to get in here.
+            shutil.copytree(folder, temporary, symlinks=True)
+            record = verify_checkpoint(temporary)
+            remove_folder(final)
+            temporary.replace(final)
+        except BaseException:
+            remove_folder(temporary)
+            raise
+        return record
+
+    def remove_copies(self, keep: Collection[int] = ()) -> None:
+        """Delete the copies of other iterations than these; see `Trial.remove_copies`."""
+        kept = {self.copied_checkpoint(iteration).name for iteration in keep}
+        with self.owned():
+            for path in parts_of(self._copies_folder):
+                if path.name not in kept:
+                    remove_folder(path)
+            with contextlib.suppress(OSError):
+                self._copies_folder.rmdir()
+
+    def set_aside(self, path: Path, prefix: str = "") -> str:
+        """Move a checkpoint or a copy to damaged/; see `Trial.set_aside`."""
+        target = within(self.folder, names.DAMAGED_FOLDER, f"{prefix}{path.name}")
+        number = 1
+        while target.exists():
+            number += 1
+            target = target.with_name(f"{prefix}{path.name}-{number}")
+        with self.owned():
+            target.parent.mkdir(exist_ok=True)
+            if path.exists():
+                path.replace(target)
+        return f"{names.DAMAGED_FOLDER}/{target.name}"
+
+    def latest_damaged(self) -> int:
+        """Of the checkpoints that were set aside, the latest one's iteration; 0: there is none."""
+        found = [path.name.partition("-")[0] for path in (self.folder / names.DAMAGED_FOLDER).glob("[0-9]*")]
+        return max((int(name) for name in found if name.isdecimal()), default=0)
+
+    def append_events(self, name: str, data: bytes) -> None:
+        """Append to an event file in tensorboard/."""
+        with open_to_append(within(self.folder, names.EVENTS_FOLDER, name)) as file:
+            file.write(data)
 
     def remove_leftovers(self) -> None:
         """Delete half-written or half-deleted checkpoints of a process that was killed."""

@@ -8,7 +8,8 @@ from pathlib import Path
 from policies.errors import SpecError
 from policies.files import absolute
 from tune_jobs.spec.sweep_spec import check_sweep_name
-from tune_jobs.store.sweep_store import SweepStore, name_taken
+from tune_jobs.store.local_storage import LocalStorage
+from tune_jobs.store.sweep_store import SweepStore
 
 DEFAULT_STORAGE = "sweeps"
 
@@ -38,22 +39,23 @@ def choose_store(name: str | None, stem: str, storage: Path) -> SweepStore:
     Raises:
         SpecError: The name that was asked for is taken, or is none that a folder can have.
     """
+    kept = LocalStorage(storage)
     if name is not None:
-        store = SweepStore(storage / check_sweep_name(name))
-        if store.folder.exists():
-            raise name_taken(store.folder)
-        return store
+        return kept.new_sweep(check_sweep_name(name))
     # Only the folder's own creation decides who has a name; this finds one that is likely free.
     number = 1
-    while (storage / (candidate := stem if number == 1 else f"{stem}-{number}")).exists():
+    while True:
+        candidate = stem if number == 1 else f"{stem}-{number}"
+        try:
+            check_sweep_name(candidate)
+        except SpecError as error:
+            raise SpecError(
+                f"The sweep would be called {candidate!r}, after its file; that is not allowed as a sweep's name.",
+                f"Give another with --name (in Python name=). {error.hint}",
+            ) from error
+        if not kept.is_taken(candidate):
+            return kept.sweep(candidate)
         number += 1
-    try:
-        return SweepStore(storage / check_sweep_name(candidate))
-    except SpecError as error:
-        raise SpecError(
-            f"The sweep would be called {candidate!r}, after its file; that is not allowed as a sweep's name.",
-            f"Give another with --name (in Python name=). {error.hint}",
-        ) from error
 
 
 def stem_of(source: object) -> str:

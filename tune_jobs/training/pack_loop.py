@@ -23,9 +23,10 @@ from policies.acting.policy import Policy
 from policies.envs.tallies import Reached, end_tally, tally_of
 from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
 from policies.portable.file import PortablePolicy
-from tune_jobs.store.ownership import Owner, OwnershipLostError
+from tune_jobs.store.contract import Ownership
+from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.protocol import IterationStats, PackEngine, TrialTask
 from tune_jobs.training.trial_loop import TrialLoop
 
@@ -161,7 +162,7 @@ class PackLoop:
         max_retries: int,
         watch: Callable[[float], AbstractContextManager[Any]] = contextlib.nullcontext,
         clock: Callable[[], float] = time.perf_counter,
-        under: Owner | None = None,
+        under: Ownership | None = None,
     ) -> None:
         self._engine = engine
         self._evaluator = evaluator
@@ -363,9 +364,9 @@ def _outcome(act: Callable[[], Progress | None]) -> Progress | Exception | None:
 
 def _describe(task: TrialTask, error: Exception) -> str:
     message = str(error) if isinstance(error, TuneJobsError) else f"{type(error).__name__}: {said_by(error)}"
-    return f"{message}\n{SweepStore(task.sweep_folder).trial(task.trial_id).log_tail()}".strip()
+    return f"{message}\n{open_sweep(task.sweep_folder).trial(task.trial_id).log_tail()}".strip()
 
 
 def _log(task: TrialTask, text: str) -> None:
     """Append to a member's own log; the output of the process goes to the pack's."""
-    SweepStore(task.sweep_folder).trial(task.trial_id).write_log(text)
+    open_sweep(task.sweep_folder).trial(task.trial_id).write_log(text)

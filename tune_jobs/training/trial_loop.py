@@ -23,12 +23,12 @@ from policies.errors import NonFiniteWeightsError
 from policies.files import write_plain
 from policies.portable.file import save_policy
 from tune_jobs.store.contract import Ownership
-from tune_jobs.store.copies import pending_copy, remove_copies
+from tune_jobs.store.copies import pending_copy
+from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.names import RESULTS
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.recovery import take_up_checkpoints, take_up_copy, take_up_results
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.training.protocol import IterationStats, TrainingEngine, TrialTask
 
 TRAINING_RETURN_EPISODES = 100
@@ -61,7 +61,7 @@ class TrialLoop:
         self._evaluator = evaluator
         self._clock = clock
         self._under = under
-        self._sweep = SweepStore(task.sweep_folder)
+        self._sweep = open_sweep(task.sweep_folder)
         self._store = self._sweep.trial(task.trial_id)
         self._window: deque[float] = deque(maxlen=TRAINING_RETURN_EPISODES)
         self._last = IterationRecord(iteration=0, num_env_steps=0, num_episodes=0, time_s=0.0)
@@ -336,8 +336,7 @@ class TrialLoop:
         self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]
         self._best = _best_of(self._checkpoints)
         if self.task.changes:
-            with self._store.owned():
-                remove_copies(self._store)
+            self._store.remove_copies()
         self._prune()
 
     def _prune(self) -> None:
