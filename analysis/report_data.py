@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord, finite_or_none
 from analysis.selection import NoUsableTrialError, error_summary, select_best
 from analysis.statistics import mean_with_ci, paired_difference
@@ -21,6 +19,7 @@ from analysis.tables import (
     trials_frame,
 )
 from analysis.wording import NONE, duration, moment, number, return_text, seed_range, shown_path
+from policies import random_streams
 from policies.portable.file import BASELINE_KINDS
 
 _MAX_AVERAGED = 1e150
@@ -84,7 +83,7 @@ def headline(
 def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRecord, folder: Path) -> dict[str, Any]:
     """The winner: its point, both scores, the random baseline, and how to load it."""
     confirmation, random = best.confirmation, best.random
-    rng = np.random.default_rng(0)
+    rng = random_streams.fixed()
     interval = gain = None
     if _have_mean(confirmation.returns):
         interval = mean_with_ci(confirmation.returns, rng=rng)

@@ -16,6 +16,7 @@ from analysis.selection import PointScore, rank_points
 from analysis.statistics import iqm, mean_with_ci, small_sample_note
 from analysis.tables import cell_value, groups_frame, point_names, steps_to_solve_frame, trials_frame
 from analysis.wording import NONE, interval_text, is_number, number, return_text
+from policies import random_streams
 
 MAX_STEPS_ROWS = 20
 """Points that the table of env steps to solve shows; the CSV file beside the report has them all."""
@@ -124,7 +125,7 @@ def point_table(trials: Sequence[TrialRecord]) -> Table:
     if all(point.num_seeds < 2 for point in points):
         return Table([], [])
     names = point_names(trials)
-    rng = np.random.default_rng(0)
+    rng = random_streams.fixed()
     headings = ["rank", *names, "seeds usable", "mean score", "IQM", "95 % interval", "note"]
     return Table(headings, [_point_row(rank, point, names, rng) for rank, point in enumerate(points, start=1)])
 

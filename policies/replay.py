@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from policies import random_streams
 from policies.hyperparams import DQNHyperparams
 
 _MAX_GATHER_BYTES = 64 * 2**20
@@ -235,7 +236,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
 def make_replay(hyperparams: DQNHyperparams, seed: int) -> ReplayBuffer:
     """The replay memory that the hyperparameters name."""
-    rng = np.random.default_rng(seed)
+    rng = random_streams.seeded(seed)
     if hyperparams.replay == "none":
         return LastTransitions(hyperparams.train_batch_size, rng)
     if hyperparams.replay == "prioritized":

@@ -21,6 +21,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from policies import random_streams
 from policies.envs.action_bounds import ToBounds
 from policies.envs.make import check_env
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
@@ -204,10 +205,7 @@ class RandomPolicy(Policy):
 
     def reset(self, seed: int) -> None:
         """Start again from a seed: the same seed gives the same actions."""
-        # Gymnasium seeds an env's generator with this very seed. Another one is derived from it, or the
-        # actions would be drawn from the numbers that the env's start states and noise come from.
-        derived = np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
-        self.action_space.seed(int(derived))
+        self.action_space.seed(random_streams.random_actions_seed(seed))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         actions = [self.action_space.sample() for _ in range(len(observations))]

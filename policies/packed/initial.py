@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from policies import random_streams
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 from policies.networks.parts import DQNNetworks, PPONetworks, model_config
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
@@ -48,5 +49,5 @@ def new_member(
         seed,
         weights,
         kl_coeff=hyperparams.kl_coeff if isinstance(hyperparams, PPOHyperparams) else 0.0,
-        rng=np.random.default_rng(np.random.SeedSequence([seed, 0])),
+        rng=random_streams.member_draws(seed),
     )

@@ -52,7 +52,7 @@ class Member:
     num_target_updates: int = 0
     failure_penalty: float | None = None
     """Of its environments: reward of steps that end by failure; None: their own."""
-    rng: np.random.Generator = field(default_factory=np.random.default_rng)
+    rng: np.random.Generator = field(kw_only=True)
     """Draws actions, permutations and batches."""
 
 

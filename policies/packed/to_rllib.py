@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
+from policies import random_streams
 from policies.errors import CheckpointError
 from policies.packed.member import Member
 from policies.packed.state import STATE_FOLDER, load_member
@@ -65,8 +65,8 @@ def to_algorithm(
     Raises:
         CheckpointError: The weights are not those of the network the hyperparameters describe, or not the expected.
     """
-    words = np.random.SeedSequence([member.seed, member.num_iterations]).generate_state(1)
-    seed = int(words[0]) % 2**31 if member.num_iterations else member.seed
+    later, _ = random_streams.seeds_after(member.seed, member.num_iterations)
+    seed = later % 2**31 if member.num_iterations else member.seed
     algorithm = build_algorithm_config(
         member.hyperparams, env_id=env_id, env_args=env_args, seed=seed, **settings
     ).build_algo()

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from policies import random_streams
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tune_jobs.search.mutation import mutate, mutation_generator
+from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.rules import FIXED_IN_A_POPULATION
 
@@ -58,9 +59,9 @@ def test_the_resample_probability_is_the_share_of_values_drawn_anew():
 
 
 def test_the_same_trial_and_change_give_the_same_mutation_and_others_another():
-    draws = {key: mutation_generator(*key).random() for key in [(0, 1, 0), (0, 1, 1), (0, 2, 0), (1, 1, 0)]}
+    draws = {key: random_streams.mutation(*key).random() for key in [(0, 1, 0), (0, 1, 1), (0, 2, 0), (1, 1, 0)]}
     assert len(set(draws.values())) == 4
-    assert mutation_generator(0, 1, 1).random() == draws[0, 1, 1]
+    assert random_streams.mutation(0, 1, 1).random() == draws[0, 1, 1]
 
 
 def test_all_names_that_are_refused_exist():

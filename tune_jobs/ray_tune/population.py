@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 from ray.tune.schedulers import PopulationBasedTraining
 
 from analysis.records import ChangeRecord, TrialRecord
+from policies import random_streams
 from policies.errors import CheckpointError, SpecError
 from tune_jobs.plan.sweep_plan import point_hyperparams
 from tune_jobs.ray_tune.early_stopping import METRIC, WORST_SCORE, OnEvaluations
-from tune_jobs.search.mutation import mutate, mutation_generator
+from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.copies import copy_latest_checkpoint
@@ -78,7 +79,7 @@ class PopulationScheduler(OnEvaluations, PopulationBasedTraining):  # type: igno
         better = [other for other, score in scores.items() if score > self._trial_state[trial].last_score]
         if trial in lower_quantile and better:
             record = self._read(_name(trial))
-            rng = mutation_generator(self._spec.seed, record.index, len(record.changes))
+            rng = random_streams.mutation(self._spec.seed, record.index, len(record.changes))
             chosen = better[int(rng.integers(len(better)))]
             try:
                 point = self._mutated(self._read(_name(chosen)).point, rng)

@@ -18,15 +18,6 @@ FACTORS = (0.8, 1.2)
 """What a number is multiplied with if it isn't drawn anew; Jaderberg et al. use these two."""
 
 
-_SPAWN_KEY = 4  # 0 to 3 belong to points and seeds
-
-
-def mutation_generator(sweep_seed: int, trial_index: int, num_changes: int) -> np.random.Generator:
-    """The generator of a trial's next mutation: the same in every run of a sweep."""
-    sequence = np.random.SeedSequence(sweep_seed, spawn_key=(_SPAWN_KEY, trial_index, num_changes))
-    return np.random.default_rng(sequence)
-
-
 def mutate(
     point: Mapping[str, Any], space: Mapping[str, Domain], rng: np.random.Generator, resample_probability: float
 ) -> dict[str, Any]:

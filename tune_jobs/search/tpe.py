@@ -19,9 +19,8 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from analysis.records import FINISHED, TrialRecord
+from policies import random_streams
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.spec.domains import Domain, Listed, Range, draw_point
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -29,7 +28,6 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 if TYPE_CHECKING:
     import optuna
 
-_SPAWN_KEY = 5  # 0 to 4 belong to points, seeds and mutations
 _ATTEMPTS = 100
 
 Check = Callable[[dict[str, Any]], object]
@@ -70,12 +68,14 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: 
     known = _known_trials(spec, records)
     if sum(trial.state.is_finished() for trial in known) < spec.search.num_startup_trials:
         return draw_point(spec.space, point_index, spec.seed)
-    words = np.random.SeedSequence(spec.seed, spawn_key=(_SPAWN_KEY, point_index)).generate_state(1)
     with warnings.catch_warnings():
         # Of arguments that are new in Optuna 4.
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         sampler = optuna.samplers.TPESampler(
-            seed=int(words[0]), n_startup_trials=0, multivariate=True, constant_liar=True
+            seed=random_streams.tpe_seed(spec.seed, point_index),
+            n_startup_trials=0,
+            multivariate=True,
+            constant_liar=True,
         )
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)

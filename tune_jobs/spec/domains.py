@@ -21,10 +21,8 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
+from policies import random_streams
 from policies.suggestions import did_you_mean
-
-# First element of the spawn keys of points; seeds.py uses 1 and up.
-POINTS_SPAWN_KEY = 0
 
 
 def _refuse_coercion(value: Any) -> Any:
@@ -367,7 +365,7 @@ def draw_point(
         given: Values that are not drawn.
     """
     given = given or {}
-    rng = np.random.default_rng(np.random.SeedSequence(sweep_seed, spawn_key=(POINTS_SPAWN_KEY, index)))
+    rng = random_streams.point_values(sweep_seed, index)
     return {name: given[name] if name in given else domain.sample(rng) for name, domain in space.items()}
 
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from policies import random_streams
+
 SEEDS_PER_TRIAL = 1024
 MAX_EPISODES = 2**18
 
@@ -19,8 +21,6 @@ _EVALUATION_START = 0
 _CONFIRMATION_START = 2**19
 _TRAINING_START = 2**20
 _SEED_END = 2**31
-# First element of each spawn key; 0 belongs to the points (search_space.py).
-_TRAINING_KEY, _EVALUATION_KEY, _CONFIRMATION_KEY = 1, 2, 3
 
 
 def trial_seeds(sweep_seed: int, num_trials: int) -> list[int]:
@@ -42,7 +42,7 @@ def trial_seeds(sweep_seed: int, num_trials: int) -> list[int]:
     taken: set[int] = set()
     seeds = []
     for index in range(num_trials):
-        rng = np.random.default_rng(np.random.SeedSequence(sweep_seed, spawn_key=(_TRAINING_KEY, index)))
+        rng = random_streams.training_block(sweep_seed, index)
         block = int(rng.integers(first, end))
         while block in taken:
             block = int(rng.integers(first, end))
@@ -53,18 +53,17 @@ def trial_seeds(sweep_seed: int, num_trials: int) -> list[int]:
 
 def evaluation_seeds(sweep_seed: int, num_episodes: int) -> tuple[int, ...]:
     """Seeds of the episodes by which all trials of a sweep are compared, consecutive, in [0, 2**19)."""
-    return _consecutive(sweep_seed, num_episodes, _EVALUATION_KEY, _EVALUATION_START)
+    return _consecutive(random_streams.evaluation_start(sweep_seed), num_episodes, _EVALUATION_START)
 
 
 def confirmation_seeds(sweep_seed: int, num_episodes: int) -> tuple[int, ...]:
     """Seeds of the episodes on which the winner is measured again, consecutive, in [2**19, 2**20)."""
-    return _consecutive(sweep_seed, num_episodes, _CONFIRMATION_KEY, _CONFIRMATION_START)
+    return _consecutive(random_streams.confirmation_start(sweep_seed), num_episodes, _CONFIRMATION_START)
 
 
-def _consecutive(sweep_seed: int, num_episodes: int, key: int, start: int) -> tuple[int, ...]:
+def _consecutive(rng: np.random.Generator, num_episodes: int, start: int) -> tuple[int, ...]:
     if num_episodes > MAX_EPISODES:
         raise ValueError(f"{num_episodes} episodes are more than the {MAX_EPISODES} there are seeds for")
-    rng = np.random.default_rng(np.random.SeedSequence(sweep_seed, spawn_key=(key,)))
     # The offset doesn't depend on the number of episodes: more episodes append seeds and change none.
     first = start + int(rng.integers(0, MAX_EPISODES))
     return tuple(range(first, first + num_episodes))

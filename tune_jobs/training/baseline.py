@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies import random_streams
 from policies.acting.baselines import baseline_policy
 from policies.acting.evaluate import Resettable
 from policies.acting.load import policy_from_portable
@@ -45,7 +46,7 @@ class BaselineEngine:
         if checkpoint is not None:
             self._iteration, self._num_env_steps = _read_state(checkpoint / STATE_FILE)
             # Other episodes than those it has played already.
-            seed = int(np.random.SeedSequence([task.seed, self._iteration]).generate_state(1)[0])
+            seed, _ = random_streams.seeds_after(task.seed, self._iteration)
         # The failure penalty is for learning alone: returns are those of the env itself.
         env = make_vector_env(task.env_id, task.env_args, hyperparams.num_envs)
         self._env = CheckedEnvs(env, task.env_id)

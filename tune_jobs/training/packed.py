@@ -7,9 +7,9 @@ from collections.abc import Hashable
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import torch
 
+from policies import random_streams
 from policies.errors import CheckpointError
 from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.envs.make import choose_kind, make_packed_envs, measure_step
@@ -65,8 +65,7 @@ class PackedEngine:
             if checkpoint is not None:
                 member = _restored(member, checkpoint)
                 # Other numbers than at the trial's start: its environments begin new episodes.
-                words = np.random.SeedSequence([task.seed, member.num_iterations, 1]).generate_state(1)
-                env_seed = int(words[0])
+                env_seed = random_streams.member_env_seed_after(task.seed, member.num_iterations)
             member.failure_penalty = task.failure_penalty
             stack.add(member, env_seed)
         except BaseException:

@@ -11,6 +11,7 @@ import torch
 from ray.rllib.algorithms.algorithm import Algorithm as RLlibAlgorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
 
+from policies import random_streams
 from policies.errors import CannotRunError
 from policies.hyperparams import Algorithm, DQNHyperparams, TrainedHyperparams, make_hyperparams
 from policies.portable.file import PortablePolicy, read_policy
@@ -116,17 +117,16 @@ class RLlibEngine:
         """
         assert self._task is not None
         iteration = int(checkpoint.name) if checkpoint.name.isdigit() else 0
-        words = np.random.SeedSequence([self._task.seed, iteration]).generate_state(2)
-        torch.manual_seed(int(words[0]))
-        np.random.seed(int(words[0]))  # noqa: NPY002 (RLlib's connectors draw from the global one)
-        seed = int(words[1])
+        own, seed = random_streams.seeds_after(self._task.seed, iteration)
+        torch.manual_seed(own)
+        np.random.seed(own)  # noqa: NPY002 (RLlib's connectors draw from the global one)
 
         def reseed(runner: ArrayEnvRunner) -> None:
             runner.reseed(seed)
 
         self.algorithm.env_runner_group.foreach_env_runner(reseed)
         if isinstance(self._hyperparams, DQNHyperparams):
-            self.algorithm.seed_replay(int(words[0]))
+            self.algorithm.seed_replay(own)
             # As much as it had when learning began; with no replay, the next steps fill it.
             num_steps = max(self._hyperparams.learning_starts, self._hyperparams.train_batch_size)
             if self._hyperparams.replay != "none" and self.algorithm.num_updates:

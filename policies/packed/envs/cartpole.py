@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
 from numpy.typing import NDArray
 
+from policies import random_streams
 from policies.envs.make import make_env, make_vector_env
 from policies.errors import EnvError
 from policies.packed.envs.penalty import Penalty
@@ -159,7 +160,7 @@ class CartPoleEnvs:
     def add(self, member_id: str, seed: int) -> None:
         """See `PackedEnvs.add`."""
         self._members.add(member_id)
-        generator = self._generators[member_id] = np.random.default_rng(seed)
+        generator = self._generators[member_id] = random_streams.seeded(seed)
         rows = self._rows
         states = rows.draw_starts(generator, self.num_envs)
         lengths = np.zeros(self.num_envs, dtype=np.int32)

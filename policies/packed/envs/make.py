@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from policies import random_streams
 from policies.envs.checked import reward_as_number
 from policies.envs.make import make_env
 from policies.errors import EnvError
@@ -153,7 +154,7 @@ def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> floa
     num_envs, num_steps = 64, 50
     envs = make_packed_envs(env_id, env_args, num_envs, kind="vectorised")
     envs.add("", 0)
-    actions = np.random.default_rng(0).integers(0, 2, (num_steps, num_envs))
+    actions = random_streams.fixed().integers(0, 2, (num_steps, num_envs))
     envs.step(actions[0])
     begin = time.perf_counter()
     envs.begin(num_steps)

@@ -1,0 +1,120 @@
+"""Every stream of random numbers is derived here, so that no two are the same by mistake.
+
+From the seed of a sweep, by `spawn_key` of `numpy.random.SeedSequence`:
+
+| spawn key | stream |
+|---|---|
+| (0, point) | a point's values, where they are drawn at random |
+| (1, trial) | where the block of a trial's training seeds begins |
+| (2,) | where the evaluation seeds begin |
+| (3,) | where the confirmation seeds begin |
+| (4, trial, change) | population based training: what a trial's change number `change` makes of its values |
+| (5, point) | search method tpe: its sampler |
+
+From the seed of a trial, which is entropy together with further numbers. A trial that goes on from iteration i > 0 does
+so with other numbers than it began with, as only packs save the state of theirs:
+
+| entropy | stream |
+|---|---|
+| the seed itself | weights, environments; engine rllib: exploration, batches and permutations |
+| [seed, 0] | packs: what a member draws: actions, permutations, batches |
+| [seed, i] | engine rllib and random policies, and a pack's checkpoint restored as an Algorithm: all of the above |
+| [seed, i, 1] | packs: environments |
+
+Random policies in evaluations draw from [the episode's seed]. Resampling in reports, and trial steps of environments
+that are measured, begin at a fixed seed. What an environment does with its seed is Gymnasium's matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+_POINT, _TRAINING, _EVALUATION, _CONFIRMATION, _MUTATION, _TPE = range(6)
+"""First elements of spawn keys: whoever needs a new stream takes the next number and adds a row above."""
+
+
+def _spawned(sweep_seed: int, *spawn_key: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(sweep_seed, spawn_key=spawn_key)
+
+
+def _words(entropy: int | Sequence[int], num_words: int) -> list[int]:
+    return [int(word) for word in np.random.SeedSequence(entropy).generate_state(num_words)]
+
+
+def seeded(seed: int) -> np.random.Generator:
+    """The generator of a seed itself."""
+    return np.random.default_rng(seed)
+
+
+def fixed() -> np.random.Generator:
+    """The same numbers each time, for what belongs to no sweep or must not differ between two looks at one."""
+    return seeded(0)
+
+
+# From a sweep's seed.
+
+
+def point_values(sweep_seed: int, point_index: int) -> np.random.Generator:
+    """Draws the values of a point."""
+    return np.random.default_rng(_spawned(sweep_seed, _POINT, point_index))
+
+
+def training_block(sweep_seed: int, trial_index: int) -> np.random.Generator:
+    """Draws which block of training seeds is a trial's."""
+    return np.random.default_rng(_spawned(sweep_seed, _TRAINING, trial_index))
+
+
+def evaluation_start(sweep_seed: int) -> np.random.Generator:
+    """Draws the first evaluation seed."""
+    return np.random.default_rng(_spawned(sweep_seed, _EVALUATION))
+
+
+def confirmation_start(sweep_seed: int) -> np.random.Generator:
+    """Draws the first confirmation seed."""
+    return np.random.default_rng(_spawned(sweep_seed, _CONFIRMATION))
+
+
+def mutation(sweep_seed: int, trial_index: int, num_changes: int) -> np.random.Generator:
+    """Draws what population based training makes of a trial's values next: the same in every run of a sweep."""
+    return np.random.default_rng(_spawned(sweep_seed, _MUTATION, trial_index, num_changes))
+
+
+def tpe_seed(sweep_seed: int, point_index: int) -> int:
+    """Seed of the sampler that proposes a point."""
+    return int(_spawned(sweep_seed, _TPE, point_index).generate_state(1)[0])
+
+
+# From a trial's seed.
+
+
+def member_draws(trial_seed: int) -> np.random.Generator:
+    """What a new member of a pack draws from."""
+    return np.random.default_rng(np.random.SeedSequence([trial_seed, 0]))
+
+
+def seeds_after(trial_seed: int, iteration: int) -> tuple[int, int]:
+    """Two seeds for a trial that goes on after an iteration: its own, and its environments'.
+
+    Where one does for both, it is the first.
+    """
+    first, second = _words([trial_seed, iteration], 2)
+    return first, second
+
+
+def member_env_seed_after(trial_seed: int, iteration: int) -> int:
+    """Seed of the environments of a pack's member that goes on after an iteration: they begin new episodes."""
+    return _words([trial_seed, iteration, 1], 1)[0]
+
+
+# From an episode's seed.
+
+
+def random_actions_seed(episode_seed: int) -> int:
+    """Seed of a random policy's actions in an episode.
+
+    Gymnasium seeds an env's generator with the episode's very seed: actions drawn from that would be drawn from the
+    numbers that the env's start states and noise come from.
+    """
+    return int(np.random.SeedSequence(episode_seed).generate_state(1, np.uint64)[0])
