@@ -31,7 +31,7 @@ _OTHERS = "other trials need the idle CPUs"
 
 
 @dataclass(frozen=True)
-class Member:
+class TrialToPack:
     """A trial that is to be packed."""
 
     trial_id: str
@@ -43,7 +43,7 @@ class Member:
     """Its sub-environments; where its point is not known, the fewest that it may have."""
 
 
-def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[Member], *, may_spread: bool) -> PackPlan:
+def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack], *, may_spread: bool) -> PackPlan:
     """Plan the packs of a sweep.
 
     Args:
@@ -91,7 +91,7 @@ def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, in
 
 
 def _by_memory(
-    machine: Machine, members: Sequence[Member], num_packs: int, slots: int, cpus: float
+    machine: Machine, members: Sequence[TrialToPack], num_packs: int, slots: int, cpus: float
 ) -> tuple[int, int, tuple[str, ...]]:
     """As many packs and slots of those as memory allows, and the note that says so if they are fewer."""
     largest = heapq.nlargest(slots, (member.num_bytes for member in members))
@@ -136,9 +136,9 @@ def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most
     return 0, f"there is not an idle CPU for each of the {num_packs} packs"
 
 
-def _in_stacks(members: Sequence[Member]) -> list[Member]:
+def _in_stacks(members: Sequence[TrialToPack]) -> list[TrialToPack]:
     """Those of one key together, in the order in which keys are first met; those that have none yet last."""
-    stacks: dict[tuple[Any, ...] | None, list[Member]] = {}
+    stacks: dict[tuple[Any, ...] | None, list[TrialToPack]] = {}
     for member in members:
         stacks.setdefault(member.key, []).append(member)
     unknown = stacks.pop(None, [])

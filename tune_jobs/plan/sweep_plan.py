@@ -26,7 +26,7 @@ from tune_jobs.plan.env_checks import check_env_args, check_env_rules
 from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
 from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.pack_plan import Member, plan_packs
+from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
 from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.tpe import check_installed
@@ -236,7 +236,7 @@ def _trials(
     return tuple(planned), choice.notes
 
 
-def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[Member]:
+def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[TrialToPack]:
     """Those of the trials that are packed; `memory` is of each point's trials."""
     members = []
     # Points that are chosen later have as many sub-environments as the others, or it is not known how many.
@@ -246,7 +246,7 @@ def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequ
             values = points[trial.point_index][1]
             key = None if values is None else pack_key(values)
             fewest = fewest_known if values is None else values.num_envs
-            members.append(Member(trial.trial_id, key, memory[trial.point_index], fewest))
+            members.append(TrialToPack(trial.trial_id, key, memory[trial.point_index], fewest))
     return members
 
 

@@ -38,7 +38,7 @@ _DEATHS_IN_COMPANY = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class _Member:
+class _TrialForTune:
     """What Tune's schedulers need of a trial."""
 
     trial_id: str
@@ -193,7 +193,7 @@ class PackDriver:
             reason = f"scheduler, at {progress.num_env_steps} env steps"
             progress = dataclasses.replace(progress, stop_reason=reason)
         self._keeper.progressed(trial_id, progress, node=node, pid=pid)
-        member, compared = _Member(trial_id), compared_by(progress, self._grace)
+        member, compared = _TrialForTune(trial_id), compared_by(progress, self._grace)
         if progress.status == "running":
             if trial_id in pack.ending:
                 return
@@ -260,7 +260,7 @@ class PackDriver:
             self._known.add(trial_id)
             if self._choose is not None:
                 self._choose(trial_id)
-            self._scheduler.on_trial_add(self._controller, _Member(trial_id))
+            self._scheduler.on_trial_add(self._controller, _TrialForTune(trial_id))
         pack.members[trial_id] = None
         if pack.is_up:
             self._keeper.started(trial_id)

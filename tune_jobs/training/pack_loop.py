@@ -96,7 +96,7 @@ class _MemberEngine:
             self.is_built = False
 
 
-class _Member:
+class _TrialInPack:
     """A trial of the pack; every try of it has an engine and a loop of its own."""
 
     def __init__(self, task: TrialTask, num_failures: int) -> None:
@@ -172,7 +172,7 @@ class PackLoop:
         self._max_retries = max_retries
         self._watch = watch
         self._clock = clock
-        self._members: dict[str, _Member] = {}
+        self._members: dict[str, _TrialInPack] = {}
         self._reports: list[MemberReport] = []
         self._lock = threading.Lock()
         # Saving is waiting for the disk, for which one need not wait for the other.
@@ -190,7 +190,7 @@ class PackLoop:
             task: The trial.
             num_failures: How often it has failed before.
         """
-        self._members[task.trial_id] = _Member(task, num_failures)
+        self._members[task.trial_id] = _TrialInPack(task, num_failures)
 
     def end(self, trial_id: str) -> None:
         """Save a member and let it go; it is reported as stopped."""
@@ -238,7 +238,7 @@ class PackLoop:
                 self._open(member)
         if not self._members:
             return False
-        due: list[_Member] = []
+        due: list[_TrialInPack] = []
         with self._watch(max(member.task.iteration_timeout_s for member in self._members.values())):
             stop = self._stop_requested()
             acts = {member: functools.partial(member.trial.before_iteration, stop=stop) for member in self._all}
@@ -246,7 +246,7 @@ class PackLoop:
             if not self._members:
                 return False
             results = self._engine.train_iteration()
-            evaluations: dict[_Member, Episodes | Exception | None] = {}
+            evaluations: dict[_TrialInPack, Episodes | Exception | None] = {}
             for member in self._all:
                 stats = results[member.task.trial_id]
                 if isinstance(stats, Exception):
@@ -262,10 +262,10 @@ class PackLoop:
         return bool(due)
 
     @property
-    def _all(self) -> list[_Member]:
+    def _all(self) -> list[_TrialInPack]:
         return list(self._members.values())
 
-    def _conclude(self, evaluations: Mapping[_Member, Episodes | Exception | None]) -> None:
+    def _conclude(self, evaluations: Mapping[_TrialInPack, Episodes | Exception | None]) -> None:
         acts = {}
         for member, evaluation in evaluations.items():
             if isinstance(evaluation, Exception) and not isinstance(evaluation, NonFiniteWeightsError):
@@ -275,7 +275,7 @@ class PackLoop:
         self._attempt(acts, saves=any(member.may_save for member in acts))
 
     def _attempt(
-        self, acts: Mapping[_Member, Callable[[], Progress | None]], *, saves: bool, leaves: bool = False
+        self, acts: Mapping[_TrialInPack, Callable[[], Progress | None]], *, saves: bool, leaves: bool = False
     ) -> None:
         """Do what concerns single members: what goes wrong with one is its own failure.
 
@@ -291,7 +291,7 @@ class PackLoop:
             elif outcome is not None:
                 self._told(member, outcome)
 
-    def _told(self, member: _Member, progress: Progress) -> None:
+    def _told(self, member: _TrialInPack, progress: Progress) -> None:
         if progress.status == "running" and not progress.evaluated:
             member.unreported = progress
             return
@@ -306,11 +306,11 @@ class PackLoop:
         if progress.status != "running":
             self._let_go(member)
 
-    def _let_go(self, member: _Member) -> None:
+    def _let_go(self, member: _TrialInPack) -> None:
         member.close()
         del self._members[member.task.trial_id]
 
-    def _open(self, member: _Member) -> None:
+    def _open(self, member: _TrialInPack) -> None:
         member.engine = _MemberEngine(self._engine, member.task.trial_id, self._lock)
         member.loop = TrialLoop(member.task, member.engine, self._evaluator, self._clock, self._under)
         try:
@@ -319,7 +319,7 @@ class PackLoop:
         except Exception as error:  # noqa: BLE001 (it must not end the others)
             self._failed(member, error)
 
-    def _failed(self, member: _Member, error: Exception, *, leaves: bool = False) -> None:
+    def _failed(self, member: _TrialInPack, error: Exception, *, leaves: bool = False) -> None:
         """Report a failure; the member is opened again, if it may be and was not to leave."""
         if _is_lost(member, error):
             _log(member.task, "another process trains this trial by now; this one leaves it")
@@ -341,7 +341,7 @@ class PackLoop:
             member.close()
 
 
-def _is_lost(member: _Member, error: Exception) -> bool:
+def _is_lost(member: _TrialInPack, error: Exception) -> bool:
     """Whether what went wrong is that another process has the member, or may come from that."""
     if isinstance(error, OwnershipLostError):
         return True
