@@ -9,18 +9,18 @@ import numpy as np
 import torch
 
 from policies import random_streams
-from policies.hyperparams import PPOHyperparams, TrainedHyperparams
+from policies.hyperparams import PPOHyperparams
 from policies.networks.parts import DQNNetworks, PPONetworks, model_config
-from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
+from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, H, Member, Weights
 
 
 def new_member(
     member_id: str,
-    hyperparams: TrainedHyperparams,
+    hyperparams: H,
     seed: int,
     observation_space: gym.Space[Any],
     action_space: gym.Space[Any],
-) -> Member:
+) -> Member[H]:
     """A member that has not trained yet.
 
     Its weights are, to the last bit, those of `RLModuleSpec.build()` after `torch.manual_seed(seed)`: the same parts

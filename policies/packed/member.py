@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -24,15 +24,19 @@ OBS_MEAN, OBS_VAR, OBS_COUNT = "obs_mean", "obs_var", "obs_count"
 TARGET_PREFIX = "_target_"
 
 
+H = TypeVar("H", bound=TrainedHyperparams)
+H_co = TypeVar("H_co", bound=TrainedHyperparams, covariant=True)
+
+
 @dataclass(eq=False)
-class Member:
+class Member(Generic[H_co]):
     """One trial of a pack: all that training it on needs, but for its running episodes and its replay memory.
 
     The weights and moments here are those of the last time its stack wrote them back.
     """
 
     member_id: str
-    hyperparams: TrainedHyperparams
+    hyperparams: H_co
     seed: int
     weights: Weights
     """By the RLModule's names, target networks (`_target_...`) and observation statistics among them."""
@@ -54,6 +58,10 @@ class Member:
     """Of its environments: reward of steps that end by failure; None: their own."""
     rng: np.random.Generator = field(kw_only=True)
     """Draws actions, permutations and batches."""
+
+
+AnyMember = Member[TrainedHyperparams]
+"""Of PPO or DQN."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +162,8 @@ def size_class(num_units: int) -> int:
 
 
 def group_members(
-    members: Sequence[Member], max_size: int = MAX_GROUP, also: Callable[[Member], Any] = lambda _: 0
-) -> list[list[Member]]:
+    members: Sequence[Member[H]], max_size: int = MAX_GROUP, also: Callable[[Member[H]], Any] = lambda _: 0
+) -> list[list[Member[H]]]:
     """Members whose networks are computed together: of the same activation and about the same sizes.
 
     Args:
@@ -164,7 +172,7 @@ def group_members(
         also: What else the members of a group have in common; sortable.
     """
 
-    def key(member: Member) -> tuple[str, tuple[int, ...], Any]:
+    def key(member: Member[H]) -> tuple[str, tuple[int, ...], Any]:
         sizes = tuple(map(size_class, member.hyperparams.hidden_sizes))
         return member.hyperparams.activation, sizes, also(member)
 

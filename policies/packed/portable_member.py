@@ -10,12 +10,12 @@ import gymnasium as gym
 from policies.acting.policy import action_transform
 from policies.hyperparams import PPOHyperparams
 from policies.networks.portable_weights import network_from_weights
-from policies.packed.member import Member
+from policies.packed.member import AnyMember
 from policies.portable.file import PortablePolicy, describe_space
 
 
 def portable_policy(
-    member: Member,
+    member: AnyMember,
     observation_space: gym.Space[Any],
     action_space: gym.Space[Any],
     *,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from policies.packed.member import Member, NetworkLayout, network_layouts, num_stack_outputs
+from policies.packed.member import AnyMember, NetworkLayout, network_layouts, num_stack_outputs
 from policies.packed.networks import StackedNetworks
 from policies.packed.optimizers import StackedOptimizer
 
@@ -27,7 +27,7 @@ class StackedRows:
     """
 
     def __init__(
-        self, members: Sequence[Member], num_inputs: int, num_outputs: int, device: str, prefix: str = ""
+        self, members: Sequence[AnyMember], num_inputs: int, num_outputs: int, device: str, prefix: str = ""
     ) -> None:
         first = members[0].hyperparams
         self._members, self._num_inputs, self._prefix = members, num_inputs, prefix
@@ -39,17 +39,17 @@ class StackedRows:
         for _, layers, member, layout in self._rows(self.networks.layers):
             layout.write(layers, member.weights, prefix)
 
-    def _rows(self, layers: Sequence[Tensor]) -> Iterator[tuple[int, list[Tensor], Member, NetworkLayout]]:
+    def _rows(self, layers: Sequence[Tensor]) -> Iterator[tuple[int, list[Tensor], AnyMember, NetworkLayout]]:
         for index, (member, layouts) in enumerate(zip(self._members, self._layouts, strict=True)):
             for number, layout in enumerate(layouts):
                 row = number * len(self._members) + index
                 yield row, [layer[row] for layer in layers], member, layout
 
-    def per_row(self, value: Callable[[Member], float], dtype: torch.dtype = torch.float32) -> Tensor:
+    def per_row(self, value: Callable[[AnyMember], float], dtype: torch.dtype = torch.float32) -> Tensor:
         """A number of each member as a column over all rows, (n * M, 1)."""
         return self.per_member(value, dtype).repeat(self.networks_per_member, 1)
 
-    def per_member(self, value: Callable[[Member], float], dtype: torch.dtype = torch.float32) -> Tensor:
+    def per_member(self, value: Callable[[AnyMember], float], dtype: torch.dtype = torch.float32) -> Tensor:
         """A number of each member, (M, 1)."""
         values = [[value(member)] for member in self._members]
         return torch.tensor(values, dtype=dtype, device=self.networks.weights.device)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.networks.layers import OBSERVATION_CLIP, VARIANCE_EPSILON
-from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, Member
+from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, AnyMember
 
 Floats = NDArray[np.float32]
 
@@ -76,7 +76,7 @@ class Observations:
         normalizes: Whether observations are normalised.
     """
 
-    def __init__(self, members: Sequence[Member], num_envs: int, *, normalizes: bool) -> None:
+    def __init__(self, members: Sequence[AnyMember], num_envs: int, *, normalizes: bool) -> None:
         self._members, self._num_envs, self._normalizes = members, num_envs, normalizes
         if normalizes:
             self._refresh()
@@ -120,7 +120,7 @@ class Observations:
         self._refresh()
 
 
-def merge_statistics(member: Member, rows: Floats) -> None:
+def merge_statistics(member: AnyMember, rows: Floats) -> None:
     """Add observations, (B, D), to a member's statistics, as `ObservationStatistics` does."""
     weights: dict[str, Any] = member.weights
     count, num_new = int(weights[OBS_COUNT]), len(rows)

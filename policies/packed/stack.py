@@ -1,62 +1,123 @@
-"""What a stack is: members of a pack that share one tensor program."""
+"""What a stack is: members of a pack that share one tensor program, and how they come and go."""
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, Generic, Protocol, TypeVar
 
-from policies.hyperparams import DQNHyperparams, TrainedHyperparams
 from policies.packed.envs.vector import PackedEnvs
-from policies.packed.member import Member, MemberStats
+from policies.packed.member import H, Member, MemberStats
+from policies.packed.sampling import EpisodeTracker
+from policies.packed.shared import Shared
 
 
-class Stack(Protocol):
+class Group(Protocol):
+    """Members whose networks are computed together."""
+
+    def write_back(self) -> None:
+        """Give the members their weights and moments as they are now."""
+        ...
+
+
+G = TypeVar("G", bound=Group)
+S = TypeVar("S", bound=Shared)
+
+
+class Stack(ABC, Generic[H, G, S]):
     """Trains its members together. They may come and go between iterations; the others do not notice.
 
-    They are equal in `tune_jobs.plan.engine_choice.pack_key` and in the environment.
+    They are equal in `Shared` and in the environment.
+
+    Args:
+        shared: What all members have in common.
+        envs: Without members.
+        device: Of the updates.
     """
 
-    envs: PackedEnvs
-    members: list[Member]
-    """In the order of their rows."""
+    def __init__(self, shared: S, envs: PackedEnvs, device: str) -> None:
+        self.envs, self._device = envs, device
+        self.members: list[Member[H]] = []
+        """In the order of their rows."""
+        self._shared = shared
+        self._groups: Sequence[G] = []
+        self._episodes = EpisodeTracker()
+        # Stale: members came or went since the groups were made. Written: no group has learned since the members were
+        # given their weights; so it is while the groups are stale.
+        self._stale, self._is_written = False, True
+        self._num_inputs = math.prod(envs.observation_space.shape or ())
 
-    def add(self, member: Member, env_seed: int) -> None:
+    def add(self, member: Member[H], env_seed: int) -> None:
         """A further member; its episodes begin.
 
         Raises:
             EnvError: Its environments cannot be made or reset; it is no member then.
+            ValueError: Its hyperparameters are not those that the members share.
         """
-        ...
+        own = self._shared.of(member.hyperparams)
+        if own != self._shared:
+            raise ValueError(f"{member.member_id} does not belong in this stack: it has {own}, not {self._shared}")
+        self.envs.add(member.member_id, env_seed)
+        self._write_back()
+        try:
+            self._begin(member)
+        except MemoryError:
+            self.envs.remove(member.member_id)
+            raise
+        self._episodes.add(member.member_id, self.envs.num_envs)
+        self.members.append(member)
+        self._stale = True
 
-    def remove(self, member_id: str) -> Member:
+    def remove(self, member_id: str) -> Member[H]:
         """Take a member out, with its weights as they are now."""
-        ...
+        member = self.member(member_id)
+        self.members.remove(member)
+        self.envs.remove(member_id)
+        self._episodes.remove(member_id)
+        self._forget(member_id)
+        self._stale = True
+        return member
 
-    def member(self, member_id: str) -> Member:
+    def member(self, member_id: str) -> Member[H]:
         """A member, with its weights as they are now."""
-        ...
+        self._write_back()
+        (member,) = (item for item in self.members if item.member_id == member_id)
+        return member
+
+    def _write_back(self) -> None:
+        if self._is_written:
+            return
+        for group in self._groups:
+            group.write_back()
+        self._is_written = True
+
+    def _begin(self, member: Member[H]) -> None:
+        """Make room for what the algorithm keeps of a member beside its weights.
+
+        Raises:
+            MemoryError: There is none; it is no member then.
+        """
+
+    def _forget(self, member_id: str) -> None:
+        """Drop what `_begin` made."""
 
     def train_iteration(self) -> dict[str, MemberStats]:
         """An iteration of every member from beginning to end."""
-        ...
+        self.begin_iteration()
+        return self.finish_iteration()
 
+    @abstractmethod
     def begin_iteration(self) -> None:
         """Begin an iteration of every member.
 
         On a GPU the updates may go on when this returns: time for another stack to sample.
         """
-        ...
 
+    @abstractmethod
     def finish_iteration(self) -> dict[str, MemberStats]:
         """End the iteration that was begun; what it gave, by id. Members in `PackedEnvs.errors` have failed."""
-        ...
 
 
-def make_stack(hyperparams: TrainedHyperparams, envs: PackedEnvs, device: str = "cpu") -> Stack:
-    """A stack without members, for such hyperparameters."""
-    if isinstance(hyperparams, DQNHyperparams):
-        from policies.packed.dqn.stack import DQNStack
-
-        return DQNStack(envs, device)
-    from policies.packed.ppo.stack import PPOStack
-
-    return PPOStack(envs, device)
+AnyStack = Stack[Any, Any, Any]
+"""Of one algorithm or the other."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from policies.errors import MALFORMED, CheckpointError
 from policies.files import write_plain
-from policies.hyperparams import Algorithm, PPOHyperparams, make_hyperparams
-from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, Member, Weights
+from policies.hyperparams import Algorithm, PPOHyperparams, TrainedHyperparams, make_hyperparams
+from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, AnyMember, Member, Weights
 
 STATE_FOLDER = "packed"
 _FORMAT_VERSION = 1
@@ -27,7 +27,7 @@ _MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"})
 _HINT = "Use another checkpoint of the trial; training cannot continue from this one."
 
 
-def save_member(member: Member, folder: Path) -> None:
+def save_member(member: AnyMember, folder: Path) -> None:
     """Write a member into a folder, which is made.
 
     Args:
@@ -54,7 +54,7 @@ def save_member(member: Member, folder: Path) -> None:
     write_plain(folder / _JSON, json.dumps(description, indent=1) + "\n")
 
 
-def load_member(folder: Path, member_id: str) -> Member:
+def load_member(folder: Path, member_id: str) -> AnyMember:
     """Read a member.
 
     Args:
@@ -85,7 +85,7 @@ def load_member(folder: Path, member_id: str) -> Member:
             parts.setdefault(part, {})[weight] = value
         return Member(
             member_id,
-            cast("Any", hyperparams),
+            cast("TrainedHyperparams", hyperparams),
             int(description["seed"]),
             weights=parts.pop(_WEIGHTS),
             moments=parts,
@@ -103,7 +103,7 @@ def _number(value: Any) -> Any:
     return value
 
 
-def check_shapes(member: Member, expected: Weights) -> None:
+def check_shapes(member: AnyMember, expected: Weights) -> None:
     """Check that a member's weights are those of the network its hyperparameters describe.
 
     Args:

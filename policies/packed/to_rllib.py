@@ -13,7 +13,7 @@ from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
 from policies import random_streams
 from policies.errors import CheckpointError
-from policies.packed.member import Member
+from policies.packed.member import AnyMember
 from policies.packed.state import STATE_FOLDER, load_member
 from policies.portable.file import read_policy
 from policies.portable.network import PolicyNetwork
@@ -51,7 +51,7 @@ def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num
 
 
 def to_algorithm(
-    member: Member, *, env_id: str, env_args: dict[str, Any], expected: PolicyNetwork | None = None, **settings: Any
+    member: AnyMember, *, env_id: str, env_args: dict[str, Any], expected: PolicyNetwork | None = None, **settings: Any
 ) -> Algorithm:
     """A member, with its weights written back, as an RLlib Algorithm.
 
@@ -86,7 +86,7 @@ def to_algorithm(
     return algorithm
 
 
-def _take_over(algorithm: Algorithm, member: Member) -> None:
+def _take_over(algorithm: Algorithm, member: AnyMember) -> None:
     learner = algorithm.learner_group._learner  # noqa: SLF001 - RLlib has no public way to the local one
     module = learner.module[DEFAULT_MODULE_ID].unwrapped()
     module.load_state_dict({name: torch.as_tensor(value) for name, value in member.weights.items()})

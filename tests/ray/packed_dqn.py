@@ -33,7 +33,7 @@ PHASES = ((3, 16, 1), (4, 16, 2), (2, 8, 1))
 def make_stack(env_id="CartPole-v1", env_args=None, failure_penalty=None, **shared):
     """A stack without members."""
     from policies.packed.envs.make import make_packed_envs
-    from policies.packed.stack import make_stack as make
+    from policies.packed.make import make_stack as make
 
     torch.set_num_threads(1)  # as the engine does
     hyperparams = DQNHyperparams(**{**SMALL, **shared})

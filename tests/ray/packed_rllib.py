@@ -24,7 +24,7 @@ def make_stack(env_id, members, env_args=None, seeds=None):
     """A stack of PPO members from a few hyperparameters each, fresh."""
     from policies.packed.envs.make import make_packed_envs
     from policies.packed.initial import new_member
-    from policies.packed.stack import make_stack as make
+    from policies.packed.make import make_stack as make
 
     settings = [PPOHyperparams(**{**SMALL, **values}) for values in members]
     kind = "vectorised" if env_id == "CartPole-v1" else "scalar"

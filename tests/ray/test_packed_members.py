@@ -22,7 +22,7 @@ SHARED = {"train_batch_size": 256, "minibatch_size": 64, "num_epochs": 4, "num_e
 
 def make_stack(env_id, **shared):
     from policies.packed.envs.make import make_packed_envs
-    from policies.packed.stack import make_stack as make
+    from policies.packed.make import make_stack as make
 
     hyperparams = PPOHyperparams(**{**SHARED, **shared})
     kind = "vectorised" if env_id == "CartPole-v1" else "scalar"

@@ -12,7 +12,7 @@ from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, make_hyperparams
 from policies.idle.find import NO_UPDATE, RULES, Limits, idle_rule
 from policies.packed.envs.make import make_packed_envs
 from policies.packed.initial import new_member
-from policies.packed.stack import make_stack
+from policies.packed.make import make_stack
 
 SMALL = {
     "ppo": {

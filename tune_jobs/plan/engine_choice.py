@@ -14,9 +14,9 @@ from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
     DQNHyperparams,
     Hyperparams,
-    PPOHyperparams,
     RandomHyperparams,
 )
+from policies.packed.shared import shared_of
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import Engine, engine_on_record, engines_for
 from tune_jobs.spec.rules import why_none
@@ -26,13 +26,6 @@ if TYPE_CHECKING:
     from policies.packed.envs.vector import EnvKind
     from tune_jobs.spec.sweep_spec import SweepSpec
 
-_SHARED = ("num_envs", "normalize_observations")
-_SHARED_BY_PPO = ("vf_share_layers", "use_kl_loss", "train_batch_size", "minibatch_size", "num_epochs")
-_SHARED_BY_DQN = (
-    "train_batch_size", "env_steps_per_iteration", "train_freq", "updates_per_env_step", "double_q", "dueling",
-    "n_step", "td_loss", "optimizer", "target_network", "replay", "learning_starts", "target_update_unit",
-    "epsilon_unit",
-)  # fmt: skip
 _MOST_NAMED = 8
 """So many trials are named in a note; more are counted."""
 
@@ -80,11 +73,11 @@ def pack_key(hyperparams: Hyperparams) -> tuple[Any, ...]:
     """What the members of a stack have in common; all else may differ between them."""
     if isinstance(hyperparams, RandomHyperparams):
         raise TypeError("Trials that do not learn are never packed.")
-    names = (*_SHARED, *(_SHARED_BY_PPO if isinstance(hyperparams, PPOHyperparams) else _SHARED_BY_DQN))
-    shared = (len(hyperparams.hidden_sizes), *(getattr(hyperparams, name) for name in names))
+    # Beside what a stack's program needs: what lets more members into one group.
+    key = (shared_of(hyperparams), len(hyperparams.hidden_sizes))
     if isinstance(hyperparams, DQNHyperparams):
-        return ("dqn", *shared, hyperparams.target_update_interval is None, hyperparams.tau == 1.0)
-    return ("ppo", *shared)
+        return (*key, hyperparams.target_update_interval is None, hyperparams.tau == 1.0)
+    return key
 
 
 def why_not(

@@ -15,9 +15,10 @@ from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.envs.make import choose_kind, make_packed_envs, measure_step
 from policies.packed.envs.vector import EnvKind
 from policies.packed.initial import new_member
-from policies.packed.member import Member
+from policies.packed.make import make_stack
+from policies.packed.member import AnyMember
 from policies.packed.portable_member import portable_policy
-from policies.packed.stack import Stack, make_stack
+from policies.packed.stack import AnyStack
 from policies.packed.state import STATE_FOLDER, check_shapes, load_member, save_member
 from policies.portable.file import PortablePolicy
 from tune_jobs.plan.engine_choice import pack_key
@@ -47,7 +48,7 @@ class PackedEngine:
         torch.set_num_threads(1)
         self._env_kind, self._num_env_processes, self._device = env_kind, num_env_processes, device
         self._num_turns = num_turns
-        self._stacks: dict[Hashable, Stack] = {}
+        self._stacks: dict[Hashable, AnyStack] = {}
         self._tasks: dict[str, tuple[TrialTask, Hashable]] = {}
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
@@ -86,7 +87,7 @@ class PackedEngine:
 
         return min(((*kind, turn) for turn in range(num_turns)), key=num_members)
 
-    def _make_stack(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Stack:
+    def _make_stack(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> AnyStack:
         kind = self._env_kind or choose_kind(measure_step(task.env_id, task.env_args), spare_cpus=0).kind
         envs = make_packed_envs(
             task.env_id,
@@ -149,12 +150,12 @@ class PackedEngine:
         self._stacks.clear()
         self._tasks.clear()
 
-    def _member_of(self, trial_id: str) -> tuple[TrialTask, Stack]:
+    def _member_of(self, trial_id: str) -> tuple[TrialTask, AnyStack]:
         task, key = self._tasks[trial_id]
         return task, self._stacks[key]
 
 
-def _restored(fresh: Member, checkpoint: Path) -> Member:
+def _restored(fresh: AnyMember, checkpoint: Path) -> AnyMember:
     """The member of a checkpoint, if it is one of the same network."""
     folder = checkpoint / STATE_FOLDER
     if not folder.is_dir():

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import cast
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, StackedOptimizer, StackedRMSprop, clip_by_global_norm
 from policies.packed.rows import StackedRows
 from policies.packed.sampling import Observations
+from policies.packed.shared import SharedByDQN
 from policies.schedules import linear
 
 Floats = NDArray[np.float32]
@@ -31,7 +31,8 @@ class DQNGroup:
     """M members with one activation and about the same layer sizes, whose updates are due at the same time.
 
     Args:
-        members: Equal in everything that gives an update its shape.
+        members: The members.
+        shared: What they have in common.
         num_inputs: Numbers of an observation.
         num_actions: A.
         replay: Where their batches are drawn.
@@ -43,18 +44,25 @@ class DQNGroup:
     """
 
     def __init__(
-        self, members: Sequence[Member], num_inputs: int, num_actions: int, replay: StackedReplay, device: str
+        self,
+        members: Sequence[Member[DQNHyperparams]],
+        shared: SharedByDQN,
+        num_inputs: int,
+        num_actions: int,
+        replay: StackedReplay,
+        *,
+        device: str,
     ) -> None:
-        self.members = members
+        self.members, self._shared = members, shared
         self.positions: slice | NDArray[np.int64] = slice(0, 0)
         self.learns = False
         self._num_inputs, self._num_actions, self._device = num_inputs, num_actions, device
         self._replay, self._slots = replay, replay.slots([member.member_id for member in members])
-        self._hyperparams = [cast("DQNHyperparams", member.hyperparams) for member in members]
+        self._hyperparams = [member.hyperparams for member in members]
         self._rows = StackedRows(members, num_inputs, num_actions, device)
         self._networks = self._rows.networks
         self._targets: StackedRows | None = None
-        if self._hyperparams[0].target_network:
+        if shared.target_network:
             self._targets = StackedRows(members, num_inputs, num_actions, device, TARGET_PREFIX)
         self._optimizer = self._make_optimizer()
         self._rows.read_moments(self._optimizer)
@@ -64,7 +72,6 @@ class DQNGroup:
         self._tau = self._column(lambda item: item.tau)
         self._copies = all(item.tau == 1.0 for item in self._hyperparams)
         self._has_schedule = any(item.lr_final is not None for item in self._hyperparams)
-        self._normalizes = self._hyperparams[0].normalize_observations
 
     def _column(self, value: Callable[[DQNHyperparams], float], dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=dtype)
@@ -72,7 +79,7 @@ class DQNGroup:
     def _make_optimizer(self) -> StackedOptimizer:
         weights, epsilon = self._networks.weights, self._column(lambda item: item.optimizer_epsilon)
         lr = self._column(lambda item: item.lr)
-        if self._hyperparams[0].optimizer == "adam":
+        if self._shared.optimizer == "adam":
             return StackedAdam(
                 weights,
                 lr,
@@ -106,7 +113,7 @@ class DQNGroup:
         if self._has_schedule:
             self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
         num_updates = len(numbers)
-        observations = Observations(self.members, 1, normalizes=self._normalizes)
+        observations = Observations(self.members, 1, normalizes=self._shared.normalize_observations)
         self._optimizer.begin(num_updates)
         stats: list[dict[str, float]] = []
         for number in range(num_updates):
@@ -119,19 +126,19 @@ class DQNGroup:
         self._acting.refresh()
         return stats
 
-    def _lr(self, member: Member) -> float:
+    def _lr(self, member: Member[DQNHyperparams]) -> float:
         item = member.hyperparams
         return linear(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
 
     def _update(self, drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
-        first, num_inputs = self._hyperparams[0], self._num_inputs
+        shared, num_inputs = self._shared, self._num_inputs
         rows = observations.prepare_rows(drawn.rows, num_inputs)
         batch = torch.from_numpy(rows).to(self._device)
         now, later = batch[..., : num_inputs + 1], batch[..., num_inputs + 1 : 2 * num_inputs + 2]
         actions, rewards, discounts = batch[..., -3].long(), batch[..., -2], batch[..., -1]
         weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
-        targets = rewards + discounts * self._next_values(later, uses_double_q=first.double_q)
-        loss = dqn.loss_gradient(self._networks.forward(now), actions, targets, weights, first)
+        targets = rewards + discounts * self._next_values(later, uses_double_q=shared.double_q)
+        loss = dqn.loss_gradient(self._networks.forward(now), actions, targets, weights, shared)
         self._networks.backward(loss.gradient)
         norms = None
         if self._clips:
@@ -141,7 +148,7 @@ class DQNGroup:
             self._replay.set_priorities(self._slots, drawn.indices, loss.td_errors.cpu().numpy())
         if not wants_stats:
             return []
-        return self._stats(dqn.mean_loss(loss.td_errors, weights, first), loss.q_selected.mean(dim=1), norms)
+        return self._stats(dqn.mean_loss(loss.td_errors, weights, shared), loss.q_selected.mean(dim=1), norms)
 
     def _next_values(self, later: Tensor, *, uses_double_q: bool) -> Tensor:
         num_members = len(self.members)

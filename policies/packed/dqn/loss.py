@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from policies.hyperparams import DQNHyperparams
+from policies.packed.shared import SharedByDQN
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ def best_next_values(target_q: Tensor, online_q: Tensor | None) -> Tensor:
 
 
 def loss_gradient(
-    outputs: Tensor, actions: Tensor, targets: Tensor, weights: Tensor | None, hyperparams: DQNHyperparams
+    outputs: Tensor, actions: Tensor, targets: Tensor, weights: Tensor | None, shared: SharedByDQN
 ) -> Loss:
     """The gradient of each member's mean loss.
 
@@ -52,18 +52,18 @@ def loss_gradient(
         actions: (M, B), whole numbers.
         targets: (M, B).
         weights: Importance weights, (M, B); None: all 1.
-        hyperparams: Of any member; all have the same `td_loss` and `dueling`.
+        shared: By the members.
     """
-    num_actions = outputs.shape[-1] - hyperparams.dueling
+    num_actions = outputs.shape[-1] - shared.dueling
     index = actions.unsqueeze(-1)
     q_selected = q_values(outputs, num_actions).gather(-1, index).squeeze(-1)
     td_errors = q_selected - targets
-    slope = td_errors.clamp(-1.0, 1.0) if hyperparams.td_loss == "huber" else 2.0 * td_errors
+    slope = td_errors.clamp(-1.0, 1.0) if shared.td_loss == "huber" else 2.0 * td_errors
     if weights is not None:
         slope = slope * weights
     slope = (slope / td_errors.shape[1]).unsqueeze(-1)
     gradient = torch.zeros_like(outputs)
-    if hyperparams.dueling:
+    if shared.dueling:
         # Q = V + A - mean A: every advantage has a part in the mean.
         gradient[..., :num_actions] = slope / -num_actions
         gradient[..., num_actions:] = slope
@@ -73,9 +73,9 @@ def loss_gradient(
     return Loss(gradient, td_errors, q_selected)
 
 
-def mean_loss(td_errors: Tensor, weights: Tensor | None, hyperparams: DQNHyperparams) -> Tensor:
+def mean_loss(td_errors: Tensor, weights: Tensor | None, shared: SharedByDQN) -> Tensor:
     """Each member's loss, (M,)."""
-    if hyperparams.td_loss == "huber":
+    if shared.td_loss == "huber":
         small = td_errors.abs()
         rows = torch.where(small <= 1.0, 0.5 * td_errors**2, small - 0.5)
     else:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.hyperparams import DQNHyperparams
+from policies.packed.shared import SharedByDQN
 
 _MIN_PRIORITY = 1e-6
 
@@ -39,12 +40,12 @@ class StackedReplay:
     """Rings of transitions, drawn from uniformly and with replacement, or the newest alone.
 
     Args:
-        hyperparams: Of the first member; all have the same `replay`.
+        shared: By all members.
         num_inputs: D.
     """
 
-    def __init__(self, hyperparams: DQNHyperparams, num_inputs: int) -> None:
-        self._newest_only = hyperparams.replay == "none"
+    def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
+        self._newest_only = shared.replay == "none"
         self.num_columns = 2 * num_inputs + 5
         self._num_inputs = num_inputs
         self._rows: Floats = np.empty((0, 0, self.num_columns), dtype=np.float32)
@@ -144,8 +145,8 @@ class StackedReplay:
 class StackedPrioritizedReplay(StackedReplay):
     """Drawn from in proportion to |TD error|^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
 
-    def __init__(self, hyperparams: DQNHyperparams, num_inputs: int) -> None:
-        super().__init__(hyperparams, num_inputs)
+    def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
+        super().__init__(shared, num_inputs)
         # A binary tree for each slot: node i has children 2i and 2i + 1, the leaves are the rows, sums above.
         self._num_leaves = 2
         self._sums: NDArray[np.float64] = np.zeros((0, 4))
@@ -227,8 +228,8 @@ class StackedPrioritizedReplay(StackedReplay):
         return np.minimum(nodes - self._num_leaves, self._size[slots, None] - 1)
 
 
-def make_stacked_replay(hyperparams: DQNHyperparams, num_inputs: int) -> StackedReplay:
+def make_stacked_replay(shared: SharedByDQN, num_inputs: int) -> StackedReplay:
     """The memories that the hyperparameters name, without members."""
-    if hyperparams.replay == "prioritized":
-        return StackedPrioritizedReplay(hyperparams, num_inputs)
-    return StackedReplay(hyperparams, num_inputs)
+    if shared.replay == "prioritized":
+        return StackedPrioritizedReplay(shared, num_inputs)
+    return StackedReplay(shared, num_inputs)

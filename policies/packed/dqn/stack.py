@@ -21,10 +21,12 @@ from policies.hyperparams import DQNHyperparams
 from policies.networks.epsilon import EpsilonSchedule
 from policies.packed.dqn.group import DQNGroup
 from policies.packed.dqn.n_step import StackedNStep
-from policies.packed.dqn.replay import StackedReplay, make_stacked_replay
+from policies.packed.dqn.replay import make_stacked_replay
 from policies.packed.envs.vector import PackedEnvs, Step
 from policies.packed.member import Member, MemberStats, group_members
-from policies.packed.sampling import EpisodeTracker, Observations, merge_statistics
+from policies.packed.sampling import Observations, merge_statistics
+from policies.packed.shared import SharedByDQN
+from policies.packed.stack import Stack
 
 Floats = NDArray[np.float32]
 
@@ -45,83 +47,41 @@ class _Draws:
     """Uniform in [0, 1), (phases, updates of a phase at most, M, B)."""
 
 
-class DQNStack:
-    """See `Stack`.
+class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
+    """See `Stack`."""
 
-    Args:
-        envs: Without members.
-        device: Of the updates.
-    """
-
-    def __init__(self, envs: PackedEnvs, device: str = "cpu") -> None:
-        self.envs, self._device = envs, device
-        self.members: list[Member] = []
-        self._groups: list[DQNGroup] = []
-        self._episodes = EpisodeTracker()
-        self._replay: StackedReplay | None = None
-        self._n_step: StackedNStep | None = None
-        self._stale, self._is_written = False, True
-        self._updates_per_phase = 0.0
+    def __init__(self, shared: SharedByDQN, envs: PackedEnvs, device: str = "cpu") -> None:
+        super().__init__(shared, envs, device)
+        self._replay = make_stacked_replay(shared, self._num_inputs)
+        self._n_step = StackedNStep(envs.num_envs, self._num_inputs, shared.n_step)
+        self._steps_per_phase = math.ceil(shared.train_freq / shared.num_envs)
+        """Vector steps between two training phases."""
+        self._updates_per_phase = self._steps_per_phase * envs.num_envs * shared.updates_per_env_step
         # Env steps at which a restored member's replay memory is as full as it was when learning began.
         self._refilled_at: dict[str, int] = {}
         self._unlearned: list[Floats] = []
         self._stats: dict[str, MemberStats] = {}
         self._num_actions = int(cast("gym.spaces.Discrete[Any]", envs.action_space).n)
-        self._num_inputs = math.prod(envs.observation_space.shape or ())
 
-    def add(self, member: Member, env_seed: int) -> None:
-        """See `Stack.add`."""
-        hyperparams = cast("DQNHyperparams", member.hyperparams)
-        self.envs.add(member.member_id, env_seed)
-        self._write_back()
-        if self._replay is None or self._n_step is None:
-            self._replay = make_stacked_replay(hyperparams, self._num_inputs)
-            self._n_step = StackedNStep(self.envs.num_envs, self._num_inputs, hyperparams.n_step)
-        try:
-            self._replay.add_member(member.member_id, hyperparams)
-        except MemoryError:
-            self.envs.remove(member.member_id)
-            raise
+    def _begin(self, member: Member[DQNHyperparams]) -> None:
+        """Make room for its transitions."""
+        hyperparams = member.hyperparams
+        self._replay.add_member(member.member_id, hyperparams)
         self._n_step.add_member(member.member_id, hyperparams)
-        self._episodes.add(member.member_id, self.envs.num_envs)
-        if member.num_updates and hyperparams.replay != "none":
+        if member.num_updates and self._shared.replay != "none":
             # Its memory is empty again. It gets as much as it had when learning began, without learning meanwhile.
-            num_steps = max(hyperparams.learning_starts, hyperparams.train_batch_size)
+            num_steps = max(self._shared.learning_starts, self._shared.train_batch_size)
             self._refilled_at[member.member_id] = member.num_env_steps + num_steps
-        self.members.append(member)
-        self._stale = True
 
-    def remove(self, member_id: str) -> Member:
-        """See `Stack.remove`."""
-        member = self.member(member_id)
-        assert self._replay is not None
-        assert self._n_step is not None
-        self.members.remove(member)
-        self.envs.remove(member_id)
-        self._episodes.remove(member_id)
+    def _forget(self, member_id: str) -> None:
+        """Drop its transitions."""
         self._replay.remove_member(member_id)
         self._n_step.remove_member(member_id)
         self._refilled_at.pop(member_id, None)
-        self._stale = True
-        return member
-
-    def member(self, member_id: str) -> Member:
-        """See `Stack.member`."""
-        self._write_back()
-        (member,) = (item for item in self.members if item.member_id == member_id)
-        return member
-
-    def _write_back(self) -> None:
-        if self._is_written:
-            return
-        for group in self._groups:
-            group.write_back()
-        self._is_written = True
 
     def _regroup(self) -> None:
         """Make the groups anew: of members that learn at the same time, whatever their place among the rows."""
         self._write_back()
-        assert self._replay is not None
         groups = group_members(
             self.members,
             _MAX_GROUP,
@@ -130,7 +90,9 @@ class DQNStack:
         places = {member.member_id: index for index, member in enumerate(self.members)}
         self._groups = []
         for members in groups:
-            group = DQNGroup(members, self._num_inputs, self._num_actions, self._replay, self._device)
+            group = DQNGroup(
+                members, self._shared, self._num_inputs, self._num_actions, self._replay, device=self._device
+            )
             indices = np.array([places[member.member_id] for member in members], dtype=np.int64)
             is_run = bool(np.all(np.diff(indices) == 1))
             group.positions = slice(int(indices[0]), int(indices[-1]) + 1) if is_run else indices
@@ -143,24 +105,21 @@ class DQNStack:
         self.members = [member for group in group_members(self.members) for member in group]
         self._ids = [member.member_id for member in self.members]
         self.envs.arrange(self._ids)
-        first = cast("DQNHyperparams", self.members[0].hyperparams)
-        self._normalizes = first.normalize_observations
-        self._updates_per_phase = _steps_per_phase(first) * self.envs.num_envs * first.updates_per_env_step
-        self._schedules = [EpsilonSchedule.of(cast("DQNHyperparams", item.hyperparams)) for item in self.members]
-        self._observations = Observations(self.members, self.envs.num_envs, normalizes=self._normalizes)
+        self._schedules = [EpsilonSchedule.of(item.hyperparams) for item in self.members]
+        self._observations = Observations(
+            self.members, self.envs.num_envs, normalizes=self._shared.normalize_observations
+        )
         self._regroup()
         self._stale = False
 
-    def _learns(self, member: Member) -> bool:
+    def _learns(self, member: Member[DQNHyperparams]) -> bool:
         """Whether updates of a member are due."""
-        assert self._replay is not None
-        hyperparams = cast("DQNHyperparams", member.hyperparams)
         if member.num_env_steps < self._refilled_at.get(member.member_id, 0):
             return False
         (size,) = self._replay.sizes(self._replay.slots([member.member_id]))
-        return member.num_env_steps >= hyperparams.learning_starts and bool(size >= hyperparams.train_batch_size)
+        return member.num_env_steps >= self._shared.learning_starts and bool(size >= self._shared.train_batch_size)
 
-    def _num_updates(self, member: Member) -> int:
+    def _num_updates(self, member: Member[DQNHyperparams]) -> int:
         """Updates of a member in a training phase now; 10 x 0.1 is a little less than 1 in binary."""
         return math.floor(member.due + self._updates_per_phase + 1e-9)
 
@@ -170,21 +129,16 @@ class DQNStack:
             return any(map(self._learns, group.members))
         return len(set(map(self._num_updates, group.members))) > 1
 
-    def train_iteration(self) -> dict[str, MemberStats]:
-        """See `Stack.train_iteration`."""
-        self.begin_iteration()
-        return self.finish_iteration()
-
     def begin_iteration(self) -> None:
         """See `Stack.begin_iteration`: all of it, since sampling waits for the updates of every phase."""
         if self._stale:
             self._arrange()
-        first = cast("DQNHyperparams", self.members[0].hyperparams)
+        shared = self._shared
         num_envs, updates_per_phase = self.envs.num_envs, self._updates_per_phase
-        steps_per_phase = _steps_per_phase(first)
+        steps_per_phase = self._steps_per_phase
         new_steps = steps_per_phase * num_envs
-        num_phases = math.ceil(first.env_steps_per_iteration / new_steps)
-        at_once = max(1, _NUMBERS_AT_ONCE // ((math.floor(updates_per_phase) + 1) * first.train_batch_size))
+        num_phases = math.ceil(shared.env_steps_per_iteration / new_steps)
+        at_once = max(1, _NUMBERS_AT_ONCE // ((math.floor(updates_per_phase) + 1) * shared.train_batch_size))
         stats: dict[str, dict[str, float]] = {}
         rewards, ended = [], []
         self.envs.begin(num_phases * steps_per_phase)
@@ -214,24 +168,22 @@ class DQNStack:
         """Each member's numbers for some phases, in an order that does not depend on the members beside it."""
         num_members, num_envs = len(self.members), self.envs.num_envs
         num_steps = num_phases * steps_per_phase
-        first = cast("DQNHyperparams", self.members[0].hyperparams)
+        shared = self._shared
         most = math.floor(updates_per_phase) + 1
         draws = _Draws(
             np.empty((num_steps, num_members, num_envs), dtype=np.float32),
             np.empty((num_steps, num_members, num_envs), dtype=np.int64),
-            np.empty((num_phases, most, num_members, first.train_batch_size)),
+            np.empty((num_phases, most, num_members, shared.train_batch_size)),
         )
         for index, member in enumerate(self.members):
             draws.explores[:, index] = member.rng.random((num_steps, num_envs), dtype=np.float32)
             draws.actions[:, index] = member.rng.integers(0, self._num_actions, (num_steps, num_envs))
-            if first.replay != "none":
-                draws.batches[:, :, index] = member.rng.random((num_phases, most, first.train_batch_size))
+            if shared.replay != "none":
+                draws.batches[:, :, index] = member.rng.random((num_phases, most, shared.train_batch_size))
         return draws
 
     def _sample(self, draws: _Draws, number: int) -> Step:
         """One vector step, with its transitions put into the replay memory."""
-        assert self._replay is not None
-        assert self._n_step is not None
         num_members, num_envs = len(self.members), self.envs.num_envs
         observations = self.envs.observations
         seen = self._observations.prepare(observations)
@@ -257,7 +209,7 @@ class DQNStack:
         for member, count in zip(self.members, counts, strict=True):
             member.num_env_steps += num_envs
             member.num_episodes += count
-        if self._normalizes:
+        if self._shared.normalize_observations:
             self._unlearned.append(observations)
         return step
 
@@ -282,7 +234,7 @@ class DQNStack:
 
     def _learn_statistics(self) -> None:
         """Merge what was observed in the phase into the statistics, if observations are normalised."""
-        if not self._normalizes:
+        if not self._shared.normalize_observations:
             return
         rows = np.stack(self._unlearned).reshape(len(self._unlearned), len(self.members), -1, self._num_inputs)
         self._unlearned = []
@@ -291,8 +243,3 @@ class DQNStack:
             if member.num_env_steps > self._refilled_at.get(member.member_id, 0):
                 merge_statistics(member, rows[:, index].reshape(-1, self._num_inputs))
         self._observations = Observations(self.members, self.envs.num_envs, normalizes=True)
-
-
-def _steps_per_phase(hyperparams: DQNHyperparams) -> int:
-    """Vector steps between two training phases."""
-    return math.ceil(hyperparams.train_freq / hyperparams.num_envs)

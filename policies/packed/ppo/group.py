@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, clip_by_global_norm
 from policies.packed.ppo import loss as ppo
 from policies.packed.rows import StackedRows
+from policies.packed.shared import SharedByPPO
 from policies.schedules import linear
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8  # RLlib leaves torch's defaults
@@ -48,7 +48,8 @@ class PPOGroup:
     """M members with one activation and about the same layer sizes.
 
     Args:
-        members: Equal in everything that gives a batch its shape.
+        members: The members.
+        shared: What they have in common.
         num_inputs: Numbers of an observation.
         num_outputs: Of the policy's head.
         is_gaussian: Whether actions are continuous.
@@ -56,9 +57,16 @@ class PPOGroup:
     """
 
     def __init__(
-        self, members: Sequence[Member], num_inputs: int, num_outputs: int, *, is_gaussian: bool, device: str
+        self,
+        members: Sequence[Member[PPOHyperparams]],
+        shared: SharedByPPO,
+        num_inputs: int,
+        num_outputs: int,
+        *,
+        is_gaussian: bool,
+        device: str,
     ) -> None:
-        self.members = members
+        self.members, self._shared = members, shared
         self._num_outputs, self._is_gaussian, self._device = num_outputs, is_gaussian, device
         self._rows = StackedRows(members, num_inputs, num_outputs, device)
         self._networks = self._rows.networks
@@ -73,7 +81,7 @@ class PPOGroup:
         )
         self._rows.read_moments(self._optimizer)
         self._acting = ActingNetworks(self._networks, len(members))
-        self._hyperparams = [cast("PPOHyperparams", member.hyperparams) for member in members]
+        self._hyperparams = [member.hyperparams for member in members]
         self._unfinished: tuple[ppo.Parts, Tensor | None, int]
         self._grad_clip = self._per_member(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
         self._clips = any(item.grad_clip is not None for item in self._hyperparams)
@@ -102,17 +110,17 @@ class PPOGroup:
 
     def learn(self, batch: Batch) -> None:
         """Make the updates of one iteration; on a GPU, only ask for them. `finish` comes next."""
-        first = self._hyperparams[0]
+        shared = self._shared
         num_rows = batch.advantages.shape[1]
-        num_updates = math.ceil(num_rows * first.num_epochs / first.minibatch_size)
+        num_updates = math.ceil(num_rows * shared.num_epochs / shared.minibatch_size)
         self._move_schedules()
         columns = self._columns(batch)
-        indices = torch.from_numpy(self._draw_rows(num_rows, num_updates * first.minibatch_size)).to(self._device)
+        indices = torch.from_numpy(self._draw_rows(num_rows, num_updates * shared.minibatch_size)).to(self._device)
         self._optimizer.begin(num_updates)
         parts, norms = None, None
         for number in range(num_updates):
-            chosen = indices[:, number * first.minibatch_size : (number + 1) * first.minibatch_size]
-            rows = columns.index_select(0, chosen.reshape(-1)).view(len(self.members), first.minibatch_size, -1)
+            chosen = indices[:, number * shared.minibatch_size : (number + 1) * shared.minibatch_size]
+            rows = columns.index_select(0, chosen.reshape(-1)).view(len(self.members), shared.minibatch_size, -1)
             outputs, values = self._forward(rows)
             minibatch = self._minibatch(rows)
             if number == num_updates - 1:
@@ -138,7 +146,7 @@ class PPOGroup:
         self._bounds = np.cumsum([num_inputs + 1, num_actions, 1, 1, 1, num_outputs]).tolist()
         actions, outputs = torch.from_numpy(batch.actions), torch.from_numpy(batch.outputs)
         logp = ppo.log_probabilities(outputs, actions, is_gaussian=self._is_gaussian)
-        keeps_outputs = self._hyperparams[0].use_kl_loss
+        keeps_outputs = self._shared.use_kl_loss
         columns = np.empty((num_members, num_rows, self._bounds[-1 if keeps_outputs else -2]), dtype=np.float32)
         columns[..., :num_inputs] = observations
         columns[..., num_inputs] = 1.0
@@ -177,7 +185,7 @@ class PPOGroup:
             logp=rows[..., bounds[1]],
             advantages=rows[..., bounds[2]],
             value_targets=rows[..., bounds[3]],
-            old_outputs=rows[..., bounds[4] :] if self._hyperparams[0].use_kl_loss else None,
+            old_outputs=rows[..., bounds[4] :] if self._shared.use_kl_loss else None,
         )
 
     def _update(self, outputs: Tensor, values: Tensor, minibatch: ppo.Minibatch) -> Tensor | None:
@@ -207,7 +215,7 @@ class PPOGroup:
         column = torch.tensor(lr, device=self._device, dtype=torch.float32)
         self._optimizer.lr = column.repeat(self._rows.networks_per_member, 1)
         self._coefficients.entropy_coeff = torch.tensor(entropy, device=self._device, dtype=torch.float32)
-        if self._hyperparams[0].use_kl_loss:
+        if self._shared.use_kl_loss:
             weights = [[member.kl_coeff] for member in self.members]
             self._coefficients.kl_coeff = torch.tensor(weights, device=self._device, dtype=torch.float32)
 

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from policies.envs.action_bounds import ToBounds
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.vector import PackedEnvs
-from policies.packed.member import Member, MemberStats, group_members
+from policies.packed.member import MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo.gae import advantages_and_targets, standardise
 from policies.packed.ppo.group import Batch, PPOGroup
 from policies.packed.ppo.loss import LOG_STD_CLIP
-from policies.packed.sampling import EpisodeTracker, Observations, one_hot
+from policies.packed.sampling import Observations, one_hot
+from policies.packed.shared import SharedByPPO
+from policies.packed.stack import Stack
 
 Floats = NDArray[np.float32]
 
@@ -46,20 +48,11 @@ class Fragment:
         """The observations that the next actions answer."""
 
 
-class PPOStack:
-    """See `Stack`.
+class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
+    """See `Stack`."""
 
-    Args:
-        envs: Without members.
-        device: Of the updates.
-    """
-
-    def __init__(self, envs: PackedEnvs, device: str = "cpu") -> None:
-        self.envs, self._device = envs, device
-        self.members: list[Member] = []
-        self._groups: list[PPOGroup] = []
-        self._episodes = EpisodeTracker()
-        self._stale, self._is_written = False, True
+    def __init__(self, shared: SharedByPPO, envs: PackedEnvs, device: str = "cpu") -> None:
+        super().__init__(shared, envs, device)
         self._ended: list[tuple[tuple[float, int], ...]] = []
         self._stream = torch.cuda.Stream() if device.startswith("cuda") else None  # type: ignore[no-untyped-call]
         space = envs.action_space
@@ -70,63 +63,32 @@ class PPOStack:
         else:
             self._num_actions = int(cast("gym.spaces.Discrete[Any]", space).n)
         self._num_outputs = self._num_actions * (2 if self._is_gaussian else 1)
-        self._num_inputs = math.prod(envs.observation_space.shape or ())
-
-    def add(self, member: Member, env_seed: int) -> None:
-        """A further member; its episodes begin."""
-        self.envs.add(member.member_id, env_seed)
-        self._write_back()
-        self.members.append(member)
-        self._episodes.add(member.member_id, self.envs.num_envs)
-        self._stale = True
-
-    def remove(self, member_id: str) -> Member:
-        """Take a member out, with its weights as they are now."""
-        self._write_back()
-        (member,) = (item for item in self.members if item.member_id == member_id)
-        self.members.remove(member)
-        self.envs.remove(member_id)
-        self._episodes.remove(member_id)
-        self._stale = True
-        return member
-
-    def member(self, member_id: str) -> Member:
-        """A member, with its weights as they are now."""
-        self._write_back()
-        (member,) = (item for item in self.members if item.member_id == member_id)
-        return member
-
-    def _write_back(self) -> None:
-        if self._stale or self._is_written:
-            return
-        for group in self._groups:
-            group.write_back()
-        self._is_written = True
 
     def _regroup(self) -> None:
         groups = group_members(self.members)
         self.members = [member for group in groups for member in group]
         self.envs.arrange([member.member_id for member in self.members])
         self._groups = [
-            PPOGroup(group, self._num_inputs, self._num_outputs, is_gaussian=self._is_gaussian, device=self._device)
+            PPOGroup(
+                group,
+                self._shared,
+                self._num_inputs,
+                self._num_outputs,
+                is_gaussian=self._is_gaussian,
+                device=self._device,
+            )
             for group in groups
         ]
-        first = self.members[0].hyperparams
-        self._observations = Observations(self.members, self.envs.num_envs, normalizes=first.normalize_observations)
+        normalizes = self._shared.normalize_observations
+        self._observations = Observations(self.members, self.envs.num_envs, normalizes=normalizes)
         self._stale = False
-
-    def train_iteration(self) -> dict[str, MemberStats]:
-        """See `Stack.train_iteration`."""
-        self.begin_iteration()
-        return self.finish_iteration()
 
     def begin_iteration(self) -> None:
         """See `Stack.begin_iteration`: sample a batch of each member and ask for the updates."""
         if self._stale:
             self._regroup()
         self._is_written = False
-        first = cast("PPOHyperparams", self.members[0].hyperparams)
-        num_steps = math.ceil(first.train_batch_size / self.envs.num_envs)
+        num_steps = math.ceil(self._shared.train_batch_size / self.envs.num_envs)
         fragment = self._sample(num_steps)
         episodes = self._episodes.follow(
             [member.member_id for member in self.members], fragment.own_rewards, fragment.ended
@@ -233,7 +195,7 @@ class PPOStack:
         seen = self._observations.part(start, stop).prepare(fragment.observations[:, rows])
         seen = by_member(seen.reshape(num_steps, num_members * num_envs, -1))
         values, next_values = self._values(group, fragment, seen, start, stop)
-        hyperparams = [cast("PPOHyperparams", member.hyperparams) for member in group.members]
+        hyperparams = [member.hyperparams for member in group.members]
         repeat = np.repeat(np.arange(num_members), num_envs)
         advantages, targets = advantages_and_targets(
             fragment.rewards[:, rows],
