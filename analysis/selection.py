@@ -15,7 +15,7 @@ The rule, in order:
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,14 +81,23 @@ def score_trial(trial: TrialRecord) -> TrialScore | None:
     """The checkpoint a trial would win with, or None if the trial is not usable."""
     if trial.status == "failed":
         return None
-    best: TrialScore | None = None
-    for checkpoint in trial.checkpoints:
-        score = finite_or_none(checkpoint.evaluation_return)
-        if score is None:
-            continue
-        if best is None or (-score, checkpoint.num_env_steps) < (-best.score, best.checkpoint.num_env_steps):
-            best = TrialScore(trial, checkpoint, score)
-    return best
+    best = _best_of(trial.checkpoints)
+    return None if best is None else TrialScore(trial, best[1], best[0])
+
+
+def best_checkpoint(checkpoints: Iterable[CheckpointRecord]) -> CheckpointRecord | None:
+    """The best of some checkpoints of one trial, by number 4 of the rule; None if none was evaluated.
+
+    A trial keeps this one of its own, whatever else it deletes.
+    """
+    best = _best_of(checkpoints)
+    return None if best is None else best[1]
+
+
+def _best_of(checkpoints: Iterable[CheckpointRecord]) -> tuple[float, CheckpointRecord] | None:
+    scores = ((finite_or_none(item.evaluation_return), item) for item in checkpoints)
+    scored = [(score, item) for score, item in scores if score is not None]
+    return min(scored, key=lambda pair: (-pair[0], pair[1].num_env_steps), default=None)
 
 
 def rank_points(trials: Sequence[TrialRecord]) -> list[PointScore]:

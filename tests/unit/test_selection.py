@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from analysis.records import CheckpointRecord, TrialRecord
-from analysis.selection import NoUsableTrialError, error_summary, rank_points, score_trial, select_best
+from analysis.selection import NoUsableTrialError, best_checkpoint, error_summary, rank_points, score_trial, select_best
 from policies.errors import NotFoundError
 
 
@@ -77,6 +77,17 @@ def test_ties_go_to_fewer_env_steps_then_to_the_lower_trial_index():
     assert select_best([trial(0, 9.0, steps=500), trial(1, 9.0, steps=400)]).trial.index == 1
     assert select_best([trial(3, 9.0, steps=400), trial(1, 9.0, steps=400)]).trial.index == 1
     assert select_best([trial(0, 9.0, 9.0)]).checkpoint.iteration == 1
+
+
+@pytest.mark.parametrize("scores", list(itertools.product([None, 0.0, 5.0], repeat=4)))
+def test_of_a_trial_as_it_grows_the_earliest_of_the_highest_is_kept(scores):
+    known = [checkpoint("t0000", number, score) for number, score in enumerate(scores, start=1)]
+    scored = [item for item in known if item.evaluation_return is not None]
+    assert best_checkpoint(known) == max(
+        scored, key=lambda item: (item.evaluation_return, -item.iteration), default=None
+    )
+    won = score_trial(trial(0, *scores))
+    assert (won and won.checkpoint) == best_checkpoint(known)
 
 
 def test_trial_index_orders_as_a_number():

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from analysis.records import TrialRecord
+from analysis.selection import score_trial
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
-from tune_jobs.search.tpe import propose_point
+from tune_jobs.search.tpe import _known_trials, propose_point
 from tune_jobs.spec.domains import draw_point
 from tune_jobs.spec.file import load_spec
 
@@ -34,9 +35,10 @@ def valley(point):
 
 def record(index, point, score=None, *, status="completed", point_index=None, steps=200_000):
     point_index = index if point_index is None else point_index
+    kept = {"trial_id": f"t{index:04d}", "iteration": 1, "num_env_steps": steps, "evaluation_return": score}
     return TrialRecord(
         trial_id=f"t{index:04d}", index=index, point_index=point_index, seed=index, point=point, hyperparams={"lr": 1},
-        status=status, best_evaluation_return=score, num_env_steps=steps,
+        status=status, best_evaluation_return=score, num_env_steps=steps, checkpoints=[kept],
     )  # fmt: skip
 
 
@@ -215,3 +217,10 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch):
         make_plan(make_spec(), Machine(num_cpus=2))
     assert "tune-jobs[tpe]" in caught.value.hint
     make_plan(make_spec(search={"type": "random"}), Machine(num_cpus=2))
+
+
+def test_the_model_learns_from_the_score_that_the_selection_goes_by():
+    spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
+    one = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0})
+    (known,) = _known_trials(spec, [one])
+    assert known.value == score_trial(one).score == 3.0

@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from analysis.records import FINISHED, TrialRecord
+from analysis.selection import score_trial
 from policies import random_streams
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.spec.domains import Domain, Listed, Range, draw_point
@@ -137,9 +138,8 @@ def _known_trials(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[optun
 
 def _score(members: Sequence[TrialRecord]) -> float | None:
     """Mean over a point's seeds; None if one of them failed or was never scored."""
-    scores = [None if record.status == "failed" else record.best_evaluation_return for record in members]
-    known = [score for score in scores if score is not None]
-    return sum(known) / len(known) if len(known) == len(scores) else None
+    scores = [scored.score for record in members if (scored := score_trial(record)) is not None]
+    return sum(scores) / len(scores) if len(scores) == len(members) else None
 
 
 def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
+from analysis.selection import best_checkpoint
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.load import policy_from_portable
 from policies.acting.policy import Policy
@@ -106,7 +107,7 @@ class TrialLoop:
         self._store.take(self._under)
         self._store.remove_leftovers()
         self._checkpoints, self._notes = take_up_checkpoints(self._store)
-        self._best = _best_of(self._checkpoints)
+        self._best = best_checkpoint(self._checkpoints)
         latest = self._checkpoints[-1] if self._checkpoints else None
         change = self.task.changes[-1] if self.task.changes else None
         folder = pending_copy(self._store, change, latest.iteration if latest is not None else 0)
@@ -334,13 +335,13 @@ class TrialLoop:
 
         self._store.write_checkpoint(record, write, self.task.engine)
         self._checkpoints = [known for known in self._checkpoints if known.iteration != record.iteration] + [record]
-        self._best = _best_of(self._checkpoints)
+        self._best = best_checkpoint(self._checkpoints)
         if self.task.changes:
             self._store.remove_copies()
         self._prune()
 
     def _prune(self) -> None:
-        """Keep the newest so many, the latest and the best."""
+        """Keep the newest so many, the latest and the best, which `analysis.selection` tells."""
         newest = self._checkpoints[-max(1, self.task.checkpoints.keep) :]
         for record in list(self._checkpoints):
             if record not in newest and record != self._best:
@@ -385,14 +386,3 @@ def _reached(record: IterationRecord) -> Reached:
 
 def _reaches(value: float | None, target: float | None) -> bool:
     return value is not None and target is not None and value >= target
-
-
-def _best_of(checkpoints: list[CheckpointRecord]) -> CheckpointRecord | None:
-    """The checkpoint with the highest evaluation return; the earliest of equals."""
-    scored = [record for record in checkpoints if record.evaluation_return is not None]
-    return max(scored, key=_score_and_age, default=None)
-
-
-def _score_and_age(record: CheckpointRecord) -> tuple[float, int]:
-    assert record.evaluation_return is not None
-    return record.evaluation_return, -record.iteration
