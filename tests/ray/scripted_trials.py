@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ray import tune
 
-from tune_jobs.ray_tune.early_stopping import build_scheduler, waits_for_others
+from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 
 STEPS = 100
 
@@ -49,7 +49,7 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
             "trial_id": tune.grid_search([f"t{index:04d}" for index in range(len(scores))]),
         },
         tune_config=tune.TuneConfig(
-            scheduler=build_scheduler(scheduler, max_env_steps),
+            scheduler=build_tune_scheduler(scheduler, max_env_steps),
             # One at a time, or who is compared with whom would depend on which process starts first.
             max_concurrent_trials=None if waits_for_others(scheduler) else 1,
             reuse_actors=True,

@@ -1,6 +1,5 @@
 """Whole runs in packs, with scripted members: who trains where, who is ended, and what becomes of a dead pack's."""
 
-import dataclasses
 import threading
 import time
 
@@ -9,6 +8,7 @@ from scripted_packs import STEPS, make_sweep, run_packs
 from test_schedulers import MIXED
 
 from tune_jobs.ray_tune.early_stopping import build_scheduler
+from tune_jobs.ray_tune.scheduling import Decision, NobodyWaits, Standing
 from tune_jobs.spec.sections import SchedulerSpec
 from tune_jobs.store.pack_files import PackFiles
 
@@ -69,16 +69,6 @@ def test_trials_that_are_not_packed_run_too(tmp_path):
 # -- schedulers
 
 
-@dataclasses.dataclass(frozen=True)
-class _Trial:
-    trial_id: str
-
-
-class _Controller:
-    def get_live_trials(self):
-        return []
-
-
 def expected_steps(scores, scheduler, max_env_steps, *, slots):
     """Env steps each trial comes to, by the scheduler itself: one pack, its members in lockstep, evaluated each 200."""
     judge = build_scheduler(scheduler, max_env_steps)
@@ -88,13 +78,13 @@ def expected_steps(scores, scheduler, max_env_steps, *, slots):
         while waiting and len(members) < slots:
             name = next(iter(waiting))
             members[name] = waiting.pop(name)
-            judge.on_trial_add(_Controller(), _Trial(name))
+            judge.begins(name)
         for name, score in list(members.items()):
             steps[name] = steps.get(name, 0) + 200
-            result = {"evaluated": True, "num_env_steps": steps[name], "score": score}
+            standing = Standing(name, steps[name], score, evaluated=True)
             over = steps[name] >= max_env_steps
-            if over or judge.on_trial_result(_Controller(), _Trial(name), result) == "STOP":
-                judge.on_trial_complete(_Controller(), _Trial(name), result)
+            if over or judge.reached(standing, NobodyWaits()) is Decision.STOP:
+                judge.ended(standing)
                 del members[name]
     return [steps[str(index)] for index in range(len(scores))]
 

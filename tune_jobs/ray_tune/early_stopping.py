@@ -1,14 +1,19 @@
-"""Ray Tune's early-stopping schedulers, acting on evaluation returns at numbers of env steps.
+"""Early stopping by Ray Tune's schedulers, on evaluation returns at numbers of env steps.
 
 A trial reports about once a second so that the table moves, but only reports with a fresh evaluation may be compared:
 the others repeat an old score at a new number of steps.
+
+ASHA and median stopping look at one trial at a time: `RayRule` asks them, for packs and for Tune alike. HyperBand
+pauses trials and lets them go on in Tune's own controller: it is Tune's scheduler itself, and packs have none of it.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from ray.tune.experiment import Trial
 from ray.tune.schedulers import (
     ASHAScheduler,
     FIFOScheduler,
@@ -17,16 +22,139 @@ from ray.tune.schedulers import (
     TrialScheduler,
 )
 
+from tune_jobs.ray_tune.scheduling import (
+    WORST_SCORE,
+    Decision,
+    EveryoneGoesOn,
+    Others,
+    Scheduler,
+    Standing,
+)
 from tune_jobs.spec.sections import SchedulerSpec
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController
-    from ray.tune.experiment import Trial
 
 METRIC = "score"
-# What a trial reports whose evaluation is not a finite number: it must lose every comparison, and NaN loses none
-# (`nan < cutoff` is False).
-WORST_SCORE = -1e300
+
+
+def is_unscored(score: float) -> bool:
+    """Whether an evaluation was not a finite number."""
+    return math.isnan(score) or score <= WORST_SCORE
+
+
+@dataclass(frozen=True)
+class _Named:
+    """All that Ray's rules ask of a trial: what it is called; and whether it runs, of one that waits."""
+
+    trial_id: str
+    status: str = Trial.RUNNING
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """All that Ray's rules ask of Tune's controller: median stopping, which trials wait for a place."""
+
+    others: Others
+
+    def get_live_trials(self) -> list[_Named]:
+        """One that waits stands for all of them: Ray's rule counts none."""
+        return [_Named("", Trial.PENDING)] if self.others.wait() else []
+
+
+_DECISIONS = {
+    TrialScheduler.CONTINUE: Decision.GO_ON,
+    TrialScheduler.STOP: Decision.STOP,
+    TrialScheduler.PAUSE: Decision.GIVE_WAY,
+}
+
+
+class RayRule:
+    """One of Ray's rules that look at one trial at a time, as a `Scheduler`; no private member of Ray is used.
+
+    A trial whose evaluation is not a finite number is ended at its first after the grace period. Losing every
+    comparison is not enough: the first trial to get somewhere is compared with none.
+
+    Args:
+        rule: Ray's, which compares `score` at `num_env_steps`.
+        grace_env_steps: Env steps before which no trial is ended.
+    """
+
+    def __init__(self, rule: ASHAScheduler | MedianStoppingRule, grace_env_steps: int) -> None:
+        self._rule = rule
+        self._grace_env_steps = grace_env_steps
+
+    def begins(self, trial_id: str) -> None:
+        """See `Scheduler.begins`."""
+        self._rule.on_trial_add(None, _Named(trial_id))
+
+    def reached(self, standing: Standing, others: Others) -> Decision:
+        """See `Scheduler.reached`."""
+        if not standing.evaluated:
+            return Decision.GO_ON
+        if is_unscored(standing.score) and standing.num_env_steps >= self._grace_env_steps:
+            return Decision.STOP
+        told = self._rule.on_trial_result(_Waiting(others), _Named(standing.trial_id), _result(standing))
+        return _DECISIONS[told]
+
+    def ended(self, standing: Standing) -> None:
+        """See `Scheduler.ended`."""
+        self._rule.on_trial_complete(None, _Named(standing.trial_id), _result(standing))
+
+
+def _result(standing: Standing) -> dict[str, Any]:
+    """What a trial reached, as Ray's rules read it."""
+    return {"num_env_steps": standing.num_env_steps, METRIC: standing.score}
+
+
+class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
+    """Lets Ray Tune ask a `Scheduler`; trials begin in their order.
+
+    Args:
+        scheduler: Decides.
+    """
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        super().__init__()
+        self.scheduler = scheduler
+
+    def on_trial_add(self, tune_controller: TuneController, trial: Trial) -> None:  # noqa: ARG002 (Tune's signature)
+        """See `TrialScheduler`."""
+        self.scheduler.begins(_name(trial))
+
+    def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
+        """See `TrialScheduler`."""
+        decision = self.scheduler.reached(_standing(trial, result), _OfTune(tune_controller))
+        return str(next(theirs for theirs, ours in _DECISIONS.items() if ours is decision))
+
+    def on_trial_complete(
+        self,
+        tune_controller: TuneController,  # noqa: ARG002 (Tune's signature)
+        trial: Trial,
+        result: dict[str, Any],
+    ) -> None:
+        """See `TrialScheduler`."""
+        # One that is ended before its first report has reached nothing to be compared with.
+        if METRIC in result:
+            self.scheduler.ended(_standing(trial, result))
+
+
+@dataclass(frozen=True)
+class _OfTune:
+    """The trials of Tune's controller; see `Others`."""
+
+    controller: TuneController
+
+    def wait(self) -> bool:
+        return any(trial.status in (Trial.PENDING, Trial.PAUSED) for trial in self.controller.get_live_trials())
+
+
+def _name(trial: Trial) -> str:
+    return str(trial.config["trial_id"])
+
+
+def _standing(trial: Trial, result: dict[str, Any]) -> Standing:
+    return Standing(_name(trial), result["num_env_steps"], result[METRIC], bool(result.get("evaluated")))
 
 
 class OnEvaluations(TrialScheduler):  # type: ignore[misc]
@@ -39,34 +167,21 @@ class OnEvaluations(TrialScheduler):  # type: ignore[misc]
         return str(super().on_trial_result(tune_controller, trial, result))
 
 
-class _EndsUnscored(OnEvaluations):
-    """Mixin: ends a trial whose evaluation is not a finite number, at its first after the grace period.
-
-    Losing every comparison is not enough: the first trial to get somewhere is compared with none.
-    """
-
-    grace_env_steps = 1
-
-    def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
-        score, num_env_steps = result.get(METRIC, WORST_SCORE), result["num_env_steps"]
-        unscored = math.isnan(score) or score <= WORST_SCORE
-        if result.get("evaluated") and unscored and num_env_steps >= self.grace_env_steps:
-            return str(TrialScheduler.STOP)
-        return super().on_trial_result(tune_controller, trial, result)
-
-
-class EvaluationASHA(_EndsUnscored, ASHAScheduler):  # type: ignore[misc]
-    """Asynchronous successive halving (Li et al. 2020)."""
-
-
-class EvaluationHyperBand(_EndsUnscored, HyperBandScheduler):  # type: ignore[misc]
+class EvaluationHyperBand(OnEvaluations, HyperBandScheduler):  # type: ignore[misc]
     """HyperBand (Li et al. 2018), with the bracket that ends most trials first, as there.
 
-    Ray begins with the one that ends none, and small sweeps never come to another (2.60).
+    Ray begins with the one that ends none, and small sweeps never come to another; there is no setting for it (2.60).
+    So three private members are used: `_create_bracket`, which is asked for the bracket of a position; `_s_max_1`, how
+    many there are; `_get_r0`, a bracket's first milestone, which may not be 0.
+
+    Args:
+        grace_env_steps: Env steps before which no trial is ended.
+        settings: Of Ray's HyperBand.
     """
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
+    def __init__(self, grace_env_steps: int, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._grace_env_steps = grace_env_steps
         milestone = vars(self)["_get_r0"]
         # Rounded down it may be 0, before a trial's first evaluation.
         self._get_r0 = lambda num_halvings: max(1, milestone(num_halvings))
@@ -74,9 +189,12 @@ class EvaluationHyperBand(_EndsUnscored, HyperBandScheduler):  # type: ignore[mi
     def _create_bracket(self, position: int) -> Any:
         return super()._create_bracket(self._s_max_1 - 1 - position)
 
-
-class EvaluationMedian(_EndsUnscored, MedianStoppingRule):  # type: ignore[misc]
-    """Median stopping (Golovin et al. 2017)."""
+    def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
+        """See `TrialScheduler`, and `RayRule` for what becomes of trials without a score."""
+        unscored = is_unscored(result.get(METRIC, WORST_SCORE))
+        if result.get("evaluated") and unscored and result["num_env_steps"] >= self._grace_env_steps:
+            return str(TrialScheduler.STOP)
+        return super().on_trial_result(tune_controller, trial, result)
 
 
 def grace_env_steps(spec: SchedulerSpec, max_env_steps: int) -> int:
@@ -93,38 +211,41 @@ def waits_for_others(spec: SchedulerSpec) -> bool:
     return spec.type in ("hyperband", "pbt")
 
 
-def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> TrialScheduler:
-    """The scheduler of a sweep.
+def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
+    """The scheduler of a sweep whose trials do not wait for each other.
 
     Args:
         spec: Its settings.
         max_env_steps: The cap of a trial, `stop.num_env_steps`.
     """
     grace = grace_env_steps(spec, max_env_steps)
-    common = {"metric": METRIC, "mode": "max"}
-    scheduler: TrialScheduler
+    common = {"metric": METRIC, "mode": "max", "time_attr": "num_env_steps"}
     if spec.type == "asha":
-        scheduler = EvaluationASHA(
-            time_attr="num_env_steps",
-            max_t=max_env_steps,
-            grace_period=min(grace, max_env_steps),
-            reduction_factor=spec.reduction_factor,
-            **common,
-        )
-    elif spec.type == "hyperband":
+        # Li et al. 2020.
+        rung = min(grace, max_env_steps)
+        asha = ASHAScheduler(max_t=max_env_steps, grace_period=rung, reduction_factor=spec.reduction_factor, **common)
+        return RayRule(asha, grace)
+    if spec.type == "median":
+        # Golovin et al. 2017.
+        return RayRule(MedianStoppingRule(grace_period=grace, **common), grace)
+    if spec.type == "none":
+        return EveryoneGoesOn()
+    raise ValueError(f"{spec.type} pauses trials: it is Ray Tune's own.")
+
+
+def build_tune_scheduler(spec: SchedulerSpec, max_env_steps: int) -> TrialScheduler:
+    """The same for Ray Tune, and HyperBand too; see `build_scheduler`."""
+    if spec.type != "hyperband":
+        return TuneScheduler(build_scheduler(spec, max_env_steps))
+    grace = grace_env_steps(spec, max_env_steps)
+    return EvaluationHyperBand(
+        grace,
+        time_attr="grace_periods",
+        metric=METRIC,
+        mode="max",
         # Its brackets count in units of the grace period: in env steps they would want 50,000 trials for 50,000 steps.
-        units = max(1, math.ceil(max_env_steps / grace))
-        scheduler = EvaluationHyperBand(
-            time_attr="grace_periods",
-            max_t=units,
-            reduction_factor=spec.reduction_factor,
-            # The last ones end by the stop rules; milestones are rounded down, and would end them before the cap.
-            stop_last_trials=False,
-            **common,
-        )
-    elif spec.type == "median":
-        scheduler = EvaluationMedian(time_attr="num_env_steps", grace_period=grace, **common)
-    else:
-        return FIFOScheduler()
-    scheduler.grace_env_steps = grace
-    return scheduler
+        max_t=max(1, math.ceil(max_env_steps / grace)),
+        reduction_factor=spec.reduction_factor,
+        # The last ones end by the stop rules; milestones are rounded down, and would end them before the cap.
+        stop_last_trials=False,
+    )

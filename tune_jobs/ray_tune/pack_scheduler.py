@@ -1,8 +1,8 @@
 """Who trains in which pack: hands out trials, ends those that the scheduler ends, and takes up what a dead pack left.
 
 Ray Tune's trials are the packs here. Tune calls its scheduler with a pack's reports before it lets the pack go on, so
-what is decided then acts in the pack's very next step. The sweep's own scheduler compares the members: each is a trial
-to it, whichever pack it is in.
+what is decided then acts in the pack's very next step. The sweep's own scheduler (`tune_jobs.ray_tune.scheduling`)
+compares the members, whichever pack they are in.
 
 A pack whose process died is started again, and its members go on from their latest checkpoints. One of them may be what
 ends the process: a member that was in a pack that died twice goes on alone, and only what it does alone counts against
@@ -17,12 +17,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ray.tune.experiment import Trial
 from ray.tune.schedulers import FIFOScheduler, TrialScheduler
 
 from tune_jobs.plan.engine_choice import PackPlan
-from tune_jobs.ray_tune.early_stopping import grace_env_steps
-from tune_jobs.ray_tune.trainable import compared_by
+from tune_jobs.ray_tune.scheduling import Decision, NobodyWaits, Scheduler, Standing
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import candidates
 from tune_jobs.store.contract import Assignment, Pack, Sweep
@@ -32,25 +30,10 @@ from tune_jobs.training.pack_loop import MemberReport
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController
+    from ray.tune.experiment import Trial
 
 _DEATHS_IN_COMPANY = 2
 """A member that was in so many packs when they died goes on alone."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _TrialForTune:
-    """What Tune's schedulers need of a trial."""
-
-    trial_id: str
-    status: str = Trial.RUNNING
-
-
-class _Controller:
-    """What Tune's schedulers need of the controller."""
-
-    def get_live_trials(self) -> list[Any]:
-        """Nobody waits for a place that a scheduler could make by pausing a member."""
-        return []
 
 
 class _Pack:
@@ -87,16 +70,14 @@ class PackDriver:
         plan: PackPlan,
         trial_ids: Sequence[str],
         *,
-        scheduler: TrialScheduler,
+        scheduler: Scheduler,
         keeper: RecordKeeper,
         choose: Callable[[str], None] | None = None,
     ) -> None:
         self._store = store
         self._slots = plan.slots
         self._max_retries = spec.max_retries
-        self._grace = grace_env_steps(spec.scheduler, spec.stop.num_env_steps)
         self._scheduler = scheduler
-        self._controller: Any = _Controller()
         self._keeper = keeper
         self._choose = choose
         self._waiting = deque(trial_ids)
@@ -193,18 +174,16 @@ class PackDriver:
             reason = f"scheduler, at {progress.num_env_steps} env steps"
             progress = dataclasses.replace(progress, stop_reason=reason)
         self._keeper.progressed(trial_id, progress, node=node, pid=pid)
-        member, compared = _TrialForTune(trial_id), compared_by(progress, self._grace)
+        standing = Standing.of(trial_id, progress)
         if progress.status == "running":
             if trial_id in pack.ending:
                 return
-            decision = self._scheduler.on_trial_result(self._controller, member, compared)
-            if decision == TrialScheduler.STOP:
-                # As Tune does with a trial that is stopped.
-                self._scheduler.on_trial_complete(self._controller, member, compared)
+            if self._scheduler.reached(standing, NobodyWaits()) is Decision.STOP:
+                self._scheduler.ended(standing)
                 pack.ending.add(trial_id)
             return
         if progress.status in ("completed", "failed"):
-            self._scheduler.on_trial_complete(self._controller, member, compared)
+            self._scheduler.ended(standing)
         self._keeper.ended(trial_id)
         self._leave(pack, trial_id)
 
@@ -260,7 +239,7 @@ class PackDriver:
             self._known.add(trial_id)
             if self._choose is not None:
                 self._choose(trial_id)
-            self._scheduler.on_trial_add(self._controller, _TrialForTune(trial_id))
+            self._scheduler.begins(trial_id)
         pack.members[trial_id] = None
         if pack.is_up:
             self._keeper.started(trial_id)

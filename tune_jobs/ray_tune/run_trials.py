@@ -24,7 +24,7 @@ from policies.errors import TuneJobsError, said_by
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
-from tune_jobs.ray_tune.early_stopping import build_scheduler, waits_for_others
+from tune_jobs.ray_tune.early_stopping import TuneScheduler, build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -124,16 +124,17 @@ class _Run:
     def _build_scheduler(self) -> TrialScheduler:
         if self._spec.scheduler.type == "pbt":
             return PopulationScheduler(self._spec, self._store, self.keeper.record, self.keeper.change)
-        return build_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
+        return build_tune_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
 
     def packs(self, trial_ids: Sequence[str]) -> None:
         """Run trials in packs; Tune's trials are the packs."""
         plan = self._job.packs
         assert plan is not None
+        # One that waits for others goes with no pack; the single trials after these are compared with them.
+        assert isinstance(self._scheduler, TuneScheduler)
         choose = None if self._chooser is None else self._chooser.prepare
-        driver = PackDriver(
-            self._store, self._spec, plan, trial_ids, scheduler=self._scheduler, keeper=self.keeper, choose=choose
-        )
+        rule = self._scheduler.scheduler
+        driver = PackDriver(self._store, self._spec, plan, trial_ids, scheduler=rule, keeper=self.keeper, choose=choose)
         events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
         tune.Tuner(

@@ -28,7 +28,8 @@ from policies.envs.tallies import end_tally
 from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
-from tune_jobs.ray_tune.early_stopping import METRIC, WORST_SCORE, grace_env_steps
+from tune_jobs.ray_tune.early_stopping import METRIC, grace_env_steps
+from tune_jobs.ray_tune.scheduling import score_of
 from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Ownership
@@ -137,18 +138,17 @@ def this_node() -> str:
 
 
 def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
-    """What schedulers compare a trial by.
+    """What Tune's schedulers compare a trial by.
 
     Args:
         progress: Where it stands.
         grace: Env steps of a grace period.
     """
-    score = progress.evaluation_return
     return {
         "evaluated": progress.evaluated,
         "num_env_steps": progress.num_env_steps,
         "grace_periods": progress.num_env_steps / grace,
-        METRIC: WORST_SCORE if score is None else score,
+        METRIC: score_of(progress),
     }
 
 

@@ -1,0 +1,171 @@
+"""Our scheduler protocol decides as Ray Tune's schedulers did before it, on random scores."""
+
+import math
+
+import numpy as np
+import pytest
+from former_schedulers import FakedController, FakedTrial, former
+
+from tune_jobs.ray_tune.early_stopping import TuneScheduler, build_scheduler, build_tune_scheduler
+from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
+from tune_jobs.spec.sections import SchedulerSpec
+
+pytestmark = [
+    pytest.mark.ray,
+    # Ray's percentile of nothing but NaN, which some of the sequences have.
+    pytest.mark.filterwarnings("ignore:All-NaN slice"),
+]
+
+MAX_ENV_STEPS = 1_600
+NAMES = {"CONTINUE": Decision.GO_ON, "STOP": Decision.STOP, "PAUSE": Decision.GIVE_WAY}
+
+
+def reports(rng):
+    """What the trials of one sweep tell, in the order in which they are told.
+
+    Yields:
+        Number of the trial, its report as Tune has it, and whether it has ended by itself.
+    """
+    num_trials = int(rng.integers(2, 14))
+    waiting, running = list(range(num_trials)), {}
+    slots = int(rng.integers(1, 6))
+    while waiting or running:
+        while waiting and len(running) < slots:
+            running[waiting.pop(0)] = 0
+        number = int(rng.choice(list(running)))
+        running[number] += int(rng.choice([100, 200, 300]))
+        # Few values, so that there are ties; a trial that gets better or worse; and no numbers.
+        score = float(rng.choice([WORST_SCORE, math.nan], p=[0.5, 0.5])) if rng.random() < 0.1 else float(
+            rng.integers(0, 6) + (rng.random() < 0.3) * number
+        )  # fmt: skip
+        over = running[number] >= MAX_ENV_STEPS
+        evaluated = bool(over or rng.random() < 0.7)
+        told = {"num_env_steps": running[number], "score": score, "evaluated": evaluated, "done": over}
+        if (yield number, told, over) is Decision.STOP or over:
+            del running[number]
+
+
+def settings(rng, kind):
+    grace = int(rng.choice([1, 100, 200, 400, 1000]))
+    return SchedulerSpec(type=kind, grace_env_steps=grace, reduction_factor=int(rng.integers(2, 5)))
+
+
+def played(seed, kind, teller):
+    """Every decision that is made in a random sweep."""
+    rng = np.random.default_rng(seed)
+    spec = settings(rng, kind)
+    tell = teller(spec)
+    found, known, answer = [], set(), None
+    sweep = reports(rng)
+    try:
+        while True:
+            number, told, over = sweep.send(answer)
+            is_new = number not in known
+            known.add(number)
+            answer = tell(f"t{number:04d}", told, over, is_new)
+            found.append(answer)
+    except StopIteration:
+        return found
+
+
+def by_tune(judge, *, seed=0):
+    """Tune's calls of its scheduler; now and then others wait for a place."""
+    rng = np.random.default_rng(seed)
+    waits = {
+        0: FakedController((FakedTrial("a"), FakedTrial("b", "TERMINATED"))),
+        1: FakedController((FakedTrial("a"), FakedTrial("b", "PENDING"))),
+        2: FakedController((FakedTrial("b", "PAUSED"),)),
+    }
+
+    def tell(name, told, over, is_new):
+        controller = waits[int(rng.integers(3))]
+        if is_new:
+            judge.on_trial_add(controller, FakedTrial(name))
+        decision = "STOP" if over else judge.on_trial_result(controller, FakedTrial(name), told)
+        if decision == "STOP":
+            judge.on_trial_complete(controller, FakedTrial(name), told)
+        return NAMES[decision]
+
+    return tell
+
+
+def in_packs_before(spec):
+    judge = former(spec, MAX_ENV_STEPS)
+
+    def tell(name, told, over, is_new):
+        if is_new:
+            judge.on_trial_add(FakedController(), FakedTrial(name))
+        decision = "STOP" if over else judge.on_trial_result(FakedController(), FakedTrial(name), told)
+        if decision == "STOP":
+            judge.on_trial_complete(FakedController(), FakedTrial(name), told)
+        return NAMES[decision]
+
+    return tell
+
+
+def in_packs_now(spec):
+    judge = build_scheduler(spec, MAX_ENV_STEPS)
+
+    def tell(name, told, over, is_new):
+        if is_new:
+            judge.begins(name)
+        standing = Standing(name, told["num_env_steps"], told["score"], told["evaluated"])
+        decision = Decision.STOP if over else judge.reached(standing, NobodyWaits())
+        if decision is Decision.STOP:
+            judge.ended(standing)
+        return decision
+
+    return tell
+
+
+@pytest.mark.parametrize("kind", ["asha", "median"])
+def test_members_of_packs_are_judged_as_with_faked_trials(kind):
+    decisions = []
+    for seed in range(40):
+        decisions += (now := played(seed, kind, in_packs_now))
+        assert now == played(seed, kind, in_packs_before), seed
+    assert 0.02 < decisions.count(Decision.STOP) / len(decisions) < 0.5
+    assert Decision.GIVE_WAY not in decisions
+
+
+@pytest.mark.parametrize("kind", ["asha", "median"])
+def test_trials_of_tune_are_judged_as_by_its_own_schedulers(kind):
+    decisions = []
+    for seed in range(40):
+        now = played(seed, kind, lambda spec: by_tune(build_tune_scheduler(spec, MAX_ENV_STEPS)))
+        assert now == played(seed, kind, lambda spec: by_tune(former(spec, MAX_ENV_STEPS))), seed
+        decisions += now
+    assert 0.02 < decisions.count(Decision.STOP) / len(decisions) < 0.5
+    # Median stopping gives way where it has too few to compare with.
+    assert (Decision.GIVE_WAY in decisions) == (kind == "median")
+
+
+def test_without_a_scheduler_everyone_goes_on_to_the_end():
+    judge = build_tune_scheduler(SchedulerSpec(type="none"), MAX_ENV_STEPS)
+    assert isinstance(judge, TuneScheduler)
+    ends = []
+    tell = by_tune(judge)
+
+    def noted(name, told, over, is_new):
+        ends.append((over, decision := tell(name, told, over, is_new)))
+        return decision
+
+    played(0, "asha", lambda spec: noted)
+    assert {over for over, _ in ends} == {False, True}
+    assert all((decision is Decision.STOP) == over for over, decision in ends)
+
+
+@pytest.mark.parametrize("kind", ["pbt", "hyperband"])
+def test_what_pauses_trials_is_none_for_packs(kind):
+    with pytest.raises(ValueError, match="Tune's own"):
+        build_scheduler(SchedulerSpec(type=kind), MAX_ENV_STEPS)
+
+
+def test_a_trial_that_tune_ends_before_its_first_report_is_compared_with_none():
+    for kind in ("asha", "median"):
+        judge = build_tune_scheduler(SchedulerSpec(type=kind), MAX_ENV_STEPS)
+        judge.on_trial_add(None, FakedTrial("t0000"))
+        judge.on_trial_complete(None, FakedTrial("t0000"), {})
+        judge.on_trial_add(None, FakedTrial("t0001"))
+        told = {"num_env_steps": 1_000, "score": 1.0, "evaluated": True}
+        assert judge.on_trial_result(FakedController(), FakedTrial("t0001"), told) == "CONTINUE"
