@@ -120,11 +120,13 @@ class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
 
     def on_trial_add(self, tune_controller: TuneController, trial: Trial) -> None:  # noqa: ARG002 (Tune's signature)
         """See `TrialScheduler`."""
-        self.scheduler.begins(_name(trial))
+        self.scheduler.begins(name_of(trial))
 
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
         """See `TrialScheduler`."""
-        decision = self.scheduler.reached(_standing(trial, result), _OfTune(tune_controller))
+        decision = self.scheduler.reached(standing_of(trial, result), OfTune(tune_controller))
+        # Who copies pauses the copying trial, which `PopulationScheduler` does.
+        assert decision in _DECISIONS.values()
         return str(next(theirs for theirs, ours in _DECISIONS.items() if ours is decision))
 
     def on_trial_complete(
@@ -136,38 +138,35 @@ class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
         """See `TrialScheduler`."""
         # One that is ended before its first report has reached nothing to be compared with.
         if METRIC in result:
-            self.scheduler.ended(_standing(trial, result))
+            self.scheduler.ended(standing_of(trial, result))
 
 
 @dataclass(frozen=True)
-class _OfTune:
+class OfTune:
     """The trials of Tune's controller; see `Others`."""
 
     controller: TuneController
 
     def wait(self) -> bool:
+        """See `Others.wait`."""
         return any(trial.status in (Trial.PENDING, Trial.PAUSED) for trial in self.controller.get_live_trials())
 
+    def ended(self) -> set[str]:
+        """See `Others.ended`."""
+        return {name_of(trial) for trial in self.controller.get_trials() if trial.is_finished()}
 
-def _name(trial: Trial) -> str:
+
+def name_of(trial: Trial) -> str:
+    """What we call a trial of Tune's."""
     return str(trial.config["trial_id"])
 
 
-def _standing(trial: Trial, result: dict[str, Any]) -> Standing:
-    return Standing(_name(trial), result["num_env_steps"], result[METRIC], bool(result.get("evaluated")))
+def standing_of(trial: Trial, result: dict[str, Any]) -> Standing:
+    """What a trial has reached by its report."""
+    return Standing(name_of(trial), result["num_env_steps"], result[METRIC], bool(result.get("evaluated")))
 
 
-class OnEvaluations(TrialScheduler):  # type: ignore[misc]
-    """Mixin: passes on only results of an iteration that was evaluated."""
-
-    def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
-        """See `TrialScheduler`."""
-        if not result.get("evaluated"):
-            return str(TrialScheduler.CONTINUE)
-        return str(super().on_trial_result(tune_controller, trial, result))
-
-
-class EvaluationHyperBand(OnEvaluations, HyperBandScheduler):  # type: ignore[misc]
+class EvaluationHyperBand(HyperBandScheduler):  # type: ignore[misc]
     """HyperBand (Li et al. 2018), with the bracket that ends most trials first, as there.
 
     Ray begins with the one that ends none, and small sweeps never come to another; there is no setting for it (2.60).
@@ -191,10 +190,12 @@ class EvaluationHyperBand(OnEvaluations, HyperBandScheduler):  # type: ignore[mi
 
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
         """See `TrialScheduler`, and `RayRule` for what becomes of trials without a score."""
+        if not result.get("evaluated"):
+            return str(TrialScheduler.CONTINUE)
         unscored = is_unscored(result.get(METRIC, WORST_SCORE))
-        if result.get("evaluated") and unscored and result["num_env_steps"] >= self._grace_env_steps:
+        if unscored and result["num_env_steps"] >= self._grace_env_steps:
             return str(TrialScheduler.STOP)
-        return super().on_trial_result(tune_controller, trial, result)
+        return str(super().on_trial_result(tune_controller, trial, result))
 
 
 def grace_env_steps(spec: SchedulerSpec, max_env_steps: int) -> int:

@@ -6,9 +6,10 @@ Tune's trials and of its controller, so that the same one decides for members of
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Any, Protocol
 
 from tune_jobs.store.progress import Progress
 
@@ -46,6 +47,18 @@ class Decision(Enum):
     STOP = "stop"
     GIVE_WAY = "give way"
     """It goes on when those had a place that wait for one."""
+    SAVE = "save"
+    """It saves and goes on: others may be told to go on from it."""
+
+
+@dataclass(frozen=True)
+class CopyFrom:
+    """It goes on from a copy of another's latest checkpoint, with other values."""
+
+    trial_id: str
+    """The other."""
+    point: dict[str, Any]
+    """The searched values it goes on with."""
 
 
 class Others(Protocol):
@@ -55,13 +68,21 @@ class Others(Protocol):
         """Whether any of them waits for a place that this one could give up."""
         ...
 
+    def ended(self) -> Collection[str]:
+        """Those that have ended by now, however they did."""
+        ...
+
 
 class NobodyWaits:
-    """In packs: places there are not given up for others."""
+    """In packs: places there are not given up for others, and no scheduler there asks who has ended."""
 
     def wait(self) -> bool:
         """See `Others.wait`."""
         return False
+
+    def ended(self) -> Collection[str]:
+        """See `Others.ended`."""
+        return ()
 
 
 class Scheduler(Protocol):
@@ -71,7 +92,7 @@ class Scheduler(Protocol):
         """A trial will run: once, before anything else is told of it."""
         ...
 
-    def reached(self, standing: Standing, others: Others) -> Decision:
+    def reached(self, standing: Standing, others: Others) -> Decision | CopyFrom:
         """What becomes of a trial that runs, now that it has reached so much."""
         ...
 
