@@ -185,7 +185,7 @@ def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(tmp_path
 @pytest.mark.parametrize("where", ["SweepStore.take", "SweepMonitor", "connected"])
 def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp_path, monkeypatch, number, where):
     """Before the trials are prepared, too: "nothing was kept" would be wrong."""
-    original = driving.SweepStore.take if where == "SweepStore.take" else getattr(driving, where)
+    original = SweepStore.take if where == "SweepStore.take" else getattr(driving, where)
 
     def interrupt(*args, **kwargs):
         if current()._ask is not None:
@@ -194,7 +194,8 @@ def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp
         os.kill(os.getpid(), number)
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(f"tune_jobs.sweeps.drive.{where}", interrupt)
+    place = "tune_jobs.store.sweep_store" if where == "SweepStore.take" else "tune_jobs.sweeps.drive"
+    monkeypatch.setattr(f"{place}.{where}", interrupt)
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.launch(SPEC, name="new", storage=tmp_path, progress="none")
     result = caught.value.result

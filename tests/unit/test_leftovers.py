@@ -10,7 +10,6 @@ import pytest
 
 from analysis.records import SweepRecord, TrialRecord
 from policies.files import atomic_path, is_abandoned, write_atomic
-from tune_jobs.store.leftovers import remove_leftovers
 from tune_jobs.store.sweep_store import SweepStore
 
 # Begins a file of each folder, and is killed in the middle.
@@ -73,7 +72,7 @@ def test_what_killed_processes_left_is_removed(store):
     half_a_checkpoint.mkdir(parents=True)
     (half_a_checkpoint / "manifest.json").write_text("{}")
     assert len(files(store.folder) - before) == 8
-    remove_leftovers(store)
+    store.remove_leftovers()
     assert files(store.folder) == before
     assert not (store.folder / ".probe").exists()
 
@@ -81,7 +80,7 @@ def test_what_killed_processes_left_is_removed(store):
 def test_a_file_that_is_being_written_stays(store):
     with atomic_path(store.folder / "best" / "after.mp4") as half:
         half.write_text("half")
-        remove_leftovers(store)
+        store.remove_leftovers()
         assert half.read_text() == "half"
     assert (store.folder / "best" / "after.mp4").read_text() == "half"
 
@@ -97,7 +96,7 @@ def test_nothing_else_is_taken_for_a_leftover(store):
     (left,) = store.folder.glob(".sweep.*")
     link = store.folder / "best" / left.name
     link.symlink_to(elsewhere)
-    remove_leftovers(store)
+    store.remove_leftovers()
     assert not left.exists()
     assert {name for name in names if (store.folder / name).exists()} == set(names)
     assert link.is_symlink()

@@ -499,6 +499,21 @@ def test_what_is_set_aside_is_kept_and_taken_for_nothing(harness, trial, another
     assert harness.content("mine", "trials/t0000/results.damaged") == b"\xff\n{\n[\n"
 
 
+def test_leftovers_of_a_sweep_are_removed_and_nothing_else(harness, sweep, trial):
+    sweep.write_record(make_sweep())
+    trial.write_record(make_trial(status="completed"))
+    trial.write_checkpoint(make_checkpoint(3), fill)
+    before = harness.keys("mine")
+    killed(lambda die: trial.write_checkpoint(make_checkpoint(4), lambda folder: (fill(folder), die())))
+    running = sweep.trial("t0001")
+    running.write_record(make_trial(1, status="running"))
+    running.write_checkpoint(
+        make_checkpoint(1, trial_id="t0001"), lambda folder: (fill(folder), sweep.remove_leftovers())
+    )
+    assert running.checkpoint_iterations() == [1]
+    assert {key for key in harness.keys("mine") if "t0001" not in key} == before
+
+
 # -- who writes: locks, and owners by epoch
 
 

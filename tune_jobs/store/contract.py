@@ -170,6 +170,16 @@ class Sweep(Protocol):
         """The run whose token another process has passed on."""
         ...
 
+    def remove_leftovers(self) -> None:
+        """Remove what processes that were killed left half made, of ended trials too; for who holds its lock.
+
+        What somebody still writes, here or on another machine, stays.
+
+        Raises:
+            CheckpointError: The record of a trial is damaged.
+        """
+        ...
+
     def probing(self) -> AbstractContextManager[Probe]:
         """Ask, in the block, whether other machines see this very sweep; for who holds its lock, before they run it.
 

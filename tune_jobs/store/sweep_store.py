@@ -13,11 +13,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
+from analysis.records import FINISHED, BestRecord, CheckpointRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
+from tune_jobs.store.leftovers import remove_abandoned
 from tune_jobs.store.locks import held, is_held
 from tune_jobs.store.ownership import Owner
 from tune_jobs.store.pack_files import PackFiles
@@ -248,6 +249,15 @@ class SweepStore:
     @property
     def _owner_path(self) -> Path:
         return within(self.folder, names.OWNER)
+
+    def remove_leftovers(self) -> None:
+        """Remove what processes that were killed left half made; see `Sweep.remove_leftovers`."""
+        trials = self.read_trials()
+        remove_abandoned(self.folder, [trial.trial_id for trial in trials])
+        for trial in trials:
+            # The others' are removed by the process that takes them up.
+            if trial.status in FINISHED:
+                self.trial(trial.trial_id).remove_leftovers()
 
     def probing(self) -> AbstractContextManager[Probe]:
         """Ask whether other machines see this very folder; see `Sweep.probing`."""

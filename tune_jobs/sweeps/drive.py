@@ -25,7 +25,6 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.closing import close_run
 from tune_jobs.store.contract import Ownership
-from tune_jobs.store.leftovers import remove_leftovers
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.monitor import SweepMonitor
@@ -133,7 +132,7 @@ def settled(store: SweepStore) -> Iterator[None]:
         with current().shielded(), contextlib.suppress(TuneJobsError):
             if is_ours and store.exists():
                 store.clear_stop_request()
-                remove_leftovers(store)
+                store.remove_leftovers()
                 _close_if_open(store)
 
 
