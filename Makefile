@@ -1,5 +1,6 @@
 # make sweep   install into .venv, run the tutorial's sweep, show where its results lie
 # make test    install the test tools too, then lint, types and every test that can run here
+# make unit    the tests of tests/unit, which start no Ray: while one works
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table
 # make bench   the benchmarks, beside their peers, in one table
@@ -12,7 +13,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test lint types learn kills bench docs clean
+.PHONY: install sweep test unit lint types learn kills bench docs clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -53,6 +54,9 @@ test: $(VENV)/installed-test lint types
 	$(BIN)/python -m pytest --ignore=$(RAY) --ignore=tests/learning; others=$$?; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	exit $$((first || second || others))
+
+unit: $(VENV)/installed-test
+	$(BIN)/python -m pytest --quiet --numprocesses=2 tests/unit
 
 lint: $(VENV)/installed-test
 	$(BIN)/ruff check .

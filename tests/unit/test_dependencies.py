@@ -17,6 +17,7 @@ NOT_IMPORTED = {
     "mypy": "a command",
     "ruff": "a command",
     "pandas-stubs": "types, for mypy",
+    "pytest-xdist": "a plugin of pytest, for `make unit`",
     "types-pyyaml": "types, for mypy",
 }
 
