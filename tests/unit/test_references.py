@@ -29,7 +29,7 @@ DECISIONS = "docs/decisions/"
 # Names of other projects, of examples, and of what a decision speaks against.
 ELSEWHERE = {
     # RLlib, Ray Tune, Gymnasium, torch, TensorBoard
-    "AutoresetMode", "NEXT_STEP", "DefaultModelConfig", "Learner", "hiddens", "logdir",
+    "AutoresetMode", "NEXT_STEP", "DefaultModelConfig", "Learner", "PopulationBasedTraining", "hiddens", "logdir",
     "tensorflow", "forward_exploration",
     # Python
     "Loader", "MetaPathFinder",
