@@ -1,7 +1,8 @@
 """What MkDocs calls while it builds the site: pages of files outside of docs/, tables in the place of their marks.
 
-A page has a mark such as `<!-- table: hyperparameters -->` where a table is drawn from the code. The README is the home
-of the site. Links are written so that they hold where the files lie, and are led to the site's pages here.
+A page has a mark such as `<!-- table: hyperparameters -->` where a table is drawn from the code, and one such as
+`<!-- file: from_python.py -->` where a file beside it is shown. The README is the home of the
+site. Links are written so that they hold where the files lie, and are led to the site's pages here.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ OUTSIDE = {
 """Files outside of docs/ that are pages, and the pages' names."""
 _SOURCES = {page: source for source, page in OUTSIDE.items()}
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s:#]+)(#[^)\s]*)?\)")
+_FILE = re.compile(r"<!-- file: ([\w./-]+)\.(\w+) -->")
+_LANGUAGES = {"py": "python", "yaml": "yaml"}
 _MARK = re.compile(r"<!-- table: ([\w-]+) -->")
 _CODE = re.compile(r"(^```.*?^```$|`[^`\n]+`)", re.MULTILINE | re.DOTALL)
 
@@ -49,10 +52,18 @@ def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
     """Draw the page's tables, and lead its links to pages of the site."""
     text = _MARK.sub(lambda mark: site_tables.TABLES[mark[1]](), markdown)
     here = page.file.src_uri
+    text = _FILE.sub(lambda mark: _shown(mark, here), text)
     # Code is left as it is.
     parts = _CODE.split(text)
     parts[::2] = [_LINK.sub(lambda link: _led(link, here), part) for part in parts[::2]]
     return "".join(parts)
+
+
+def _shown(mark: re.Match[str], here: str) -> str:
+    """A file beside the page, as code with its name."""
+    name = f"{mark[1]}.{mark[2]}"
+    text = (ROOT / "docs" / posixpath.dirname(here) / name).read_text(encoding="utf-8")
+    return f'```{_LANGUAGES[mark[2]]} title="{name}"\n{text}```'
 
 
 def _led(link: re.Match[str], here: str) -> str:

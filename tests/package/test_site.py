@@ -97,7 +97,9 @@ def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site, pages)
     known = [*SweepSpec.model_fields, *DOMAIN_KINDS]
     assert {name for name in known if name not in text("reference/sweep-file.html")} == set()
     assert {preset.name for preset in list_presets() if preset.expected not in text("presets.html")} == set()
-    assert not any("<!-- table" in path.read_text() for path in pages)
+    examples = [path for ending in ("py", "yaml") for path in (ROOT / "docs" / "examples").rglob(f"*.{ending}")]
+    assert {path.name for path in examples if path.read_text().strip() not in text("examples/index.html")} == set()
+    assert not any(mark in path.read_text() for path in pages for mark in ("<!-- table", "<!-- file"))
 
 
 @pytest.mark.browser
