@@ -16,7 +16,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_fie
 FORMAT_VERSION = 2
 
 TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
-SweepState = Literal["running", "interrupted", "completed"]
+SweepState = Literal["created", "running", "interrupted", "completed"]
+"""`created`: written, and not begun by anybody."""
 TRIAL_ID_PATTERN = "t[0-9]{4,9}"
 """What trials are called: part of their folders' paths."""
 TrialId = Annotated[str, Field(pattern=f"^{TRIAL_ID_PATTERN}$")]

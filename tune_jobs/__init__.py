@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from tune_jobs.spec.file import load_spec as load_spec
     from tune_jobs.spec.sweep_spec import SweepSpec as SweepSpec
     from tune_jobs.sweeps.interrupted import SweepInterrupted as SweepInterrupted
+    from tune_jobs.sweeps.verbs import CreatedSweep as CreatedSweep
     from tune_jobs.sweeps.verbs import SweepResult as SweepResult
     from tune_jobs.sweeps.verbs import SweepStatus as SweepStatus
     from tune_jobs.sweeps.verbs import best as best
+    from tune_jobs.sweeps.verbs import create as create
     from tune_jobs.sweeps.verbs import dataframe as dataframe
+    from tune_jobs.sweeps.verbs import drive as drive
     from tune_jobs.sweeps.verbs import evaluate as evaluate
     from tune_jobs.sweeps.verbs import extend as extend
     from tune_jobs.sweeps.verbs import launch as launch
@@ -36,8 +39,8 @@ if TYPE_CHECKING:
     from tune_jobs.sweeps.verbs import video as video
 
 _SWEEPS = (
-    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps", "report",
-    "restore", "resume", "status", "stop", "trials", "video",
+    "CreatedSweep", "SweepResult", "SweepStatus", "best", "create", "dataframe", "drive", "evaluate", "extend",
+    "launch", "list_sweeps", "report", "restore", "resume", "status", "stop", "trials", "video",
 )  # fmt: skip
 _HOME = {
     "TuneJobsError": "policies.errors",

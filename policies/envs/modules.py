@@ -15,6 +15,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -30,11 +31,13 @@ _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 _SHARED = ("policies", "analysis")
 
 _allowed: set[str] = set()
+_allowed_in_block: ContextVar[set[str] | None] = ContextVar("allowed_in_block", default=None)
+"""Beside those, in an `allowed_again` block: of the thread that runs it, as others may run blocks of their own."""
 
 
 @checked
 def allow_modules(names: Iterable[str]) -> None:
-    """Allow modules, for as long as this process lives.
+    """Allow modules, for as long as this process lives, or for the `allowed_again` block that this thread runs.
 
     Args:
         names: Dotted names, such as `my_envs` or `my_package.envs`.
@@ -50,24 +53,25 @@ def allow_modules(names: Iterable[str]) -> None:
                 f"{name!r} is not the name of a Python module, so it cannot be allowed.",
                 "Give the name that an import statement would: my_envs for the file my_envs.py.",
             )
-    _allowed.update(wanted)
+    in_block = _allowed_in_block.get()
+    (_allowed if in_block is None else in_block).update(wanted)
 
 
 @contextlib.contextmanager
 def allowed_again() -> Iterator[None]:
     """Afterwards allow what is allowed now, and nothing that the block has: a sweep's modules are its own."""
-    before = set(_allowed)
+    token = _allowed_in_block.set(set(_allowed_in_block.get() or ()))
     try:
         yield
     finally:
-        _allowed.clear()
-        _allowed.update(before)
+        _allowed_in_block.reset(token)
 
 
 def allowed_modules() -> tuple[str, ...]:
     """The modules that are allowed in this process, sorted; those of the environment variable too."""
     inherited = (name.strip() for name in os.environ.get(ENVIRONMENT_VARIABLE, "").split(","))
-    return tuple(sorted(_allowed.union(name for name in inherited if name)))
+    in_block = _allowed_in_block.get() or ()
+    return tuple(sorted(_allowed.union(in_block, (name for name in inherited if name))))
 
 
 def is_allowed(module: str) -> bool:

@@ -15,6 +15,7 @@ import threading
 import time
 import traceback
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -107,9 +108,12 @@ def main() -> None:
     while not (STORAGE / "four").exists():
         assert thread.is_alive()
         time.sleep(0.01)
-    refused = launch("five")
+    results.append(launch("five"))
+    created = tune_jobs.create(SPEC, name="created", storage=STORAGE)
+    with ThreadPoolExecutor(1) as pool:
+        driven = pool.submit(tune_jobs.drive, created.folder, progress="none", finish=False).result()
     thread.join()
-    tell("two threads", before, f"{results[0]}; {refused}")
+    tell("two threads", before, "; ".join([*results, f"exit code {driven.exit_code}"]))
 
     # From here on with a Ray of the user's own.
     import ray

@@ -14,9 +14,14 @@ SCRIPT = Path(__file__).with_name("a_users_script.py")
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory):
+def folder(tmp_path_factory):
+    """Where the script runs."""
+    return tmp_path_factory.mktemp("script")
+
+
+@pytest.fixture(scope="module")
+def told(folder):
     """What the script told of each of its launches."""
-    folder = tmp_path_factory.mktemp("script")
     # What "another Ray" is said to listen at.
     with socket.create_server(("127.0.0.1", 0)) as server, (folder / "errors").open("w") as errors:
         command = [sys.executable, str(SCRIPT), str(folder / "sweeps"), str(server.getsockname()[1])]
@@ -33,7 +38,7 @@ def told(tmp_path_factory):
         ("a launch", "exit code 0"),
         ("a bad spec", "WrongSpecError: sweep: algorithm: 'sac'"),
         ("a signal", "SweepInterrupted: "),
-        ("two threads", "exit code 0; CannotRunError: Another thread of this process is running a sweep"),
+        ("two threads", "exit code 0; exit code 0; exit code 0"),
         ("too few CPUs", "CannotRunError: One trial needs 2 CPUs; the Ray that this process is connected to has 1."),
         ("another Ray", "CannotRunError: This process is connected to the Ray at "),
         (
@@ -46,3 +51,22 @@ def told(tmp_path_factory):
 def test_a_launch_leaves_the_process_as_it_was(told, what, came_of_it):
     assert told[what]["came of it"].startswith(came_of_it)
     assert told[what]["changed"] == {}
+
+
+def test_a_created_sweep_that_a_thread_drives_gives_what_a_launch_gives(told, folder):
+    assert "two threads" in told
+    launched, driven = (what_it_learned(folder / "sweeps" / name) for name in ("one", "created"))
+    assert driven == launched
+    assert len(launched) == 3
+
+
+def what_it_learned(sweep):
+    """Its records, results and weights, without times and places."""
+    trial = sweep / "trials" / "t0000"
+    results = [json.loads(line) for line in (trial / "results.jsonl").read_text().splitlines()]
+    record = json.loads((trial / "trial.json").read_text())
+    for data in (record, *results):
+        for name in ("time_s", "node", "pid", "started_at", "ended_at"):
+            data.pop(name, None)
+    weights = [path.read_bytes() for path in sorted(trial.glob("checkpoints/*/policy.safetensors"))]
+    return [record, results, weights]

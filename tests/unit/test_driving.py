@@ -257,6 +257,7 @@ def test_the_plan_asks_the_ray_that_is_there(monkeypatch):
     assert driving.machine_here().source == "this machine"
     ray.is_initialized = lambda: True
     connected_ray = type(sys)("tune_jobs.ray_tune.connected_ray")
+    connected_ray.is_of_a_sweep = lambda: False
     connected_ray.connected_machine = lambda: Machine(1, source="the connected one")
     monkeypatch.setitem(sys.modules, "tune_jobs.ray_tune.connected_ray", connected_ray)
     assert driving.machine_here().source == "the connected one"

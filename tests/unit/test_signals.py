@@ -2,15 +2,15 @@
 
 import os
 import signal
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from analysis.records import SweepRecord
-from policies.errors import CannotRunError
-from tune_jobs.process.interruption import current, taking_signals
-from tune_jobs.sweeps.interrupted import SweepInterrupted, run_alone
+from tune_jobs.process.interruption import can_drive, current, taking_signals
+from tune_jobs.sweeps.alone import run_alone
+from tune_jobs.sweeps.interrupted import SweepInterrupted
 from tune_jobs.sweeps.outcome import SweepResult
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -173,32 +173,14 @@ def test_a_run_that_another_process_stopped_raises_nothing():
 
 
 def test_a_process_runs_one_sweep_at_a_time():
-    begun, may_end = threading.Event(), threading.Event()
-    results = []
-
-    @run_alone
-    def first():
-        begun.set()
-        assert may_end.wait(60)
-        return make_result()
-
-    @run_alone
-    def second():
-        raise AssertionError("it must not begin")
-
-    # A thread other than the main one may run a sweep; it gets no signals.
-    thread = threading.Thread(target=lambda: results.append(first()))
-    thread.start()
-    try:
-        assert begun.wait(60)
-        before = [Path(f"/proc/self/fd/{number}").readlink() for number in (1, 2)]
-        with pytest.raises(CannotRunError, match="Another thread of this process"):
-            second()
-        assert [Path(f"/proc/self/fd/{number}").readlink() for number in (1, 2)] == before
-    finally:
-        may_end.set()
-        thread.join(60)
-    assert results == [make_result()]
+    """The others get processes of their own: see test_apart.py."""
+    assert can_drive()
+    with taking_signals():
+        assert not can_drive()
+        with pytest.raises(RuntimeError), taking_signals():
+            raise AssertionError("it must not begin")
+    with ThreadPoolExecutor(1) as pool:
+        assert not pool.submit(can_drive).result()
     # And the next one may.
     assert run_alone(make_result)() == make_result()
 

@@ -5,19 +5,22 @@ them to save a checkpoint and stop; the second ends them. Everywhere else the fi
 both cases the records are written, Ray is shut down and the locks are freed before `SweepInterrupted` is raised.
 
 A SIGHUP is never a second one: for one terminal that goes, a shell and the system may both send it, and who sends
-SIGTERM may send it too. A SIGHUP that this process ignores stays ignored: nohup means it.
+SIGTERM may send it too. A SIGHUP that this process ignores stays ignored: nohup means it. `ASKED`, by which a process
+asks one that runs a sweep for it, is never a second one either: a terminal's Ctrl-C reaches both.
+
+Signals are the main thread's. A sweep that is run for another thread is run in a process of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from policies.errors import CannotRunError
-
+ASKED = signal.SIGUSR1
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -42,11 +45,13 @@ class Interruption:
         Raises:
             KeyboardInterrupt: Nobody is to be asked (any more), and nothing is under way that must not be cut short.
         """
+        global _num_taken  # noqa: PLW0603 (a process has one set of handlers)
+        _num_taken += 1
         self.came = True
         if self._num_shields:
             return
         ask, self._ask = self._ask, None
-        is_echo = number == signal.SIGHUP and self._has_acted
+        is_echo = number in (signal.SIGHUP, ASKED) and self._has_acted
         self._has_acted = True
         if ask is not None:
             # Nobody is impatient yet: what comes while it is asked was sent together with this one.
@@ -78,42 +83,65 @@ class Interruption:
             self._num_shields -= 1
 
 
-# One sweep at a time: who drives one owns the process's signals, its standard output and its connection to Ray.
-_only_one = threading.Lock()
 _current = Interruption()
+_is_driving = False
+_num_taken = 0
 
 
 def current() -> Interruption:
-    """Of the sweep that this process runs."""
-    return _current
+    """Of the sweep that this process runs in its main thread; to other threads no signal comes."""
+    return _current if _is_main_thread() else Interruption()
+
+
+def can_drive() -> bool:
+    """Whether a sweep can be run here: by the main thread, of a process that runs none.
+
+    Who runs one owns the process's signals, its standard output and its connection to Ray.
+    """
+    return _is_main_thread() and not _is_driving
+
+
+def num_taken() -> int:
+    """How many signals have come to the sweeps that this process has run in its main thread."""
+    return _num_taken
+
+
+def main_thread_was_interrupted() -> bool:
+    """Whether a KeyboardInterrupt that nobody caught has ended the main thread, and the process waits for others."""
+    ended_by = getattr(sys, "last_type", None)
+    return not threading.main_thread().is_alive() and ended_by is not None and issubclass(ended_by, KeyboardInterrupt)
+
+
+def _is_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 @contextlib.contextmanager
 def taking_signals() -> Iterator[Interruption]:
-    """Handle this process's signals while the block runs a sweep; in another thread than the main one, none.
+    """Handle this process's signals while the block runs a sweep.
 
     Raises:
-        CannotRunError: Another thread of this process runs a sweep.
+        RuntimeError: `can_drive` says no.
     """
-    global _current  # noqa: PLW0603 (a process has one set of handlers)
+    global _current, _is_driving
+    if not can_drive():
+        raise RuntimeError("A sweep is run by the main thread, of a process that runs no other.")
     interruption = Interruption()
-    if not _only_one.acquire(blocking=False):
-        raise CannotRunError(
-            "Another thread of this process is running a sweep; one process runs one at a time.",
-            "Wait until it is done, or launch this one in a process of its own.",
-        )
     try:
-        _current = interruption
+        _current, _is_driving = interruption, True
         with _handled(interruption):
             yield interruption
     finally:
-        _current = Interruption(has_acted=interruption.came)
-        _only_one.release()
+        _current, _is_driving = Interruption(has_acted=interruption.came), False
 
 
-def end_in_order() -> None:
-    """From now on let SIGTERM and SIGHUP do what Ctrl-C does: for a program of ours, whatever it is doing."""
-    for number in _SIGNALS:
+def end_in_order(*more: int) -> None:
+    """From now on let SIGTERM and SIGHUP do what Ctrl-C does: for a program of ours, whatever it is doing.
+
+    Args:
+        more: Further signals that do.
+    """
+    for number in (*_SIGNALS, *more):
         if not _is_ignored(number):
             signal.signal(number, _take_now)
 
@@ -129,9 +157,6 @@ def _is_ignored(number: int) -> bool:
 
 @contextlib.contextmanager
 def _handled(interruption: Interruption) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     before = {}
     try:
         for number in _SIGNALS:

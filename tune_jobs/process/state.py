@@ -39,12 +39,26 @@ def given_back() -> Iterator[None]:
         yield
 
 
+_before_sweep: dict[str, str] | None = None
+"""Our variables as they were before the sweep that this process runs."""
+
+
+def environment() -> dict[str, str]:
+    """This process's variables, without what the sweep that it runs has changed: for a process that runs another."""
+    ours, before = _our_variables(), _before_sweep
+    if before is None:
+        return dict(os.environ)
+    return {name: value for name, value in os.environ.items() if name not in ours} | before
+
+
 @contextlib.contextmanager
 def _variables() -> Iterator[None]:
-    before = _our_variables()
+    global _before_sweep  # noqa: PLW0603 (a process has one environment)
+    before = _before_sweep = _our_variables()
     try:
         yield
     finally:
+        _before_sweep = None
         for name in _our_variables().keys() - before.keys():
             os.environ.pop(name, None)
         os.environ.update(before)

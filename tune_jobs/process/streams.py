@@ -35,6 +35,11 @@ _shown_on: list[_PatientStream] = []
 """Where standard error leads to, while it is sent to a file."""
 
 
+def standard_error() -> int:
+    """The descriptor of the real standard error, wherever number 2 leads meanwhile."""
+    return _shown_on[-1].fileno() if _shown_on else 2
+
+
 def say_at_last(text: str) -> None:
     """Tell something on the real standard error, from a process that ends now."""
     for stream in _shown_on[-1:]:

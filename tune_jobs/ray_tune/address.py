@@ -39,6 +39,16 @@ def check_address(address: str) -> None:
         ) from error
 
 
+def check_form(address: str) -> None:
+    """Check that an address is one, and ask nobody: what it leads to may not be there yet.
+
+    Raises:
+        SpecError: It has another form than `auto`, `host:port` or `ray://host:port`.
+    """
+    if address != "auto":
+        _host_and_port(address, "")
+
+
 def recorded_cluster() -> str | None:
     """The address of the cluster that `ray start` last started or joined on this machine, if it left one."""
     try:

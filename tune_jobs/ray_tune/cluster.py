@@ -36,6 +36,7 @@ from tune_jobs.ray_tune.connected_ray import (
     cluster_machine,
     connected_machine,
     is_client,
+    of_a_sweep,
 )
 from tune_jobs.ray_tune.environment import prepare_environment, provide_token
 from tune_jobs.ray_tune.processes import ending_if_it_fails
@@ -62,7 +63,7 @@ class Connection:
 
 
 @contextlib.contextmanager
-def connect(address: str | None, machine: Machine | None = None) -> Iterator[Connection]:
+def connect(address: str | None, machine: Machine | None = None, *, is_users: bool = False) -> Iterator[Connection]:
     """Join a cluster, or start Ray on this machine, for the time of the block.
 
     A connection that the caller already has is used and kept, if it is to the wanted address or none is given.
@@ -70,6 +71,7 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
     Args:
         address: None: this machine; `auto`, `host:port` or `ray://host:port`.
         machine: What to start Ray with on this machine.
+        is_users: Whether the connection stands for one that the caller has in another process.
 
     Raises:
         CannotRunError: Nothing answers at the address, its Ray differs, Ray does not start, or the caller is connected
@@ -83,6 +85,8 @@ def connect(address: str | None, machine: Machine | None = None) -> Iterator[Con
     logger = logging.getLogger("ray")
     level = logger.level
     with contextlib.ExitStack() as stack:
+        if not is_users:
+            stack.enter_context(of_a_sweep())
         if address is None:
             stack.enter_context(reaping())
         try:

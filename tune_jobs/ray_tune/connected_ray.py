@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,30 @@ from tune_jobs.plan.machine import Machine
 _FREED_WITHIN_S = 5.0
 _POLL_INTERVAL_S = 0.1
 _DEFAULT_CLIENT_PORT = "10001"
+
+
+_num_of_sweeps = 0
+
+
+@contextlib.contextmanager
+def of_a_sweep() -> Iterator[None]:
+    """In the block the connection is one that a sweep has made for itself, and not the caller's."""
+    global _num_of_sweeps  # noqa: PLW0603 (a process has one connection)
+    _num_of_sweeps += 1
+    try:
+        yield
+    finally:
+        _num_of_sweeps -= 1
+
+
+def is_of_a_sweep() -> bool:
+    """Whether a sweep has made the connection, or is about to."""
+    return _num_of_sweeps > 0
+
+
+def address_for_others() -> str:
+    """Where another process of this machine joins the same Ray."""
+    return f"ray://{_client_address()}" if is_client() else str(ray.get_runtime_context().gcs_address)
 
 
 def is_client() -> bool:

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.records import FINISHED, BestRecord, SweepRecord, TrialRecord
+from analysis.records import FINISHED, BestRecord, SweepRecord, SweepState, TrialRecord
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan, TrialPlan
@@ -36,15 +36,17 @@ if TYPE_CHECKING:
 _PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
 
 
-def write_new(store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None) -> None:
-    """Write the records of a new sweep."""
+def write_new(
+    store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None, state: SweepState = "running"
+) -> None:
+    """Write the records of a new sweep, which runs at once or is only created."""
     for trial in plan.trials:
         store.trial(trial.trial_id).write_record(pending_record(trial))
     # Last: a folder without it is no sweep, so nobody sees half of one.
     store.write_record(
         SweepRecord(
             name=store.name,
-            state="running",
+            state=state,
             spec=spec.model_copy(update={"name": store.name}).model_dump(mode="json"),
             evaluation_seeds=plan.evaluation_seeds,
             confirmation_seeds=plan.confirmation_seeds,
@@ -108,14 +110,31 @@ def connected(address: str | None, here: Machine | None) -> AbstractContextManag
 
 
 def machine_here() -> Machine:
-    """What a sweep without an address runs on: the Ray that this process is connected to, else this machine."""
-    ray: Any = sys.modules.get("ray")
-    # A ray that is only being imported has no such function yet.
-    if ray is None or not getattr(ray, "is_initialized", bool)():
+    """What a sweep without an address runs on: the Ray that the user has connected this process to, or this machine."""
+    if not _is_connected_by_user():
         return local_machine()
     from tune_jobs.ray_tune.connected_ray import connected_machine
 
     return connected_machine()
+
+
+def address_of_users_ray() -> str | None:
+    """Where the Ray is that the user has connected this process to; None: there is none, or it is another sweep's."""
+    if not _is_connected_by_user():
+        return None
+    from tune_jobs.ray_tune.connected_ray import address_for_others
+
+    return address_for_others()
+
+
+def _is_connected_by_user() -> bool:
+    ray: Any = sys.modules.get("ray")
+    # A ray that is only being imported has no such function yet.
+    if ray is None or not getattr(ray, "is_initialized", bool)():
+        return False
+    from tune_jobs.ray_tune.connected_ray import is_of_a_sweep
+
+    return not is_of_a_sweep()
 
 
 @contextlib.contextmanager

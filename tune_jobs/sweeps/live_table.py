@@ -28,6 +28,14 @@ _STATUS_STYLES = {
 }  # fmt: skip
 _MAX_RUNNING_ROWS = 12
 
+_shares_terminal = False
+
+
+def share_terminal() -> None:
+    """From now on print lines on a terminal too: another process writes there, and would tear a table."""
+    global _shares_terminal  # noqa: PLW0603 (a process has one standard error)
+    _shares_terminal = True
+
 
 def describe_point(record: TrialRecord) -> str:
     """A trial's sampled values in a line."""
@@ -179,7 +187,7 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
                 print(f"note: {note}", file=stream, flush=True)
         if progress == "none":
             yield
-        elif stream.isatty():
+        elif stream.isatty() and not _shares_terminal:
             console = Console(file=stream)
             with Live(_Screen(monitor), console=console, refresh_per_second=_REFRESH_PER_S):
                 yield

@@ -1,59 +1,111 @@
 """Everything one can do with a sweep; the command line and the Python API are this.
 
-Words: *launch* starts a new sweep, *resume* goes on with an interrupted one, *extend* adds trials to one, *stop* ends
-one that another process runs. A sweep is named by its folder, or by its name in the storage folder.
+Words: *create* writes a new sweep, *drive* runs it, *launch* does both, *resume* goes on with an interrupted one,
+*extend* adds trials to one, *stop* ends one that another process or thread runs. A sweep is named by its folder, or by
+its name in the storage folder.
 """
 
 from __future__ import annotations
 
 import contextlib
 import re
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from analysis.records import BestRecord, EvaluationRecord, SweepRecord
+from analysis.records import BestRecord, EvaluationRecord
 from policies.arguments import NumEpisodes, PositiveInt, Seed, checked
 from policies.envs.modules import allowed_again
-from policies.errors import TuneJobsError
 from policies.guard.guard import guarding
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.plan.user_code import Source, load_source
-from tune_jobs.process.interruption import current
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
+from tune_jobs.process.interruption import can_drive, current
+from tune_jobs.sweeps.alone import run_alone
+from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
 from tune_jobs.sweeps.drive import connected, machine_here, run_sweep, settled, write_new
-from tune_jobs.sweeps.interrupted import run_alone
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.results import dataframe, report, trials
+from tune_jobs.sweeps.status import SweepStatus, list_sweeps, status
 from tune_jobs.sweeps.storage import choose_store, create_store, expanded, stem_of, storage_folder
 
 if TYPE_CHECKING:
     from ray.rllib.algorithms.algorithm import Algorithm
 
 __all__ = [
-    "SweepResult", "SweepStatus", "best", "dataframe", "evaluate", "extend", "launch", "list_sweeps",
-    "report", "restore", "resume", "status", "stop", "trials", "video",
+    "CreatedSweep", "SweepResult", "SweepStatus", "best", "create", "dataframe", "drive", "evaluate", "extend",
+    "launch", "list_sweeps", "report", "restore", "resume", "status", "stop", "trials", "video",
 ]  # fmt: skip
 
 Progress = Literal["auto", "none"]
 
 
-@dataclass(frozen=True)
-class SweepStatus:
-    """A sweep in a few numbers."""
-
-    sweep: SweepRecord
-    counts: dict[str, int]
-    """Number of trials by status."""
-    alive: bool
-    """Whether a process runs it now."""
-
-
-@run_alone
 @checked
+@allowed_again()
 @guarding(start=True)
+def create(
+    source: Source,
+    *,
+    overrides: Sequence[str] = (),
+    name: str | None = None,
+    storage: str | Path | None = None,
+    address: str | None = None,
+    rl_module: type[Any] | str | None = None,
+) -> CreatedSweep:
+    """Write a new sweep, and start nothing: `drive` runs it, from any thread and process.
+
+    Args:
+        source: As `launch`.
+        overrides: As `launch`.
+        name: As `launch`.
+        storage: As `launch`.
+        address: Ray cluster that it is for; it is joined only when the sweep is driven. None: this machine.
+        rl_module: As `launch`.
+
+    Returns:
+        Its name and folder.
+
+    Raises:
+        SpecError: The sweep is wrong, or its name is taken. Nothing was written.
+        CannotRunError: It cannot run here. Nothing was written.
+    """
+    spec = load_source(source, overrides, rl_module)
+    chosen = name if name is not None else spec.name
+    return write_created(spec, chosen, stem_of(source), storage_folder(storage), address)
+
+
+@checked
+def drive(
+    sweep: str | Path,
+    *,
+    storage: str | Path | None = None,
+    address: str | None = None,
+    finish: bool = True,
+    progress: Progress = "auto",
+) -> SweepResult:
+    """Run a sweep that was created, or what is missing of one, to its end; the process is as before then.
+
+    In another thread than the main one, and where this process runs a sweep already, it is run in a child process.
+
+    Args:
+        sweep: Name or folder.
+        storage: Folder for sweeps.
+        address: Ray cluster to run on; None: the one that it was created for or ran on last, mostly this machine.
+        finish: As `launch`.
+        progress: As `launch`.
+
+    Raises:
+        NotFoundError: No such sweep.
+        CannotRunError: It is being run by another process or thread, cannot run here, or Ray died.
+        SweepInterrupted: As `launch`; what was created is kept.
+    """
+    from tune_jobs.sweeps.conclude import find_sweep
+
+    store = find_sweep(sweep, storage)
+    where = store.read_record().address if address is None else address
+    return resume(store.folder, address=where, finish=finish, progress=progress)
+
+
+@checked
 def launch(
     source: Source,
     *,
@@ -75,7 +127,7 @@ def launch(
         storage: Folder for sweeps; None: $TUNE_JOBS_STORAGE, else ./sweeps.
         address: Ray cluster to run on; None: this machine.
         finish: Also choose and confirm the best, film it and write the report.
-        progress: `auto` or `none`.
+        progress: `auto`: a table on a terminal, else lines, as in another thread than the main one; or `none`.
         rl_module: An RLModule class of your own, or its `module:Class`; None: the source's, mostly none.
 
     Returns:
@@ -83,11 +135,33 @@ def launch(
 
     Raises:
         SpecError: The sweep is wrong, or its name is taken. Nothing was written.
-        CannotRunError: It cannot run here, and nothing was written; Ray died, and what is done can be resumed; or
-            another thread of this process runs a sweep.
+        CannotRunError: It cannot run here, and nothing was written; or Ray died, and what is done can be resumed.
         SweepInterrupted: Ctrl-C, SIGTERM or SIGHUP ended it, and what is done is saved. It is a KeyboardInterrupt; an
             end by `stop` raises nothing.
     """
+    if can_drive():
+        return _launch_here(
+            source, overrides, name, storage, address, finish=finish, progress=progress, rl_module=rl_module
+        )
+    # The source may hold classes, and what is wrong with it is told here.
+    created = create(source, overrides=overrides, name=name, storage=storage, address=address, rl_module=rl_module)
+    with removed_if_not_begun(created):
+        return drive(created.folder, finish=finish, progress=progress)
+
+
+@run_alone
+@guarding(start=True)
+def _launch_here(
+    source: Source,
+    overrides: Sequence[str],
+    name: str | None,
+    storage: str | Path | None,
+    address: str | None,
+    *,
+    finish: bool,
+    progress: Progress,
+    rl_module: type[Any] | str | None,
+) -> SweepResult:
     spec = load_source(source, overrides, rl_module)
     names = (name if name is not None else spec.name, stem_of(source), storage_folder(storage))
     choose_store(*names)
@@ -115,8 +189,8 @@ def launch(
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
-@run_alone
 @checked
+@run_alone
 def resume(
     sweep: str | Path,
     *,
@@ -151,8 +225,8 @@ def resume(
     return go_on(store, address, 0, finish=finish, progress=progress, retry_failed=retry_failed)
 
 
-@run_alone
 @checked
+@run_alone
 def extend(
     sweep: str | Path,
     num_samples: PositiveInt,
@@ -199,42 +273,6 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
         return False
     store.request_stop()
     return True
-
-
-@checked
-def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStatus:
-    """How a sweep stands.
-
-    Raises:
-        NotFoundError: No such sweep.
-    """
-    from tune_jobs.sweeps.conclude import find_sweep
-
-    return _status(find_sweep(sweep, storage))
-
-
-@checked
-def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
-    """How every sweep in a storage folder stands, by name; one that cannot be read is left out with a warning."""
-    from tune_jobs.store.candidates import leave_out
-
-    found = []
-    for store in list_sweep_stores(storage_folder(storage)):
-        try:
-            found.append(_status(store))
-        except TuneJobsError as error:
-            leave_out(error)
-    return found
-
-
-def _status(store: SweepStore) -> SweepStatus:
-    record, alive = store.read_record(), store.is_driven()
-    counts = Counter(trial.status for trial in store.read_trials())
-    if record.state == "running" and not alive:
-        # Its process was killed before it could write so.
-        record = record.model_copy(update={"state": "interrupted"})
-        counts["paused"] += counts.pop("running", 0)
-    return SweepStatus(record, {name: number for name, number in counts.items() if number}, alive)
 
 
 @allowed_again()

@@ -1,0 +1,184 @@
+"""A sweep that is run in a process of its own, for a thread of this one that waits for it.
+
+Signals, descriptors 1 and 2, environment variables and the connection to Ray are a process's, not a thread's. So a
+thread leaves them alone, and a second sweep beside another one has them for itself.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
+from typing import Any
+
+from policies.envs.modules import allowed_modules
+from policies.errors import CannotRunError
+from policies.standard_streams import standard_streams
+from tune_jobs.process.interruption import ASKED, main_thread_was_interrupted, num_taken
+from tune_jobs.process.streams import standard_error
+from tune_jobs.sweeps.drive import address_of_users_ray
+from tune_jobs.sweeps.interrupted import SweepInterrupted
+from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.own_process import ERROR, LOG, SIGNALS, Request
+
+_LOOK_S = 0.25
+_PATIENCE_S = 10.0
+# `-P`: nothing of the working directory can stand in for these packages. Ctrl-C ends it silently until it is handled.
+_BEGIN = """\
+import signal
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+import sys
+sys.path.insert(0, {root!r})
+import tune_jobs
+del sys.path[0]
+from tune_jobs.sweeps.own_process import main
+main({parent}, {descriptor})
+"""
+_ROOT = str(Path(__file__).parents[2])
+
+_running: dict[subprocess.Popen[bytes], threading.Event] = {}
+"""The children, and whether the threads that wait for them have what they came for."""
+_pid = os.getpid()
+
+
+def call_apart(function: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> SweepResult:
+    """Call a function that runs a sweep in a child process, and wait for it.
+
+    Args:
+        function: As `module:function`; in the child, too, it may be run in the main thread alone.
+        args: What it takes.
+        kwargs: What it takes.
+
+    Returns:
+        What it returned.
+
+    Raises:
+        CannotRunError: The child could not be started, or ended without an answer.
+        BaseException: Whatever the function raised, SweepInterrupted among it.
+    """
+    script = getattr(sys.modules.get("__main__"), "__file__", None)
+    request = Request(
+        function,
+        args,
+        kwargs,
+        path=tuple(sys.path),
+        script=sys.argv[0] if sys.argv else "",
+        main_file=script,
+        modules=allowed_modules(),
+        ray_address=address_of_users_ray(),
+    )
+    process, connection = _started()
+    done = _running[process] = threading.Event()
+    try:
+        try:
+            # One that has ended is found by what does not come back.
+            with contextlib.suppress(OSError):
+                connection.send(request)
+            kind, answer = _answer(process, connection)
+        except KeyboardInterrupt:
+            # Where the main thread waits, from inside of another sweep.
+            process.send_signal(ASKED)
+            kind, answer = _answer(process, connection)
+    finally:
+        connection.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_PATIENCE_S)
+        process.kill()
+        process.wait()
+        del _running[process]
+        done.set()
+    if kind == ERROR:
+        raise answer
+    result: SweepResult = answer
+    return result
+
+
+def _started() -> tuple[subprocess.Popen[bytes], Connection[Any, Any]]:
+    # It needs NumPy.
+    from tune_jobs.process.state import environment
+
+    ours, theirs = Pipe()
+    number = theirs.fileno()
+    code = _BEGIN.format(root=_ROOT, parent=os.getpid(), descriptor=number)
+    try:
+        with standard_streams():
+            errors = standard_error()
+            # In this process's group: what a terminal sends to it reaches both.
+            process = subprocess.Popen(  # noqa: S603 (this very Python)
+                [sys.executable, "-P", "-c", code],
+                stdin=subprocess.DEVNULL, stdout=errors, stderr=errors, env=environment(), pass_fds=[number],
+            )  # fmt: skip
+    except OSError as error:
+        ours.close()
+        raise CannotRunError(
+            f"No process can be started to run the sweep in ({sys.executable}): {error}.",
+            "See what limits the processes of this user, with `ulimit -u`.",
+        ) from error
+    finally:
+        theirs.close()
+    return process, ours
+
+
+def _answer(process: subprocess.Popen[bytes], connection: Connection[Any, Any]) -> tuple[str, Any]:
+    """What the child answers; meanwhile log what it logs, and ask it to end where this process was interrupted."""
+    num_before, is_asked = num_taken(), False
+    while True:
+        try:
+            if connection.poll(_LOOK_S):
+                kind, value = connection.recv()
+                if kind != LOG:
+                    return kind, value
+                _log(value)
+            elif process.poll() is not None and not connection.poll():
+                return ERROR, _lost(process)
+        except (EOFError, OSError):
+            return ERROR, _lost(process)
+        if not is_asked and (num_taken() != num_before or main_thread_was_interrupted()):
+            # Not at once: what a terminal has sent is there by now, and this does not count as a second one.
+            is_asked = True
+            process.send_signal(ASKED)
+
+
+@atexit.register
+def _end_in_order() -> None:
+    """Ask children that still run when this process ends to end too, and wait for them.
+
+    Their threads are daemons, or forgotten: up to Python 3.12 a Ctrl-C that comes while a thread is joined takes it for
+    one that has ended (an error in the fix of bpo-45274), and it is not waited for.
+    """
+    # A copy of this process, by a fork, has no such children.
+    running = dict(_running) if os.getpid() == _pid else {}
+    for process in running:
+        process.send_signal(ASKED)
+    for done in running.values():
+        done.wait()
+
+
+def _log(record: logging.LogRecord) -> None:
+    logger = logging.getLogger(record.name)
+    if logger.isEnabledFor(record.levelno):
+        logger.handle(record)
+
+
+def _lost(process: subprocess.Popen[bytes]) -> BaseException:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(_PATIENCE_S)
+    code = process.returncode
+    if code is not None and -code in SIGNALS:
+        # It handles these once it has begun.
+        return SweepInterrupted()
+    how = "closed its connection" if code is None else f"ended with exit code {code}"
+    if code is not None and code < 0:
+        how = f"was ended by signal {-code} ({(signal.strsignal(-code) or 'unknown').lower()})"
+    return CannotRunError(
+        f"The process that ran the sweep {how}.",
+        "What is done is kept: go on with it by `tune-jobs resume`. Standard error and driver.log have what it said.",
+    )

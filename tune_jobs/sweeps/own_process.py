@@ -1,0 +1,119 @@
+"""The process that runs a sweep for another one: what it is asked, and what it answers; see `apart`."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import logging.handlers
+import os
+import pickle
+import pkgutil
+import signal
+import sys
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from policies.envs.modules import allow_modules
+from policies.errors import said_by, tellable
+from policies.parents import end_with_parent
+from tune_jobs.process.interruption import ASKED, end_in_order
+from tune_jobs.sweeps.interrupted import SweepInterrupted
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, ASKED)
+RESULT, ERROR, LOG = "result", "error", "log"
+"""What an answer is."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A call of a function, and what the process that asks for it has that this one has to have too."""
+
+    function: str
+    """As `module:function`."""
+    args: tuple[Any, ...]
+    kwargs: Mapping[str, Any]
+    path: tuple[str, ...]
+    """Where modules are looked for."""
+    script: str
+    """As in `sys.argv`: Ray and the guard let their processes find what lies beside it."""
+    main_file: str | None
+    """None: it is a notebook, or another program without a script."""
+    modules: tuple[str, ...]
+    """Those of the user's own that are allowed."""
+    ray_address: str | None
+    """Of the Ray that it has joined itself; None: it has not."""
+
+
+def main(parent: int, descriptor: int) -> None:
+    """Do what the parent asks, and answer.
+
+    Args:
+        parent: Its process id.
+        descriptor: Of this end of the pipe to it.
+    """
+    end_with_parent(parent=parent)
+    end_in_order(ASKED)
+    # A thread that waits for signals, as services have one, keeps them from the others and from what these start.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    os.set_inheritable(descriptor, False)  # noqa: FBT003 (takes no keyword)
+    connection = Connection(descriptor)
+    telling = _Telling(connection)
+    logging.getLogger().addHandler(telling)
+    try:
+        answer = (RESULT, _done(connection.recv()))
+    except BaseException as error:  # noqa: BLE001 (KeyboardInterrupt too: whatever it is, the parent raises it)
+        answer = (ERROR, _portable(error))
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    logging.getLogger().removeHandler(telling)
+    with contextlib.suppress(OSError):
+        connection.send(answer)
+
+
+def _done(request: Request) -> Any:
+    # It needs NumPy: the signals are handled before.
+    from tune_jobs.sweeps.live_table import share_terminal
+
+    share_terminal()
+    sys.path[:] = request.path
+    sys.argv[:] = [request.script]
+    if request.main_file is not None:
+        sys.modules["__main__"].__file__ = request.main_file
+    allow_modules(request.modules)
+    function = pkgutil.resolve_name(request.function)
+    with contextlib.ExitStack() as stack:
+        if request.ray_address is not None:
+            from tune_jobs.ray_tune.cluster import connect
+
+            stack.enter_context(connect(request.ray_address, is_users=True))
+        return function(*request.args, **request.kwargs)
+
+
+def _portable(error: BaseException) -> BaseException:
+    """The error, or one that says the same where it cannot be sent."""
+    if isinstance(error, KeyboardInterrupt) and not isinstance(error, SweepInterrupted):
+        return SweepInterrupted()
+    said = "".join(traceback.format_exception(error))
+    if isinstance(error, Exception):
+        error = tellable(error)
+    error.add_note(f"In the process that ran the sweep:\n{said}")
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 (our own)
+    except Exception:  # noqa: BLE001 (of an exception of somebody else's)
+        return RuntimeError(f"{type(error).__name__}: {said_by(error)}\n{said}")
+    return error
+
+
+class _Telling(logging.handlers.QueueHandler):
+    """Sends log records to the parent, whose settings decide what becomes of them."""
+
+    def __init__(self, connection: Connection[Any, Any]) -> None:
+        super().__init__(connection)  # type: ignore[arg-type]  # what it is given is for `enqueue` alone
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """See `QueueHandler.enqueue`."""
+        with contextlib.suppress(OSError):
+            self.queue.send((LOG, record))  # type: ignore[attr-defined]
