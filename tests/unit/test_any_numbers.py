@@ -13,6 +13,7 @@ from analysis.report import build_report
 from analysis.tables import groups_frame, iterations_frame, steps_to_solve_frame, trials_frame
 from tune_jobs.cli.output import show_best, show_evaluation, show_result, show_status, show_sweeps, show_trials
 from tune_jobs.store.event_files import ScalarWriter
+from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.live_table import summary_line
 from tune_jobs.sweeps.monitor import SweepMonitor
 
@@ -84,7 +85,7 @@ def test_the_running_sweep_is_shown_and_written_for_tensorboard(made, tmp_path):
     monitor = SweepMonitor("mine", running, max_env_steps_per_trial=100_000, max_concurrent=2)
     monitor.update(made.trials[0])
     assert "1 completed" in summary_line(monitor)
-    writer = ScalarWriter(tmp_path)
+    writer = ScalarWriter(SweepStore(tmp_path))
     for trial in made.trials:
         writer.write(trial, evaluated=True)
     writer.flush()

@@ -24,6 +24,7 @@ from policies.errors import CannotRunError
 from policies.standard_streams import standard_streams
 from tune_jobs.process.interruption import ASKED, main_thread_was_interrupted, num_taken
 from tune_jobs.process.streams import standard_error
+from tune_jobs.store.names import DRIVER_LOG
 from tune_jobs.sweeps.drive import address_of_users_ray
 from tune_jobs.sweeps.interrupted import SweepInterrupted
 from tune_jobs.sweeps.outcome import SweepResult
@@ -180,5 +181,6 @@ def _lost(process: subprocess.Popen[bytes]) -> BaseException:
         how = f"was ended by signal {-code} ({(signal.strsignal(-code) or 'unknown').lower()})"
     return CannotRunError(
         f"The process that ran the sweep {how}.",
-        "What is done is kept: go on with it by `tune-jobs resume`. Standard error and driver.log have what it said.",
+        "What is done is kept, and `tune-jobs resume` continues it. "
+        f"Standard error and {DRIVER_LOG} have what it said.",
     )

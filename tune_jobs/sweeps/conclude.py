@@ -24,8 +24,9 @@ from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import choose, leave_out, read_trials
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.local_storage import open_storage, open_sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
 from tune_jobs.sweeps.storage import expanded, storage_folder
 from tune_jobs.training.registry import engine_of_checkpoint
 
@@ -33,27 +34,27 @@ from tune_jobs.training.registry import engine_of_checkpoint
 FRESH_SEED = 2**31
 
 
-def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> SweepStore:
+def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
     """A sweep by its folder, or by its name in the storage folder.
 
     Raises:
         NotFoundError: There is none.
     """
-    as_folder = SweepStore(expanded(sweep))
+    as_folder = open_sweep(expanded(sweep))
     if as_folder.exists():
         return as_folder
     root = storage_folder(storage)
-    store = SweepStore(root / str(sweep))
+    store = open_sweep(root / str(sweep))
     if store.exists():
         return store
-    known = [item.name for item in list_sweep_stores(root)]
+    known = [item.name for item in open_storage(root).sweeps()]
     raise NotFoundError(
         f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
         "List the sweeps with `tune-jobs list`; name another storage folder with --storage.",
     )
 
 
-def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
+def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
     """Every trial's results, by trial id; none, with a warning, of a trial whose file cannot be read at all."""
     found = {}
     for record in store.read_trials():
@@ -66,7 +67,7 @@ def read_results(store: SweepStore) -> dict[str, list[IterationRecord]]:
 
 
 @guarding()
-def choose_best(store: SweepStore, num_episodes: int = 100) -> BestRecord:
+def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
     """Select the winner, confirm it on seeds it was not chosen on, and copy its policy to best/.
 
     Raises:
@@ -123,7 +124,7 @@ class PolicySource:
     policy: Policy
     env_id: str
     env_args: dict[str, Any]
-    store: SweepStore | None = None
+    store: Sweep | None = None
     """The sweep, where the policy is a sweep's best."""
     timeout_s: float = CALL_TIMEOUT_S
     """How long one call of the environment may take."""
@@ -155,7 +156,7 @@ def find_policy(
         return _baseline(text, env_id, action)
     _refuse_action(text, action)
     path = expanded(text)
-    store: SweepStore | None = None
+    store: Sweep | None = None
     timeout_s = CALL_TIMEOUT_S
     if is_checkpoint(path):
         verify_checkpoint(path)
@@ -216,7 +217,7 @@ def _refuse_action(source: str, action: int | Sequence[float] | None) -> None:
         )
 
 
-def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[SweepStore, str | None]:
+def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[Sweep, str | None]:
     try:
         return _trusted(find_sweep(text, storage)), None
     except NotFoundError:
@@ -231,13 +232,13 @@ def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[SweepStore,
             ) from error
 
 
-def _trusted(store: SweepStore) -> SweepStore:
+def _trusted(store: Sweep) -> Sweep:
     """The sweep, with the modules allowed that its launcher did: its policies and environment may be from there."""
     allow_modules(store.read_record().allowed_modules)
     return store
 
 
-def best_checkpoint(store: SweepStore, trial_id: str) -> CheckpointRecord:
+def best_checkpoint(store: Sweep, trial_id: str) -> CheckpointRecord:
     """The checkpoint of one trial with the highest evaluation return.
 
     Raises:
@@ -299,7 +300,7 @@ def find_trained_checkpoint(source: str | Path, storage: str | Path | None = Non
 
 
 @guarding()
-def make_videos(store: SweepStore, seed: int | None = None) -> dict[str, Path]:
+def make_videos(store: Sweep, seed: int | None = None) -> dict[str, Path]:
     """Film a random policy (before) and the winner (after) on one seed, alone and side by side, into best/.
 
     Returns:
@@ -341,7 +342,7 @@ def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]
 
 
 @guarding()
-def make_report(store: SweepStore, why_no_best: TuneJobsError | None = None) -> Path:
+def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
     """Write the sweep's tables, figures and HTML report; works without a winner, and says why there is none.
 
     Args:
@@ -373,7 +374,7 @@ def make_report(store: SweepStore, why_no_best: TuneJobsError | None = None) -> 
         )
 
 
-def _known_best(store: SweepStore) -> BestRecord:
+def _known_best(store: Sweep) -> BestRecord:
     """The confirmed winner, confirmed now if it has not been."""
     try:
         return store.read_best()

@@ -24,9 +24,8 @@ from tune_jobs.ray_tune.address import check_address
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.closing import close_run
-from tune_jobs.store.contract import Ownership
+from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult
 
@@ -37,7 +36,7 @@ _PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
 
 
 def write_new(
-    store: SweepStore, spec: SweepSpec, plan: SweepPlan, address: str | None, state: SweepState = "running"
+    store: Sweep, spec: SweepSpec, plan: SweepPlan, address: str | None, state: SweepState = "running"
 ) -> None:
     """Write the records of a new sweep, which runs at once or is only created."""
     for trial in plan.trials:
@@ -138,7 +137,7 @@ def _is_connected_by_user() -> bool:
 
 
 @contextlib.contextmanager
-def settled(store: SweepStore) -> Iterator[None]:
+def settled(store: Sweep) -> Iterator[None]:
     """However the block ends, leave no sweep behind that says it runs; its lock has to be held."""
     is_ours = True
     try:
@@ -156,7 +155,7 @@ def settled(store: SweepStore) -> Iterator[None]:
 
 
 def run_sweep(
-    store: SweepStore,
+    store: Sweep,
     plan: SweepPlan,
     *,
     address: str | None,
@@ -178,7 +177,7 @@ def run_sweep(
 
 
 def _run_sweep(
-    store: SweepStore,
+    store: Sweep,
     plan: SweepPlan,
     *,
     address: str | None,
@@ -219,7 +218,7 @@ def _run_sweep(
 
 
 def _run_trials(
-    store: SweepStore,
+    store: Sweep,
     plan: SweepPlan,
     todo: tuple[str, ...],
     monitor: SweepMonitor,
@@ -275,14 +274,14 @@ def _noted() -> Iterator[None]:
         current().came = True
 
 
-def _close_if_open(store: SweepStore) -> None:
+def _close_if_open(store: Sweep) -> None:
     """As `close_run`, where Ray did not come so far that the run began."""
     with current().shielded():
         if store.read_record().state == "running":
             close_run(store)
 
 
-def _finished(store: SweepStore, result: SweepResult) -> SweepResult:
+def _finished(store: Sweep, result: SweepResult) -> SweepResult:
     """Choose, confirm and film the winner, and write the report; what can't be made is noted, not raised."""
     made = _Finish(store)
     with _noted():
@@ -301,7 +300,7 @@ def _finished(store: SweepStore, result: SweepResult) -> SweepResult:
 class _Finish:
     """What comes after the trials, as far as it was made."""
 
-    def __init__(self, store: SweepStore) -> None:
+    def __init__(self, store: Sweep) -> None:
         self._store = store
         self.best: BestRecord | None = None
         self._why: TuneJobsError | None = None

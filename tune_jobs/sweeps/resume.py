@@ -13,15 +13,15 @@ from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Sweep
 from tune_jobs.store.names import SWEEP_RECORD
-from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.drive import connected, machine_here, pending_record, run_sweep, settled
 from tune_jobs.sweeps.outcome import SweepResult
 
 
 @guarding()
 def go_on(
-    store: SweepStore,
+    store: Sweep,
     address: str | None,
     num_samples: int,
     *,
@@ -59,7 +59,7 @@ def go_on(
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
-def check_same_trials(store: SweepStore, plan: SweepPlan) -> None:
+def check_same_trials(store: Sweep, plan: SweepPlan) -> None:
     """Check that planning again gives the trials that are there.
 
     Raises:
@@ -79,7 +79,7 @@ def check_same_trials(store: SweepStore, plan: SweepPlan) -> None:
 
 
 def _add_trials(
-    store: SweepStore, record: SweepRecord, spec: SweepSpec, plan: SweepPlan, address: str | None, *, retry_failed: bool
+    store: Sweep, record: SweepRecord, spec: SweepSpec, plan: SweepPlan, address: str | None, *, retry_failed: bool
 ) -> None:
     """Write the records of what a sweep is to run more; nothing if there is nothing to run."""
     known = {trial.trial_id: trial for trial in store.read_trials()}

@@ -9,7 +9,8 @@ from pathlib import Path
 from analysis.records import SweepRecord
 from policies.arguments import checked
 from policies.errors import TuneJobsError
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.local_storage import open_storage
 from tune_jobs.sweeps.storage import storage_folder
 
 
@@ -42,7 +43,7 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
     from tune_jobs.store.candidates import leave_out
 
     found = []
-    for store in list_sweep_stores(storage_folder(storage)):
+    for store in open_storage(storage_folder(storage)).sweeps():
         try:
             found.append(_status(store))
         except TuneJobsError as error:
@@ -50,7 +51,7 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
     return found
 
 
-def _status(store: SweepStore) -> SweepStatus:
+def _status(store: Sweep) -> SweepStatus:
     record, alive = store.read_record(), store.is_driven()
     counts = Counter(trial.status for trial in store.read_trials())
     if record.state == "running" and not alive:

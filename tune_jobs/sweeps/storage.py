@@ -8,8 +8,8 @@ from pathlib import Path
 from policies.errors import SpecError
 from policies.files import absolute
 from tune_jobs.spec.sweep_spec import check_sweep_name
-from tune_jobs.store.local_storage import LocalStorage
-from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.local_storage import open_storage
 
 DEFAULT_STORAGE = "sweeps"
 
@@ -28,7 +28,7 @@ def expanded(path: str | Path) -> Path:
         return Path(path)
 
 
-def choose_store(name: str | None, stem: str, storage: Path) -> SweepStore:
+def choose_store(name: str | None, stem: str, storage: Path) -> Sweep:
     """The folder of a new sweep, not made yet.
 
     Args:
@@ -39,7 +39,7 @@ def choose_store(name: str | None, stem: str, storage: Path) -> SweepStore:
     Raises:
         SpecError: The name that was asked for is taken, or is none that a folder can have.
     """
-    kept = LocalStorage(storage)
+    kept = open_storage(storage)
     if name is not None:
         return kept.new_sweep(check_sweep_name(name))
     # Only the folder's own creation decides who has a name; this finds one that is likely free.
@@ -63,7 +63,7 @@ def stem_of(source: object) -> str:
     return Path(source).stem if isinstance(source, str | Path) else "sweep"
 
 
-def create_store(name: str | None, stem: str, storage: Path) -> SweepStore:
+def create_store(name: str | None, stem: str, storage: Path) -> Sweep:
     """Make the folder of a new sweep; of several processes at once, each gets one of its own.
 
     Args:
