@@ -332,11 +332,14 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
 
     def ask():
         eventually(lambda: has_checkpoints(tmp_path, num_trials=2))
-        # Nobody else must run it meanwhile, nor this process anything.
-        with pytest.raises(CannotRunError, match="Another thread of this process"):
-            sweeps.resume("mine", storage=tmp_path)
-        assert sweeps.status("mine", storage=tmp_path).alive
-        asked.append(sweeps.stop("mine", storage=tmp_path))
+        try:
+            # Nobody else must run it meanwhile.
+            with pytest.raises(CannotRunError, match="Sweep mine is being run by another process"):
+                sweeps.resume("mine", storage=tmp_path)
+            assert sweeps.status("mine", storage=tmp_path).alive
+        finally:
+            # Its trials would take hours.
+            asked.append(sweeps.stop("mine", storage=tmp_path))
 
     thread = threading.Thread(target=ask)
     thread.start()
