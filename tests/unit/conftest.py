@@ -1,9 +1,10 @@
-"""Fixtures of the tests of the command line, and of those that compute."""
+"""Fixtures of the tests of the command line, of stores, and of those that compute."""
 
 import pytest
 from fake_sweeps import run, sweeps
+from store_parts import another, harness, sweep, trial
 
-__all__ = ["in_double", "run", "sweeps"]
+__all__ = ["another", "harness", "in_double", "run", "sweep", "sweeps", "trial"]
 
 
 @pytest.fixture

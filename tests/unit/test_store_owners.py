@@ -1,0 +1,266 @@
+"""What every store promises of who writes, of packs, logs and stops, and of what comes of a sweep."""
+
+import json
+import os
+
+import pytest
+from policy_factory import make_portable
+from store_parts import BEST, PACK, fill, killed, make_best, make_checkpoint, make_iteration, numbers
+
+from policies.acting.load import load_policy
+from policies.errors import CannotRunError, CheckpointError
+from policies.files import open_to_append
+from tune_jobs.store.contract import Assignment
+from tune_jobs.store.ownership import OwnershipLostError
+from tune_jobs.store.probe import answer
+
+# -- who writes: locks, and owners by epoch
+
+
+def test_one_process_at_a_time_drives_a_sweep(sweep, another):
+    assert not sweep.is_driven()
+    with sweep.lock():
+        assert another().is_driven()
+        with pytest.raises(CannotRunError, match="another process"), another().lock():
+            pass
+    assert not another().is_driven()
+    with another().driver_lock():
+        assert sweep.is_driven()
+        for held in (sweep.lock, sweep.driver_lock):
+            with pytest.raises(CannotRunError, match="still being run"), held():
+                pass
+    with sweep.lock(), another().driver_lock():
+        pass
+
+
+def test_a_killed_driver_holds_no_lock(sweep, another):
+    def act(die):
+        with another().lock():
+            die()
+
+    killed(act)
+    assert not sweep.is_driven()
+    with sweep.lock():
+        pass
+
+
+def test_who_was_run_before_has_lost_it(sweep, another):
+    first = sweep.take()
+    with first.held():
+        pass
+    second = another().take()
+    assert (first.is_current(), second.is_current()) == (False, True)
+    for write in (first.check, first.held().__enter__):
+        with pytest.raises(OwnershipLostError):
+            write()
+    passed_on = another().owner(second.token)
+    passed_on.check()
+    second.release()
+    for owner in (second, passed_on):
+        with owner.held():
+            pass
+    assert not another().owner("").is_current()
+    assert not another().owner(first.token).is_current()
+
+
+def test_who_lost_a_trial_writes_nothing_of_it(harness, trial, another):
+    trial.take()
+    trial.append_iterations([make_iteration(1)])
+    trial.write_checkpoint(make_checkpoint(1), fill)
+    assert not trial.is_lost()
+    another().trial("t0000").take()
+    assert trial.is_lost()
+    before = {key: harness.content("mine", key) for key in harness.keys("mine")}
+    for write in (
+        lambda: trial.append_iterations([make_iteration(2)]),
+        lambda: trial.keep_iterations([]),
+        lambda: trial.write_checkpoint(make_checkpoint(2), fill),
+        lambda: trial.write_checkpoint(make_checkpoint(1), lambda folder: fill(folder, "other")),
+        lambda: trial.delete_checkpoint(make_checkpoint(1)),
+        lambda: trial.set_aside(trial.checkpoint_folder(1)),
+        trial.set_aside_results,
+        lambda: trial.keep_damaged_results([b"x"]),
+        trial.remove_copies,
+        trial.forget_tally,
+        trial.owned().__enter__,
+    ):
+        with pytest.raises(OwnershipLostError):
+            write()
+    assert {key: harness.content("mine", key) for key in harness.keys("mine")} == before
+
+
+def test_a_trial_that_is_lost_while_its_checkpoint_is_written_gets_none(trial, another):
+    trial.take()
+
+    def write(folder):
+        fill(folder)
+        another().trial("t0000").take()
+
+    with pytest.raises(OwnershipLostError):
+        trial.write_checkpoint(make_checkpoint(1), write)
+    assert numbers(another) == []
+
+
+def test_a_trial_and_a_pack_are_taken_only_for_who_owns_the_run(sweep, trial, another):
+    run = sweep.take()
+    pack = sweep.pack("p00").take(run)
+    trial.take(pack)
+    second = another().take()
+    for take in (another().trial("t0000").take, another().pack("p00").take):
+        with pytest.raises(OwnershipLostError):
+            take(run)
+    assert not trial.is_lost()
+    assert pack.is_current()
+    another().pack("p00").take(second)
+    with pytest.raises(OwnershipLostError):
+        another().trial("t0000").take(pack)
+    assert not trial.is_lost()
+
+
+def test_who_has_not_taken_a_trial_is_kept_from_nothing(trial, another):
+    """A reader, or a tool that works on a sweep that nobody runs."""
+    trial.take()
+    reader = another().trial("t0000")
+    with reader.owned():
+        pass
+    assert not reader.is_lost()
+
+
+# -- packs
+
+
+def test_an_assignment_comes_back_as_it_was_written(sweep, another):
+    for assignment in (Assignment(("t0002", "t0000"), {"t0000": 2}), Assignment()):
+        sweep.pack("p00").write(assignment)
+        assert another().pack("p00").read() == assignment
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{}", b'{"trial_ids": ["../x"], "num_failures": {}}', b"\xff"])
+def test_an_assignment_that_cannot_be_read_is_an_error_that_names_it(harness, sweep, content):
+    if content is not None:
+        harness.put("mine", PACK, content)
+    with pytest.raises(CheckpointError, match="p00"):
+        sweep.pack("p00").read()
+
+
+# -- logs and tallies
+
+
+def test_a_log_is_appended_to_and_its_end_is_told(sweep, trial, another, capfd):
+    pack = sweep.pack("p00")
+    assert trial.log_tail() == pack.log_tail() == ""
+    for log in (trial, pack):
+        with open_to_append(log.log_path) as file:
+            file.write(b"".join(b"line %d\n" % number for number in range(30)))
+    trial.write_log("it \udcff ended")
+    assert another().pack("p00").log_tail(2) == "line 28\nline 29"
+    *_, before, last = another().trial("t0000").log_tail().splitlines()
+    assert before == "line 29"
+    assert last.endswith(f"process {os.getpid()}: it \\udcff ended")
+    pack.begin_log()
+    assert str(os.getpid()) in capfd.readouterr().out
+
+
+def test_a_tally_is_forgotten_whether_there_is_one_or_not(trial):
+    trial.take()
+    trial.tally_path.write_bytes(b"")
+    trial.forget_tally()
+    trial.forget_tally()
+    assert not trial.tally_path.exists()
+
+
+# -- requests to stop
+
+
+def test_a_stop_is_asked_for_and_forgotten(sweep, another):
+    assert not sweep.stop_requested()
+    sweep.clear_stop_request()
+    another().request_stop()
+    another().request_stop()
+    assert sweep.stop_requested()
+    sweep.clear_stop_request()
+    assert not another().stop_requested()
+
+
+# -- what comes of it
+
+
+def test_the_best_is_read_with_its_policy(sweep, another):
+    policy = make_portable("CartPole-v1", seed=3)
+    sweep.write_best(make_best(), policy)
+    assert another().has_best()
+    assert load_policy(another().best_folder).env_id == load_policy(another().best_policy_path).env_id == "CartPole-v1"
+    sweep.write_best(make_best(seed=4))
+    assert another().read_best().seed == 4
+    assert load_policy(another().best_folder).env_id == "CartPole-v1"
+
+
+def test_a_policy_that_cannot_be_written_leaves_the_best_that_was_there(sweep, another, monkeypatch):
+    sweep.write_best(make_best(), make_portable("CartPole-v1"))
+
+    def fails(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fails)
+        with pytest.raises(CannotRunError, match="No space"):
+            sweep.write_best(make_best(seed=4), make_portable("Acrobot-v1"))
+    assert another().read_best() == make_best()
+    assert load_policy(another().best_folder).env_id == "CartPole-v1"
+
+
+def test_an_edited_best_is_refused(harness, sweep):
+    sweep.write_best(make_best())
+    data = json.loads(harness.content("mine", BEST)) | {"selection_score": 99.0}
+    harness.put("mine", BEST, json.dumps(data).encode())
+    with pytest.raises(CheckpointError, match="SHA-256"):
+        sweep.read_best()
+
+
+def test_films_are_those_that_were_written(sweep, another):
+    sweep.write_best(make_best(), make_portable("CartPole-v1"))
+    with sweep.writing_films() as paths:
+        assert set(paths) == {"before_mp4", "after_mp4", "after_gif", "before_after_mp4"}
+        paths["after_mp4"].write_bytes(b"film")
+    films = another().films()
+    assert {name: path.read_bytes() for name, path in films.items()} == {"after_mp4": b"film"}
+
+
+def test_a_report_is_written_over_the_one_before(harness, sweep):
+    for text in (b"one", b"two"):
+        with sweep.writing_report() as folder:
+            folder.mkdir(exist_ok=True)
+            (folder / "index.html").write_bytes(text)
+        assert harness.content("mine", "report/index.html") == text
+
+
+def test_events_are_appended(harness, trial):
+    for data in (b"one", b"two"):
+        trial.append_events("events.1", data)
+    assert harness.content("mine", "trials/t0000/tensorboard/events.1") == b"onetwo"
+
+
+# -- of machines
+
+
+def test_who_sees_the_same_sweep_can_answer(harness, sweep):
+    before = harness.keys("mine")
+    with sweep.probing() as probe:
+        assert not probe.is_same("", "node")
+        question = answer(probe.place, "node")
+        assert probe.is_same(question, "node")
+        assert not probe.is_same(question, "other")
+        assert not probe.is_same(f"{question}x", "node")
+    assert not probe.is_same(question, "node")
+    assert harness.keys("mine") == before
+
+
+def test_ray_tunes_state_is_begun_anew_and_the_driver_prints_to_a_file(sweep, another):
+    sweep.clear_tune_folder()
+    sweep.tune_folder.mkdir(parents=True)
+    (sweep.tune_folder / "state.json").touch()
+    another().clear_tune_folder()
+    assert not sweep.tune_folder.exists()
+    with sweep.driver_log.open("ab") as file:
+        file.write(b"said")
+    assert another().driver_log.read_bytes() == b"said"
