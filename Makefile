@@ -45,13 +45,13 @@ $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
-# In three processes on two cores, as many of the tests wait for processes of their own: two halves of those that start Ray,
+# In three processes on two cores, as many of the tests wait for processes of their own: two halves of those in tests/ray,
 # each with a Ray of its own, and the others. What the halves print, skipped tests with their reasons too, comes at the end.
 RAY := tests/ray
 test: $(VENV)/installed-test lint types
 	@$(BIN)/python -m pytest $(RAY)/test_[a-o]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
-	$(BIN)/python -m pytest $(RAY)/test_[p-z]*.py tests/learning > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
-	$(BIN)/python -m pytest --ignore=$(RAY) --ignore=tests/learning; others=$$?; \
+	$(BIN)/python -m pytest $(RAY)/test_[p-z]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
+	$(BIN)/python -m pytest --ignore=$(RAY); others=$$?; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	exit $$((first || second || others))
 
