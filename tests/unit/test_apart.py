@@ -22,6 +22,7 @@ from policies.errors import CannotRunError, EnvError, SpecError
 from tune_jobs.process.interruption import can_drive, taking_signals
 from tune_jobs.process.state import given_back
 from tune_jobs.process.streams import quiet
+from tune_jobs.sweeps import apart
 from tune_jobs.sweeps.interrupted import SweepInterrupted
 
 LIMIT_S = 120
@@ -52,7 +53,9 @@ def wait_until(condition):
         time.sleep(0.02)
 
 
-def test_a_thread_has_a_sweep_run_by_a_child_and_its_own_process_is_as_before(tmp_path, caplog):
+def test_a_thread_has_a_sweep_run_by_a_child_and_its_own_process_is_as_before(tmp_path, caplog, monkeypatch):
+    # A child that joins a Ray of another test's imports it, and that adds to where it looks for modules.
+    monkeypatch.setattr(apart, "address_of_users_ray", lambda: None)
     before = process_state()
     with allowed_again():
         allow_modules(["of_the_main_thread"])

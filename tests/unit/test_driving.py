@@ -248,6 +248,7 @@ def test_a_loop_over_launches_stops_at_the_first_signal(store, monkeypatch):
 
 def test_the_plan_asks_the_ray_that_is_there(monkeypatch):
     """Without importing ray where nobody has."""
+    monkeypatch.delitem(sys.modules, "ray", raising=False)
     here = driving.machine_here()
     assert here.source == "this machine"
     ray = type(sys)("ray")
