@@ -7,10 +7,10 @@ the network; the others are in `packed_dqn_traces`.
 import numpy as np
 import pytest
 from packed_dqn import ROUNDING, add, compare, differences, make_stack, q_values_of
-from rounding import assert_network
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import DQNHyperparams
+from tests.rounding import assert_network
 
 CASES = {}
 

@@ -6,13 +6,13 @@ import pytest
 import torch
 from network_builds import build, observations_of, portable, rllib_outputs
 from rllib_cases import MODULE, learner_of, module_of
-from rounding import assert_greedy, assert_network
 
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import make_hyperparams
 from policies.portable.file import ConvLayer, save_policy
+from tests.rounding import assert_greedy, assert_network
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

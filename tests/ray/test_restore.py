@@ -7,7 +7,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from rounding import assert_greedy, assert_network
 from trials import make_task, run_trial
 
 from policies.acting.load import load_policy
@@ -16,6 +15,7 @@ from policies.activations import ACTIVATIONS
 from policies.errors import CheckpointError, NotFoundError
 from policies.hyperparams import make_hyperparams
 from policies.portable.file import Layer, PolicyNetwork, read_policy, save_policy
+from tests.rounding import assert_greedy, assert_network
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 

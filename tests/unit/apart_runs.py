@@ -23,7 +23,7 @@ from tune_jobs.sweeps.interrupted import SweepInterrupted
 from tune_jobs.sweeps.outcome import SweepResult
 
 
-def make_result(name="mine"):
+def make_result(name: str = "mine") -> SweepResult:
     sweep = SweepRecord(
         name=name,
         state="completed",
@@ -37,7 +37,7 @@ def make_result(name="mine"):
 
 
 @run_alone
-def tells(folder, *, name):
+def tells(folder: Path, *, name: str) -> SweepResult:
     """Write down what it sees of its process, and change that process."""
     seen = {
         "pid": os.getpid(),
@@ -58,7 +58,7 @@ def tells(folder, *, name):
 
 
 @run_alone
-def meets(folder, *, name, other):
+def meets(folder: Path, *, name: str, other: str) -> SweepResult:
     """Return once the other one runs too."""
     (folder / name).touch()
     deadline = time.monotonic() + 120
@@ -69,7 +69,7 @@ def meets(folder, *, name, other):
 
 
 @run_alone
-def fails(kind):
+def fails(kind: str) -> SweepResult:
     class OwnError(Exception):
         """Of a class that no other process finds."""
 
@@ -89,7 +89,7 @@ def fails(kind):
 
 
 @run_alone
-def until_asked(folder, name):
+def until_asked(folder: Path, name: str) -> SweepResult:
     """Run until it is asked to stop, and a little longer, while a second signal would end it."""
     asked = threading.Event()
     with current().asking(asked.set):
@@ -100,8 +100,8 @@ def until_asked(folder, name):
     return make_result(name)
 
 
-def main(folder, how):
-    def call(name):
+def main(folder: Path, how: str) -> None:
+    def call(name: str) -> None:
         try:
             until_asked(folder, name)
         except SweepInterrupted as interruption:

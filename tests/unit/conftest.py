@@ -1,5 +1,7 @@
 """Fixtures of the tests of the command line, of stores, and of those that compute."""
 
+from collections.abc import Iterator
+
 import pytest
 from fake_sweeps import run, sweeps
 from store_parts import another, harness, sweep, trial
@@ -8,7 +10,7 @@ __all__ = ["another", "harness", "in_double", "run", "sweep", "sweeps", "trial"]
 
 
 @pytest.fixture
-def in_double():
+def in_double() -> Iterator[None]:
     """New tensors are of float64: formulas can be compared without their rounding."""
     import torch
 

@@ -2,14 +2,17 @@
 
 import dataclasses
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from policy_factory import make_portable
 
 from policies.acting.evaluate import Episodes
+from policies.acting.policy import Policy, WeightsPolicy
 from policies.errors import CheckpointError
-from policies.portable.file import Layer, PolicyNetwork, read_policy
+from policies.portable.file import Layer, PolicyNetwork, PortablePolicy, read_policy
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
@@ -27,19 +30,19 @@ class FakeEngine:
 
     def __init__(
         self,
-        episodes=lambda iteration: (20.0,),
+        episodes: Callable[[int], Sequence[float]] = lambda iteration: (20.0,),
         *,
-        steps=100,
-        nan_from=None,
-        raise_at=None,
-        says="the cart left the track",
-    ):
+        steps: int = 100,
+        nan_from: int | None = None,
+        raise_at: int | None = None,
+        says: str = "the cart left the track",
+    ) -> None:
         self.episodes, self.steps, self.nan_from, self.raise_at = episodes, steps, nan_from, raise_at
         self.says = says
         self.iteration = 0
-        self.builds = []
+        self.builds: list[str | None] = []
 
-    def build(self, task, checkpoint):
+    def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         self.builds.append(None if checkpoint is None else checkpoint.name)
         self.iteration = 0
         if checkpoint is not None:
@@ -47,7 +50,7 @@ class FakeEngine:
             if read_policy(checkpoint).training["iteration"] != self.iteration:
                 raise CheckpointError("Engine and policy of the checkpoint differ.")
 
-    def train_iteration(self):
+    def train_iteration(self) -> IterationStats:
         self.iteration += 1
         if self.iteration == self.raise_at:
             raise ZeroDivisionError(self.says)
@@ -58,7 +61,7 @@ class FakeEngine:
             learner={"total_loss": 1.0 / self.iteration},
         )
 
-    def policy(self):
+    def policy(self) -> PortablePolicy:
         portable = make_portable("CartPole-v1", hidden=(2,))
         nan = self.nan_from is not None and self.iteration >= self.nan_from
         *layers, last = portable.network.layers
@@ -69,23 +72,24 @@ class FakeEngine:
             training={"iteration": self.iteration},
         )
 
-    def save(self, folder):
+    def save(self, folder: Path) -> None:
         (folder / "rllib").mkdir()
         (folder / "engine.json").write_text(json.dumps({"iteration": self.iteration}))
 
-    def close(self):
+    def close(self) -> None:
         pass
 
 
 class FakeEvaluator:
     """Gives the policy of iteration i the mean return `scores(i)`, from two episodes of different returns."""
 
-    def __init__(self, scores=float):
+    def __init__(self, scores: Callable[[int], float] = float) -> None:
         self.scores = scores
-        self.evaluated = []
+        self.evaluated: list[int] = []
 
-    def run(self, policy):
+    def run(self, policy: Policy) -> Episodes:
         policy.check_finite()  # as the real one
+        assert isinstance(policy, WeightsPolicy)
         iteration = round(float(policy.portable.network.layers[-1].bias[0]))
         self.evaluated.append(iteration)
         score = self.scores(iteration)
@@ -95,18 +99,22 @@ class FakeEvaluator:
 class FakeClock:
     """Seconds that pass only by command, or so many at each look."""
 
-    def __init__(self, step=0.0):
+    def __init__(self, step: float = 0.0) -> None:
         self.now, self.step = 1_000.0, step
 
-    def __call__(self):
+    def __call__(self) -> float:
         self.now += self.step
         return self.now
 
 
-def make_task(folder: Path, **changes):
+def make_task(folder: Path, **changes: Any) -> TrialTask:
     """A trial that nothing stops for 100 iterations; evaluated at each, with a checkpoint at every tenth."""
-    sections = {"stop": StopSpec, "evaluation": EvaluationSpec, "checkpoints": CheckpointSpec}
-    values = {
+    sections: dict[str, Callable[..., Any]] = {
+        "stop": StopSpec,
+        "evaluation": EvaluationSpec,
+        "checkpoints": CheckpointSpec,
+    }
+    values: dict[str, Any] = {
         "stop": {"num_iterations": 100},
         "evaluation": {"every_iterations": 1},
         "checkpoints": {"every_iterations": 10, "keep": 2},

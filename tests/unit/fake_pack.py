@@ -1,11 +1,23 @@
 """A pack with fakes for its engine, its evaluator and its clock: each member does as its own script says."""
 
+from __future__ import annotations
+
 import dataclasses
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, cast
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
+from policies.acting.evaluate import Episodes, Evaluator
+from policies.acting.policy import Policy
+from policies.portable.file import PortablePolicy
+from tune_jobs.store.contract import Ownership
+from tune_jobs.store.progress import Progress
 from tune_jobs.store.trial_store import TrialStore
-from tune_jobs.training.pack_loop import PackLoop
+from tune_jobs.training.pack_loop import MemberReport, PackLoop
+from tune_jobs.training.protocol import IterationStats, TrialTask
 
 
 class FakePackEngine:
@@ -15,20 +27,22 @@ class FakePackEngine:
         make: Trial id -> the engine of that member.
     """
 
-    def __init__(self, make=lambda trial_id: FakeEngine()):
+    def __init__(self, make: Callable[[str], FakeEngine] = lambda trial_id: FakeEngine()) -> None:
         self._make = make
-        self.members, self.builds, self.num_iterations, self.closed = {}, [], 0, False
+        self.members: dict[str, FakeEngine] = {}
+        self.builds: list[tuple[str, int | None]] = []
+        self.num_iterations, self.closed = 0, False
 
-    def add(self, task, checkpoint):
+    def add(self, task: TrialTask, checkpoint: Path | None) -> None:
         assert task.trial_id not in self.members
         engine = self._make(task.trial_id)
         self.builds.append((task.trial_id, None if checkpoint is None else int(checkpoint.name)))
         engine.build(task, checkpoint)
         self.members[task.trial_id] = engine
 
-    def train_iteration(self):
+    def train_iteration(self) -> dict[str, IterationStats | Exception]:
         self.num_iterations += 1
-        results = {}
+        results: dict[str, IterationStats | Exception] = {}
         for trial_id, engine in self.members.items():
             try:
                 results[trial_id] = engine.train_iteration()
@@ -36,16 +50,16 @@ class FakePackEngine:
                 results[trial_id] = error
         return results
 
-    def policy(self, trial_id):
+    def policy(self, trial_id: str) -> PortablePolicy:
         return self.members[trial_id].policy()
 
-    def save(self, trial_id, folder):
+    def save(self, trial_id: str, folder: Path) -> None:
         self.members[trial_id].save(folder)
 
-    def remove(self, trial_id):
+    def remove(self, trial_id: str) -> None:
         del self.members[trial_id]
 
-    def close(self):
+    def close(self) -> None:
         self.closed = True
 
 
@@ -64,23 +78,23 @@ class Pack:
 
     def __init__(
         self,
-        folder,
-        make=lambda trial_id: FakeEngine(),
+        folder: Path,
+        make: Callable[[str], FakeEngine] = lambda trial_id: FakeEngine(),
         *,
-        scores=float,
-        max_retries=0,
-        clock=None,
-        watch=None,
-        under=None,
-        **task,
-    ):
+        scores: Callable[[int], float] = float,
+        max_retries: int = 0,
+        clock: Callable[[], float] | None = None,
+        watch: Callable[[float], AbstractContextManager[Any]] | None = None,
+        under: Ownership | None = None,
+        **task: Any,
+    ) -> None:
         self.folder, self.task, self.stop = folder, task, False
         self.engine = FakePackEngine(make)
         self.evaluator = FakeEvaluator(scores)
-        self.batches = []
+        self.batches: list[int] = []
         self.loop = PackLoop(
             self.engine,
-            self.evaluator,
+            cast("Evaluator", self.evaluator),
             self._evaluate,
             stop_requested=lambda: self.stop,
             max_retries=max_retries,
@@ -88,11 +102,11 @@ class Pack:
             under=under,
             **({} if watch is None else {"watch": watch}),
         )
-        self.reports = []
+        self.reports: list[MemberReport] = []
 
-    def _evaluate(self, evaluator, policies):
+    def _evaluate(self, evaluator: Evaluator, policies: Sequence[Policy]) -> list[Episodes | Exception]:
         self.batches.append(len(policies))
-        results = []
+        results: list[Episodes | Exception] = []
         for policy in policies:
             try:
                 results.append(evaluator.run(policy))
@@ -100,18 +114,18 @@ class Pack:
                 results.append(error)
         return results
 
-    def add(self, *trial_ids, num_failures=0):
+    def add(self, *trial_ids: str, num_failures: int = 0) -> Pack:
         for trial_id in trial_ids:
             task = dataclasses.replace(make_task(self.folder, **self.task), trial_id=trial_id)
             self.loop.add(task, num_failures)
         return self
 
-    def advance(self, max_s=0.0, *, until_evaluated=False):
+    def advance(self, max_s: float = 0.0, *, until_evaluated: bool = False) -> list[MemberReport]:
         reports = self.loop.advance(max_s, until_evaluated=until_evaluated)
         self.reports += reports
         return reports
 
-    def run(self, max_reports=1_000):
+    def run(self, max_reports: int = 1_000) -> Pack:
         """Until no member is left."""
         for _ in range(max_reports):
             if not self.loop.trial_ids:
@@ -119,13 +133,15 @@ class Pack:
             self.advance()
         return self
 
-    def of(self, trial_id):
+    def of(self, trial_id: str) -> list[MemberReport]:
         """The reports of a member."""
         return [report for report in self.reports if report.trial_id == trial_id]
 
-    def last(self, trial_id):
+    def last(self, trial_id: str) -> Progress:
         """Where a member was last."""
-        return self.of(trial_id)[-1].progress
+        progress = self.of(trial_id)[-1].progress
+        assert progress is not None
+        return progress
 
-    def store(self, trial_id):
+    def store(self, trial_id: str) -> TrialStore:
         return TrialStore(self.folder, trial_id)

@@ -3,10 +3,12 @@
 import dataclasses
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import click.testing
 import pytest
-from click.testing import CliRunner
 
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, SweepRecord, TrialRecord
 from tune_jobs.cli.commands import cli
@@ -15,15 +17,18 @@ ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
 HEAVY = ("ray", "torch", "pandas", "matplotlib", "imageio", "PIL")
 
+RunCommand = Callable[..., click.testing.Result]
+"""The arguments of `tune-jobs` -> what came of it."""
+
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunCommand:
     """Run a command in an empty folder; whatever goes wrong has to be a message, not an exception."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
 
-    def invoke(*arguments):
-        result = CliRunner().invoke(cli, [str(argument) for argument in arguments], prog_name="tune-jobs")
+    def invoke(*arguments: object) -> click.testing.Result:
+        result = click.testing.CliRunner().invoke(cli, [str(argument) for argument in arguments], prog_name="tune-jobs")
         assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
         assert "Traceback" not in result.output
         return result
@@ -96,7 +101,7 @@ TRIALS = [
 ]
 
 
-def evaluation(policy, *returns, threshold=195.0):
+def evaluation(policy: str, *returns: float, threshold: float | None = 195.0) -> EvaluationRecord:
     return EvaluationRecord(
         policy=policy,
         env_id="CartPole-v0",
@@ -117,10 +122,17 @@ BEST = BestRecord(
 )
 
 
+class FakeSweeps(types.ModuleType):
+    """In the place of `tune_jobs.sweeps.verbs`."""
+
+    calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]]
+    answers: dict[str, Any]
+
+
 @pytest.fixture
-def sweeps(monkeypatch, tmp_path):
+def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSweeps:
     """Calls are kept in `.calls`; what they return or raise can be replaced in `.answers`."""
-    fake = types.ModuleType("tune_jobs.sweeps.verbs")
+    fake = FakeSweeps("tune_jobs.sweeps.verbs")
     folder = tmp_path / "sweeps" / "mine"
     result = Result(folder, SWEEP, TRIALS, BEST, None, {"report": folder / "report" / "index.html"}, exit_code=3)
     status = Status(SWEEP, {"completed": 1, "failed": 1, "running": 0}, alive=False)
@@ -139,8 +151,8 @@ def sweeps(monkeypatch, tmp_path):
         "report": Path("index.html"),
     }
 
-    def make(name):
-        def call(*args, **kwargs):
+    def make(name: str) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
             fake.calls.append((name, args, kwargs))
             print("a library's chatter")
             answer = fake.answers[name]

@@ -5,25 +5,27 @@ from __future__ import annotations
 import json
 import os
 import time
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 RAISE, EXIT, WRONG_SHAPE = 1, 2, 3
 
 
-class Fragile(gym.Env):
+class Fragile(gym.Env[Any, Any]):
     """A random walk that goes on by action 0; by the others it breaks. It ends after 7 steps."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gym.spaces.Discrete(4)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.state, self.steps = self.draw(), 0
         return self.state.copy(), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if action == RAISE:
             raise RuntimeError("the motor broke")
         if action == EXIT:
@@ -33,7 +35,7 @@ class Fragile(gym.Env):
         observation = np.zeros(5) if action == WRONG_SHAPE else self.state.copy()
         return observation, float(self.state.sum()), self.steps == 7, False, {}
 
-    def draw(self):
+    def draw(self) -> NDArray[np.float64]:
         return self.np_random.normal(size=2)
 
 
@@ -42,7 +44,7 @@ class Slow(Fragile):
 
     action_space = gym.spaces.Discrete(1)
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         time.sleep(0.002)
         return super().step(action)
 
@@ -52,7 +54,7 @@ class Unseedable(Fragile):
 
     action_space = gym.spaces.Discrete(1)
 
-    def draw(self):
+    def draw(self) -> NDArray[np.float64]:
         return np.random.default_rng().normal(size=2)
 
 
@@ -61,11 +63,11 @@ class ForgetsLater(Fragile):
 
     action_space = gym.spaces.Discrete(1)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.generator = np.random.default_rng(seed)
         return super().reset(seed=seed)
 
-    def draw(self):
+    def draw(self) -> NDArray[np.float64]:
         return self.generator.normal(size=2)
 
 
@@ -77,20 +79,20 @@ class Sharing(Fragile):
 
     action_space = gym.spaces.Discrete(1)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         global _shared  # noqa: PLW0603
         if seed is not None:
             _shared = np.random.default_rng(seed)
         return super().reset(seed=seed)
 
-    def draw(self):
+    def draw(self) -> NDArray[np.float64]:
         return _shared.normal(size=2)
 
 
 class RefusesSeeds(Fragile):
     """Cannot be reset from seed 13."""
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed == 13:
             raise ValueError("13 brings bad luck")
         return super().reset(seed=seed)
@@ -99,10 +101,10 @@ class RefusesSeeds(Fragile):
 class Deep(Fragile):
     """Its error comes from what it calls."""
 
-    def step(self, action):
+    def step(self, action: Any) -> Any:
         return self.parse("{")
 
-    def parse(self, text):
+    def parse(self, text: str) -> Any:
         return json.loads(text)
 
 
@@ -134,25 +136,33 @@ class Faulty(Fragile):
     action_space = gym.spaces.Discrete(2)
 
     def __init__(  # noqa: PLR0917 (an env's arguments come by name)
-        self, where="step", raises=None, number=None, at=3, action=None, seed=None, length=7, render_mode=None
-    ):
+        self,
+        where: str = "step",
+        raises: str | None = None,
+        number: float | str | None = None,
+        at: int = 3,
+        action: int | None = None,
+        seed: int | None = None,
+        length: int = 7,
+        render_mode: str | None = None,
+    ) -> None:
         self.fault, self.raised, self.number = where, raises, None if number is None else float(number)
         self.at, self.action, self.wrong_seed, self.length = at, action, seed, length
         self.render_mode, self.steps, self.is_wrong = render_mode, 0, seed is None
         self.meet("init")
 
-    def meet(self, where):
+    def meet(self, where: str) -> None:
         if self.raised is not None and where == self.fault and self.is_wrong:
             raise RAISED[self.raised]
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed is not None and self.wrong_seed is not None:
             self.is_wrong = seed == self.wrong_seed
         self.meet("reset")
         observation, info = super().reset(seed=seed)
         return self.spoilt(observation, "reset"), info
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps += 1
         is_now = self.steps == self.at and self.action in (None, action)
         if is_now:
@@ -160,38 +170,39 @@ class Faulty(Fragile):
         self.state += 0.1 * self.draw()
         reward = float(self.state.sum())
         if is_now and self.is_wrong and self.fault == "reward":
+            assert self.number is not None
             reward = self.number
         observation = self.state.copy()
         return self.spoilt(observation, "observation") if is_now else observation, reward, self.over, False, {}
 
     @property
-    def over(self):
+    def over(self) -> bool:
         return self.steps == self.length
 
-    def spoilt(self, observation, where):
+    def spoilt(self, observation: NDArray[np.float64], where: str) -> NDArray[np.float64]:
         if self.is_wrong and self.number is not None and self.fault == where:
             observation[1] = self.number
         return observation
 
-    def render(self):
+    def render(self) -> Any:
         self.meet("render")
         return np.zeros((8, 8, 3), np.uint8)
 
-    def close(self):
+    def close(self) -> None:
         self.meet("close")
 
 
-class Images(gym.Env):
+class Images(gym.Env[Any, Any]):
     """Observes images, and cannot be drawn."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
     observation_space = gym.spaces.Box(0, 255, (20, 16, 3), np.uint8)
     action_space = gym.spaces.Discrete(2)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         return np.zeros((20, 16, 3), np.uint8), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         return np.zeros((20, 16, 3), np.uint8), 0.0, True, False, {}
 
 
@@ -200,6 +211,6 @@ class VerySlow(Fragile):
 
     action_space = gym.spaces.Discrete(1)
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         time.sleep(0.25)
         return super().step(action)

@@ -4,6 +4,9 @@ import copy
 import functools
 import hashlib
 import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from packed_members import random_member
@@ -22,12 +25,15 @@ FILES = (
     "member/state.json",
 )  # fmt: skip
 
-WRONG = {
+Place = tuple[str | int, ...]
+"""Keys and indices on the way to a place in JSON-like data."""
+
+WRONG: dict[str, Any] = {
     "null": None, "true": True, "a negative": -1, "zero": 0, "a fraction": 1.5, "64 bits": 2**64, "a huge int": 10**300,
     "a huge float": 1e308, "infinity": float("inf"), "no text": "", "a text": "x", "a digit": "7",
     "a path up": "../../precious", "a long text": "x" * 5_000, "a NUL": "a\0b", "a surrogate": "\ud800", "a list": [],
     "a list in lists": [[1]], "a mapping": {}, "a mapping of lists": {"x": [None]},
-    "deep": functools.reduce(lambda inner, _: [inner], range(200), 0),
+    "deep": functools.reduce(lambda inner, _: [inner], range(200), cast("Any", 0)),
 }  # fmt: skip
 """Values that are right nowhere, or in few places."""
 
@@ -39,7 +45,7 @@ CONTENTS = {
 """Files that are none of ours."""
 
 
-def make_template(folder):
+def make_template(folder: Path) -> Path:
     """A sweep with every kind of file that there is."""
     store = make_sweep_folder(folder, iterations=6, seeds_per_point=1)
     change = ChangeRecord(
@@ -58,7 +64,7 @@ def make_template(folder):
     return folder
 
 
-def places(data, at=()):
+def places(data: Any, at: Place = ()) -> Iterator[Place]:
     """Every place in JSON-like data; of a list the first item stands for all."""
     if at:
         yield at
@@ -67,12 +73,12 @@ def places(data, at=()):
         yield from places(value, (*at, key))
 
 
-def read(path):
+def read(path: Path) -> Any:
     """The content of a file; of results the last line."""
     return json.loads(path.read_text().splitlines()[-1]) if path.suffix == ".jsonl" else json.loads(path.read_text())
 
 
-def put(data, at, value):
+def put(data: Any, at: Place, value: Any) -> Any:
     """A copy of JSON-like data that has a value at a place."""
     data = copy.deepcopy(data)
     target = data
@@ -82,7 +88,7 @@ def put(data, at, value):
     return data
 
 
-def without(data, at):
+def without(data: Any, at: Place) -> Any:
     """A copy of JSON-like data that lacks a place."""
     data = copy.deepcopy(data)
     target = data
@@ -92,7 +98,7 @@ def without(data, at):
     return data
 
 
-def write(path, data):
+def write(path: Path, data: Any) -> None:
     """Replace a file, sealed and with its hash in its checkpoint's manifest, as somebody does who knows how."""
     if isinstance(data, dict) and "sha256" in data and path.name in {"manifest.json", "evaluation.json"}:
         data = data | {"sha256": seal(data)}
@@ -104,7 +110,7 @@ def write(path, data):
     in_manifest(path)
 
 
-def in_manifest(path):
+def in_manifest(path: Path) -> None:
     """Have the manifest beside a file name what the file is by now."""
     manifest = path.with_name("manifest.json")
     if path != manifest and manifest.is_file():

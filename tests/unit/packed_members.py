@@ -1,17 +1,22 @@
 """Members of a pack with random weights, made without RLlib, and the same networks as torch modules."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import torch
 from torch import nn
 
-from policies.hyperparams import PPOHyperparams
+from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 from policies.packed.member import Member, network_layouts
 
 MODULES = {"linear": nn.Identity, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "elu": nn.ELU, "gelu": nn.GELU}
 NUM_INPUTS, NUM_OUTPUTS = 4, 3
 
 
-def names_and_shapes(hyperparams):
+def names_and_shapes(hyperparams: TrainedHyperparams) -> Iterator[tuple[str, tuple[int, ...]]]:
     """Weights of an RLModule by its names."""
     for layout in network_layouts(hyperparams, NUM_OUTPUTS):
         size = NUM_INPUTS
@@ -22,7 +27,7 @@ def names_and_shapes(hyperparams):
             size = parts[-1].stop
 
 
-def random_member(name, seed=0, **values):
+def random_member(name: str, seed: int = 0, **values: Any) -> Member[PPOHyperparams]:
     hyperparams = PPOHyperparams(**values)
     rng = np.random.default_rng(seed)
     weights = {
@@ -35,7 +40,7 @@ def random_member(name, seed=0, **values):
 class Reference(nn.Module):
     """A member's networks, layer by layer, in torch's own modules."""
 
-    def __init__(self, member):
+    def __init__(self, member: Member[PPOHyperparams]) -> None:
         super().__init__()
         self.member = member
         self.layers = nn.ModuleDict()
@@ -47,7 +52,7 @@ class Reference(nn.Module):
                     layer.weight.copy_(torch.from_numpy(value))
                     layer.bias.copy_(torch.from_numpy(member.weights[f"{name}.bias"]))
 
-    def forward(self, x):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Outputs of each network side by side."""
         outputs = []
         function = MODULES[self.member.hyperparams.activation]()
@@ -58,6 +63,6 @@ class Reference(nn.Module):
             outputs += [self.layers[part.name.replace(".", "/")](features) for part in layout.layers[-1]]
         return torch.cat(outputs, dim=-1)
 
-    def named(self):
+    def named(self) -> list[tuple[str, nn.Parameter]]:
         """(name, weight), by the RLModule's names."""
         return [(name.removeprefix("layers.").replace("/", "."), value) for name, value in self.named_parameters()]

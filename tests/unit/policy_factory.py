@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from policies.acting.policy import NetworkPolicy
 from policies.envs.make import check_env
@@ -15,6 +17,7 @@ from policies.portable.file import (
     ConvLayer,
     Layer,
     ModuleWeights,
+    NetworkKind,
     Normalization,
     PolicyNetwork,
     PortablePolicy,
@@ -22,12 +25,22 @@ from policies.portable.file import (
 )
 
 
-def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algorithm="ppo", **env_args: Any):
+def make_portable(
+    env_id: str,
+    hidden: Sequence[int] = (16, 16),
+    activation: str = "tanh",
+    seed: int = 0,
+    algorithm: str = "ppo",
+    **env_args: Any,
+) -> PortablePolicy:
     """A network with random weights for a registered env."""
     info = check_env(env_id, env_args)
     rng = np.random.default_rng(seed)
-    discrete = isinstance(info.action_space, gym.spaces.Discrete)
-    num_outputs = int(info.action_space.n) if discrete else 2 * info.action_space.shape[0]
+    space = info.action_space
+    discrete = isinstance(space, gym.spaces.Discrete)
+    assert space.shape is not None
+    assert info.observation_space.shape is not None
+    num_outputs = int(space.n) if isinstance(space, gym.spaces.Discrete) else 2 * space.shape[0]
     sizes = [info.observation_space.shape[0], *hidden, num_outputs]
     layers = []
     for index, (num_in, num_out) in enumerate(itertools.pairwise(sizes)):
@@ -35,7 +48,7 @@ def make_portable(env_id: str, hidden=(16, 16), activation="tanh", seed=0, algor
         bias = 0.1 * rng.normal(size=num_out)
         last = index == len(sizes) - 2
         layers.append(Layer(weight.astype(np.float32), bias.astype(np.float32), "linear" if last else activation))
-    kind = "gaussian" if not discrete else "q_values" if algorithm == "dqn" else "categorical"
+    kind: NetworkKind = "gaussian" if not discrete else "q_values" if algorithm == "dqn" else "categorical"
     return PortablePolicy(
         network=PolicyNetwork(kind, tuple(layers)),
         algorithm=algorithm,
@@ -58,12 +71,15 @@ CONV = ((5, 4, 2), (3, 2, 1))
 """(channels, kernel, stride); they make 4 x 3 pixels of such an image."""
 
 
-def make_image_policy(activation="relu", seed=0, *, normalize=True, num_actions=3) -> PortablePolicy:
+def make_image_policy(
+    activation: str = "relu", seed: int = 0, *, normalize: bool = True, num_actions: int = 3
+) -> PortablePolicy:
     """A convolutional network with random weights for `IMAGES`."""
     rng = np.random.default_rng(seed)
 
-    def weights(*shape):
-        return (rng.normal(size=shape) / np.sqrt(np.prod(shape[1:]))).astype(np.float32)
+    def weights(*shape: int) -> NDArray[np.float32]:
+        drawn: NDArray[np.float64] = rng.normal(size=shape) / np.sqrt(np.prod(shape[1:]))
+        return drawn.astype(np.float32)
 
     conv, channels = [], IMAGES.shape[2]
     for out_channels, kernel, stride in CONV:
@@ -96,7 +112,10 @@ def make_image_policy(activation="relu", seed=0, *, normalize=True, num_actions=
 
 def make_module_portable() -> PortablePolicy:
     """A policy whose network is a class of the user's own; nothing of that name exists."""
-    tensors = {"trunk.weight": np.arange(8, dtype=np.float32).reshape(2, 4), "count": np.array(3, dtype=np.int64)}
+    tensors: dict[str, NDArray[Any]] = {
+        "trunk.weight": np.arange(8, dtype=np.float32).reshape(2, 4),
+        "count": np.array(3, dtype=np.int64),
+    }
     base = make_portable("CartPole-v1")
     module = ModuleWeights("no_such_package.networks:Mine", {"fcnet_hiddens": [2], "rate": 0.5}, tensors)
     return dataclasses.replace(base, network=PolicyNetwork("module", (), module=module))
@@ -128,23 +147,23 @@ def balancing_policy(env_id: str = "CartPole-v0", skill: str = "good") -> Networ
     )
 
 
-class Walk(gym.Env):
+class Walk(gym.Env[Any, Any]):
     """A point on a line that is moved by its action; it ends far out, or never. Actions start at 3."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
-    def __init__(self, end: float | None = None, fail_at: int | None = None, render_mode: str | None = None):
+    def __init__(self, end: float | None = None, fail_at: int | None = None, render_mode: str | None = None) -> None:
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
         self.action_space = gym.spaces.Discrete(2, start=3)
         self.render_mode = render_mode
         self.end, self.fail_at, self.position, self.steps = end, fail_at, 0.0, 0
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.position, self.steps = float(self.np_random.normal()), 0
         return np.array([self.position, 1.0]), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         # Not `isinstance(action, int) or np.integer`: an env may well want a plain int.
         assert isinstance(action, int), type(action)
         assert action in {3, 4}
@@ -155,7 +174,7 @@ class Walk(gym.Env):
         terminated = self.end is not None and abs(self.position) > self.end
         return np.array([self.position, 1.0]), self.position, terminated, False, {}
 
-    def render(self):
+    def render(self) -> Any:
         frame = np.zeros((10, 15, 3), np.uint8)
         frame[:, self.steps % 15] = 255
         return frame
@@ -166,40 +185,42 @@ class NotDrawable(Walk):
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
 
 
-class Pushes(gym.Env):
+class Pushes(gym.Env[Any, Any]):
     """Continuous actions, one bounded and one not."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
         self.action_space = gym.spaces.Box(np.array([-1.0, -np.inf], np.float32), np.array([1.0, np.inf], np.float32))
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         return self.observation_space.sample() * 0, {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         assert action.shape == (2,)
         return np.zeros(3, np.float32), float(action.sum()), True, False, {}
 
 
-class Odd(gym.Env):
+class Odd(gym.Env[Any, Any]):
     """Spaces of any kind, to be refused."""
 
-    def __init__(self, observation_space=None, action_space=None):
+    def __init__(
+        self, observation_space: gym.Space[Any] | None = None, action_space: gym.Space[Any] | None = None
+    ) -> None:
         self.observation_space = observation_space or gym.spaces.Box(-1, 1, (2,))
         self.action_space = action_space or gym.spaces.Discrete(2)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         return self.observation_space.sample(), {}
 
 
 def register_test_envs() -> None:
     """Register the envs above; more than once does no harm."""
-    here = {
+    here: dict[str, Callable[..., gym.Env[Any, Any]]] = {
         "TestWalk-v0": Walk,
         "TestNotDrawable-v0": NotDrawable,
         "TestPushes-v0": Pushes,

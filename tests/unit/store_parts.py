@@ -2,9 +2,12 @@
 
 import os
 import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
-from stores import HARNESSES
+from stores import HARNESSES, Harness
 
 from analysis.records import (
     BestRecord,
@@ -14,63 +17,76 @@ from analysis.records import (
     SweepRecord,
     TrialRecord,
 )
+from tune_jobs.store.contract import Sweep, Trial
 
 SWEEP, TRIAL, RESULTS = "sweep.json", "trials/t0000/trial.json", "trials/t0000/results.jsonl"
 BEST, PACK = "best/evaluation.json", "packs/p00.json"
 NO_IDS = ["", ".", "..", "../t0000", "t0000/", "/t0000", "t000", "T0000", "t00000000000", "t0000\n", "t0000\0", "*"]
 
 
+Reopen = Callable[[], Sweep]
+"""Opens the sweep as another process does."""
+
+
 @pytest.fixture(params=HARNESSES)
-def harness(request, tmp_path):
+def harness(request: pytest.FixtureRequest, tmp_path: Path) -> Harness:
     return HARNESSES[request.param](tmp_path)
 
 
 @pytest.fixture
-def sweep(harness):
+def sweep(harness: Harness) -> Sweep:
     made = harness.storage().sweep("mine")
     made.create()
     return made
 
 
 @pytest.fixture
-def trial(sweep):
+def trial(sweep: Sweep) -> Trial:
     return sweep.trial("t0000")
 
 
 @pytest.fixture
-def another(harness):
+def another(harness: Harness) -> Reopen:
     """The sweep as another process opens it."""
     return lambda: harness.storage().sweep("mine")
 
 
-def make_sweep(**changes):
-    values = {"name": "mine", "state": "running", "spec": {"a": 1}, "evaluation_seeds": (1, 2), "num_trials": 2,
-              "confirmation_seeds": (3,), "created_at": 5.0}  # fmt: skip
+def make_sweep(**changes: Any) -> SweepRecord:
+    values: dict[str, Any] = {
+        "name": "mine", "state": "running", "spec": {"a": 1}, "evaluation_seeds": (1, 2), "num_trials": 2,
+        "confirmation_seeds": (3,), "created_at": 5.0,
+    }  # fmt: skip
     return SweepRecord(**values | changes)
 
 
-def make_trial(index=0, **changes):
-    values = {"trial_id": f"t{index:04d}", "index": index, "point_index": index, "seed": index, "point": {"lr": 0.1}}
+def make_trial(index: int = 0, **changes: Any) -> TrialRecord:
+    values: dict[str, Any] = {
+        "trial_id": f"t{index:04d}",
+        "index": index,
+        "point_index": index,
+        "seed": index,
+        "point": {"lr": 0.1},
+    }
     return TrialRecord(**values | changes)
 
 
-def make_iteration(number, **changes):
+def make_iteration(number: int, **changes: Any) -> IterationRecord:
     return IterationRecord(iteration=number, num_env_steps=100 * number, num_episodes=number, time_s=number, **changes)
 
 
-def make_checkpoint(iteration, **changes):
-    values = {"trial_id": "t0000", "iteration": iteration, "num_env_steps": 100 * iteration}
+def make_checkpoint(iteration: int, **changes: Any) -> CheckpointRecord:
+    values: dict[str, Any] = {"trial_id": "t0000", "iteration": iteration, "num_env_steps": 100 * iteration}
     return CheckpointRecord(**values | changes)
 
 
-def make_best(**changes):
+def make_best(**changes: Any) -> BestRecord:
     evaluation = EvaluationRecord(policy="p", env_id="E-v0", seeds=(1,), returns=(0.0,), lengths=(3,))
-    values = {"checkpoint": make_checkpoint(1), "point": {}, "seed": 0, "selection_score": -1.0,
+    values: dict[str, Any] = {"checkpoint": make_checkpoint(1), "point": {}, "seed": 0, "selection_score": -1.0,
               "confirmation": evaluation, "random": evaluation}  # fmt: skip
     return BestRecord(**values | changes)
 
 
-def fill(folder, content="abc"):
+def fill(folder: Path, content: str = "abc") -> None:
     """What an engine and the trial write into a checkpoint."""
     (folder / "policy.json").write_text("{}")
     (folder / "policy.safetensors").write_text("")
@@ -78,7 +94,7 @@ def fill(folder, content="abc"):
     (folder / "state" / "weights").write_text(content)
 
 
-def killed(act):
+def killed(act: Callable[[Callable[..., None]], object]) -> None:
     """Do something in a process that is killed within it: `act` is given what to call there."""
     child = os.fork()
     if not child:
@@ -89,5 +105,5 @@ def killed(act):
     assert os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
-def numbers(another):
+def numbers(another: Reopen) -> list[int]:
     return another().trial("t0000").checkpoint_iterations()

@@ -1,9 +1,12 @@
 """A sweep folder as a run leaves it, in a second and without Ray: fakes for the training, the real files."""
 
 import dataclasses
+from pathlib import Path
+from typing import Any, cast
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
+from policies.acting.evaluate import Evaluator
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -12,7 +15,7 @@ from tune_jobs.sweeps.drive import write_new
 from tune_jobs.training.trial_loop import TrialLoop
 
 MACHINE = Machine(num_cpus=4, source="this machine")
-SPEC = {
+SPEC: dict[str, Any] = {
     "env": {"id": "CartPole-v1"},
     "algorithm": "ppo",
     "space": {"lr": {"uniform": [1e-4, 1e-2]}},
@@ -23,7 +26,7 @@ SPEC = {
 }
 
 
-def make_sweep_folder(folder, iterations=6, **spec):
+def make_sweep_folder(folder: Path, iterations: int = 6, **spec: Any) -> SweepStore:
     """A completed sweep of 4 trials; trial i's checkpoint of iteration n scored 10 i + n.
 
     The points are {t0000, t0001} and {t0002, t0003}; t0003 wins with its last checkpoint.
@@ -41,7 +44,7 @@ def make_sweep_folder(folder, iterations=6, **spec):
     return store
 
 
-def train(store, trial_id, iterations):
+def train(store: SweepStore, trial_id: str, iterations: int) -> None:
     """Run a trial to its end, and write its record as its driver does."""
     known = store.trial(trial_id).read_record()
     task = make_task(
@@ -50,7 +53,7 @@ def train(store, trial_id, iterations):
     )  # fmt: skip
     task = dataclasses.replace(task, trial_id=trial_id, seed=known.seed)
     evaluator = FakeEvaluator(lambda iteration: 10.0 * known.index + iteration)
-    loop = TrialLoop(task, FakeEngine(), evaluator, FakeClock(0.001))
+    loop = TrialLoop(task, FakeEngine(), cast("Evaluator", evaluator), FakeClock(0.001))
     loop.open()
     while (progress := loop.advance(1e9)).status == "running":
         pass

@@ -1,7 +1,10 @@
 """Sweeps that look like real ones, without training: for the tests of tables, plots and report."""
 
 import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,6 +15,7 @@ from analysis.records import (
     IterationRecord,
     SweepRecord,
     TrialRecord,
+    TrialStatus,
 )
 from analysis.selection import NoUsableTrialError, select_best
 
@@ -32,10 +36,10 @@ class Synthetic:
     trials: list[TrialRecord]
     results: dict[str, list[IterationRecord]]
     best: BestRecord | None
-    videos: dict = field(default_factory=dict)
+    videos: dict[str, Path] = field(default_factory=dict)
 
 
-def make_points(num_samples, rng):
+def make_points(num_samples: int, rng: np.random.Generator) -> list[dict[str, Any]]:
     grid = [([size], activation) for size in (32, 64) for activation in ("linear", "relu")]
     return [
         {"hidden_sizes": list(sizes), "activation": activation, "lr": float(rng.uniform(1e-7, 1e-2))}
@@ -46,28 +50,29 @@ def make_points(num_samples, rng):
 
 def make_sweep(
     *,
-    points=None,
-    seeds_per_point=1,
-    failed=(),
-    pending=(),
-    algorithm="ppo",
-    env_id="CartPole-v0",
-    threshold=195.0,
-    cap=200.0,
-    max_steps=50_000,
-    steps_per_iteration=1024,
-    seed=0,
-    name="cartpole-ppo-1",
-    error=ERROR,
-    with_best=True,
-):
+    points: Sequence[dict[str, Any]] | None = None,
+    seeds_per_point: int = 1,
+    failed: Collection[int] = (),
+    pending: Collection[int] = (),
+    algorithm: str = "ppo",
+    env_id: str = "CartPole-v0",
+    threshold: float | None = 195.0,
+    cap: float = 200.0,
+    max_steps: int = 50_000,
+    steps_per_iteration: int = 1024,
+    seed: int = 0,
+    name: str = "cartpole-ppo-1",
+    error: str = ERROR,
+    with_best: bool = True,
+) -> Synthetic:
     """A finished sweep; `failed` and `pending` are trial indices."""
     rng = np.random.default_rng(seed)
     points = make_points(5, rng) if points is None else points
-    trials, results = [], {}
+    trials: list[TrialRecord] = []
+    results: dict[str, list[IterationRecord]] = {}
     for index in range(len(points) * seeds_per_point):
         point = points[index // seeds_per_point]
-        status = "failed" if index in failed else "pending" if index in pending else "completed"
+        status: TrialStatus = "failed" if index in failed else "pending" if index in pending else "completed"
         stop_at = {"failed": 5, "pending": 0}.get(status, math.ceil(max_steps / steps_per_iteration))
         rows = make_iterations(
             point,
@@ -90,15 +95,25 @@ def make_sweep(
     return Synthetic(sweep, trials, results, best)
 
 
-def make_iterations(point, rng, *, num_iterations, steps_per_iteration, cap, threshold):
+def make_iterations(
+    point: Mapping[str, Any],
+    rng: np.random.Generator,
+    *,
+    num_iterations: int,
+    steps_per_iteration: int,
+    cap: float,
+    threshold: float | None,
+) -> list[IterationRecord]:
     log_lr = math.log10(point.get("lr", 3e-3))
     speed = math.exp(-((log_lr + 2.5) ** 2) / 0.5) * (1.6 if sum(point.get("hidden_sizes", [64])) >= 64 else 1.0)
     ceiling = cap * (0.75 if point.get("activation") == "linear" else 1.4)
-    rows, last, num_episodes = [], [], 0
+    rows: list[IterationRecord] = []
+    last: list[float] = []
+    num_episodes = 0
     for iteration in range(1, num_iterations + 1):
         progress = 1 - math.exp(-speed * iteration / 10)
         mean = min(1.04 * cap, 20 + (ceiling - 20) * progress**1.5)
-        returns = []
+        returns: list[float] = []
         while sum(returns) < steps_per_iteration:
             returns.append(float(min(cap, max(8, round(rng.normal(mean, 0.2 * mean * (mean < 0.97 * cap)))))))
         num_episodes += len(returns)
@@ -124,10 +139,12 @@ def make_iterations(point, rng, *, num_iterations, steps_per_iteration, cap, thr
     return rows
 
 
-def make_trial(index, *, seeds_per_point, point, status, rows):
+def make_trial(
+    index: int, *, seeds_per_point: int, point: dict[str, Any], status: TrialStatus, rows: Sequence[IterationRecord]
+) -> TrialRecord:
     trial_id = f"t{index:04d}"
     evaluated = [row for row in rows if row.evaluation_return is not None]
-    top = max(evaluated, key=lambda row: row.evaluation_return, default=None)
+    top = max(evaluated, key=lambda row: cast("float", row.evaluation_return), default=None)
     kept = sorted({row.iteration: row for row in [top, *rows[-1:]] if row is not None}.items())
     last = rows[-1] if rows else None
     return TrialRecord(
@@ -162,7 +179,9 @@ def make_trial(index, *, seeds_per_point, point, status, rows):
     )
 
 
-def make_sweep_record(name, algorithm, env_id, trials, seeds_per_point):
+def make_sweep_record(
+    name: str, algorithm: str, env_id: str, trials: Sequence[TrialRecord], seeds_per_point: int
+) -> SweepRecord:
     return SweepRecord(
         name=name,
         state="completed",
@@ -192,13 +211,15 @@ def make_sweep_record(name, algorithm, env_id, trials, seeds_per_point):
     )
 
 
-def make_best(trials, env_id, threshold, cap, rng):
+def make_best(
+    trials: Sequence[TrialRecord], env_id: str, threshold: float | None, cap: float, rng: np.random.Generator
+) -> BestRecord:
     selection = select_best(trials)
     seeds = tuple(range(900_000, 900_100))
     returns = tuple(float(min(cap, round(value))) for value in rng.normal(selection.score - 1, 6, size=100))
     baseline = tuple(float(round(value)) for value in rng.gamma(4, 6, size=100) + 8)
 
-    def record(policy, values):
+    def record(policy: str, values: tuple[float, ...]) -> EvaluationRecord:
         return EvaluationRecord(
             policy=policy,
             env_id=env_id,

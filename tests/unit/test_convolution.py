@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rounding import assert_rounded
 
 from policies.errors import SpecError
 from policies.portable.convolution import convolve, output_shape
+from tests.rounding import assert_rounded
 
 
 def test_a_convolution_by_its_definition():

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from rounding import close
 from torch import nn
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn import loss as dqn
+from tests.rounding import close
 
 M, B = 3, 50
 

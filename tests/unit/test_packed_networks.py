@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
-from rounding import assert_rounded, close
 
 from policies.activations import ACTIVATIONS
 from policies.packed.member import MAX_GROUP, group_members, network_layouts, size_class
 from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm
 from policies.packed.rows import StackedRows
+from tests.rounding import assert_rounded, close
 
 # Of the members of one stack, by the number of layers: the second is padded in every layer, the third in one.
 SIZES = {1: [(12,), (7,), (9,)], 2: [(12, 9), (5, 4), (11, 9)], 3: [(8, 12, 6), (7, 5, 4), (8, 12, 3)]}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from packed_members import random_member
-from rounding import assert_rounded, close
 from torch import nn
 
 from policies.networks.layers import ObservationStatistics
@@ -15,6 +14,7 @@ from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR
 from policies.packed.ppo import loss as ppo
 from policies.packed.ppo.gae import advantages_and_targets, standardise
 from policies.packed.sampling import EpisodeTracker, Observations, one_hot
+from tests.rounding import assert_rounded, close
 
 M, B = 4, 200
 

@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from policy_factory import IMAGES, make_image_policy, make_policy, make_portable, register_test_envs
-from rounding import assert_rounded, dense
 
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.activations import ACTIVATIONS
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import save_policy
+from tests.rounding import assert_rounded, dense
 
 register_test_envs()
 ENVS = ["CartPole-v1", "Pendulum-v1", "TestPushes-v0", "TestWalk-v0", "MountainCarContinuous-v0"]

@@ -18,7 +18,6 @@ from policy_factory import (
     make_portable,
     register_test_envs,
 )
-from rounding import assert_rounded, dense
 
 from policies.acting.load import load_policy
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
@@ -30,6 +29,7 @@ from policies.portable.file import (
     save_policy,
     space_from_description,
 )
+from tests.rounding import assert_rounded, dense
 
 register_test_envs()
 ROOT = Path(__file__).parents[2]
