@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from policies import random_streams
 from policies.hyperparams import DQNHyperparams
+from policies.sum_trees import SumTrees
 
 _MAX_GATHER_BYTES = 64 * 2**20
 _MIN_PRIORITY = 1e-6
@@ -183,25 +184,26 @@ class PrioritizedReplayBuffer(ReplayBuffer):
     def __init__(self, capacity: int, rng: np.random.Generator, *, alpha: float, beta: float) -> None:
         super().__init__(capacity, rng)
         self.alpha, self.beta = alpha, beta
-        # A binary tree in an array: node i has children 2i and 2i + 1, the leaves are the rows, sums above.
-        self._num_levels = max(1, (capacity - 1).bit_length())
-        self._num_leaves = 1 << self._num_levels
-        self._sums = np.zeros(2 * self._num_leaves)
+        # One tree, whose leaves are the rows.
+        self._priorities = SumTrees(1, capacity)
         self._highest = 1.0
 
     def add(self, transitions: Transitions) -> NDArray[np.int64]:
         """As `ReplayBuffer.add`; new rows get the highest priority so far, so that each is soon seen."""
         where = super().add(transitions)
-        self._set(where, np.full(len(where), self._highest))
+        self._priorities.set(where, np.full(len(where), self._highest))
         return where
 
     def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
         """Draw batches; the priorities set between two of them act on the next."""
         if not self._size:
             return
+        root = np.zeros(batch_size, dtype=np.int64)
         for _ in range(num_batches):
-            indices = self._find(self.rng.uniform(0.0, self._sums[1], batch_size))
-            shares = self._sums[self._num_leaves + indices] / self._sums[1]
+            total = self._priorities.totals[0]
+            leaves = self._priorities.find(root, self.rng.uniform(0.0, total, batch_size))
+            indices = np.minimum(leaves, self._size - 1)
+            shares = self._priorities.leaves[indices] / total
             weights = (self._size * shares) ** -self.beta
             rows = {name: values[indices] for name, values in self._columns.items()}
             weights = (weights / weights.max()).astype(np.float32)
@@ -212,26 +214,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self.alpha
         priorities = np.where(np.isfinite(priorities), priorities, self._highest)
         self._highest = float(priorities.max(initial=self._highest))
-        self._set(indices, priorities)
-
-    def _set(self, indices: NDArray[np.int64], priorities: NDArray[np.float64]) -> None:
-        nodes = self._num_leaves + indices
-        self._sums[nodes] = priorities
-        # Level by level, of which there are as many whatever the rows are, and if there are none.
-        for _ in range(self._num_levels):
-            nodes = nodes >> 1
-            self._sums[nodes] = self._sums[2 * nodes] + self._sums[2 * nodes + 1]
-
-    def _find(self, heights: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The rows at these heights of the stack of all priorities."""
-        nodes = np.ones(len(heights), dtype=np.int64)
-        for _ in range(self._num_levels):
-            left = 2 * nodes
-            beyond = heights >= self._sums[left]
-            heights = np.where(beyond, heights - self._sums[left], heights)
-            nodes = left + beyond
-        # Rounding may lead one step beyond the last row.
-        return np.minimum(nodes - self._num_leaves, self._size - 1)
+        self._priorities.set(indices, priorities)
 
 
 def make_replay(hyperparams: DQNHyperparams, seed: int) -> ReplayBuffer:

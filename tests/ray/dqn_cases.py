@@ -317,7 +317,7 @@ def priority_ratio(replay, td_error):
     rows = sampled_like(replay, 2)
     where = replay.add(rows)
     replay.set_priorities(where, np.array([1.0, td_error], dtype=np.float32))
-    leaves = replay._sums[replay._num_leaves + where]
+    leaves = replay._priorities.leaves[where]
     return leaves[1] / leaves[0]
 
 

@@ -141,7 +141,7 @@ def check_prioritized_alpha():
     slots = replay.slots(["a", "b"])
     replay.add(slots, np.zeros((2, 2, replay.num_columns), dtype=np.float32))
     replay.set_priorities(slots, np.array([[0, 1]] * 2), np.array([[1.0, 100.0]] * 2, dtype=np.float32))
-    leaves = replay._sums[slots, replay._num_leaves : replay._num_leaves + 2]
+    leaves = replay._priorities.leaves.reshape(2, -1)[slots, :2]
     np.testing.assert_allclose(leaves[:, 1] / leaves[:, 0], [1.0, 100.0], rtol=1e-4)
     stack.envs.close()
 

@@ -213,7 +213,7 @@ def test_a_slot_that_is_used_again_holds_nothing_of_the_member_before(replay):
         if replay == "prioritized":
             # The highest priority is that of a new memory again.
             assert set(drawn.weights[0]) == {1.0}
-            assert stacked._sums[slots[0], 1] == pytest.approx(BATCH)
+            assert stacked._priorities.totals[slots[0]] == pytest.approx(BATCH)
 
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized"])
@@ -256,9 +256,9 @@ def test_priorities_of_rows_that_are_in_a_batch_twice():
     put(stacked, ["a"], transitions(0, 4))
     indices = np.array([[2, 2, 0, 2, 0]])
     stacked.set_priorities(stacked.slots(["a"]), indices, np.array([[3.0, 3.0, 5.0, 3.0, 5.0]], dtype=np.float32))
-    leaves = stacked._sums[0, stacked._num_leaves :][:5]
+    leaves = stacked._priorities.leaves[:5]
     np.testing.assert_allclose(leaves, [5, 1, 3, 1, 0], rtol=1e-5)
-    assert stacked._sums[0, 1] == pytest.approx(10, rel=1e-5)
+    assert stacked._priorities.totals[0] == pytest.approx(10, rel=1e-5)
     found = numbers_of(stacked.draw(stacked.slots(["a"]), np.array([[0.0, 0.49, 0.51, 0.59, 0.61, 0.89, 0.91]])))
     assert found.tolist() == [[0, 0, 1, 1, 2, 2, 3]]
 
@@ -269,7 +269,8 @@ def test_errors_that_are_no_numbers_do_not_spoil_the_trees():
     slots = stacked.slots(["a", "b"])
     errors = np.array([[np.nan, np.inf, 1.0, 2.0], [0.5, 0.5, 0.5, 0.5]], dtype=np.float32)
     stacked.set_priorities(slots, np.arange(4)[None].repeat(2, axis=0), errors)
-    assert np.isfinite(stacked._sums[:2]).all()
+    assert np.isfinite(stacked._priorities.leaves).all()
+    assert np.isfinite(stacked._priorities.totals).all()
     assert np.isfinite(stacked.draw(slots, np.full((2, BATCH), 0.1)).weights).all()
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.shared import SharedByDQN
+from policies.sum_trees import SumTrees
 
 _MIN_PRIORITY = 1e-6
 
@@ -147,9 +148,8 @@ class StackedPrioritizedReplay(StackedReplay):
 
     def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
         super().__init__(shared, num_inputs)
-        # A binary tree for each slot: node i has children 2i and 2i + 1, the leaves are the rows, sums above.
-        self._num_leaves = 2
-        self._sums: NDArray[np.float64] = np.zeros((0, 4))
+        # A tree for each slot, whose leaves are the rows.
+        self._priorities = SumTrees(0, 0)
         self._highest: NDArray[np.float64] = np.zeros(0)
         self._alpha: NDArray[np.float64] = np.zeros(0)
         self._beta: NDArray[np.float64] = np.zeros(0)
@@ -159,39 +159,36 @@ class StackedPrioritizedReplay(StackedReplay):
         super().add_member(member_id, hyperparams)
         self._grow_trees()
         slot = self._slots[member_id]
-        self._sums[slot], self._highest[slot] = 0.0, 1.0
+        self._priorities.clear(slot)
+        self._highest[slot] = 1.0
         self._alpha[slot], self._beta[slot] = hyperparams.prioritized_alpha, hyperparams.prioritized_beta
-
-    @property
-    def _num_levels(self) -> int:
-        """Of a tree, above its leaves."""
-        return self._num_leaves.bit_length() - 1
 
     def _grow_trees(self) -> None:
         num_slots, capacity = self._rows.shape[:2]
-        num_leaves = 1 << max(1, (capacity - 1).bit_length())
-        if num_leaves == self._num_leaves and num_slots == len(self._sums):
+        num_now = len(self._highest)
+        if num_slots == num_now and capacity <= self._priorities.num_leaves:
             return
-        old, self._sums = self._sums[:, self._num_leaves :], np.zeros((num_slots, 2 * num_leaves))
+        self._priorities = self._priorities.resized(num_slots, capacity)
         for name in ("_highest", "_alpha", "_beta"):
             values = np.zeros(num_slots)
-            values[: len(old)] = getattr(self, name)
+            values[:num_now] = getattr(self, name)
             setattr(self, name, values)
-        self._num_leaves = num_leaves
-        self._sums[: len(old), num_leaves : num_leaves + old.shape[1]] = old
-        for level in range(num_leaves.bit_length() - 2, -1, -1):
-            nodes = np.arange(1 << level, 2 << level)
-            self._sums[:, nodes] = self._sums[:, 2 * nodes] + self._sums[:, 2 * nodes + 1]
+
+    def _first(self, slots: Indices) -> Indices:
+        """Where the leaves of slots begin, (M, 1)."""
+        return slots[:, None] * self._priorities.num_leaves
 
     def _advance(self, slots: Indices, places: Indices) -> None:
         super()._advance(slots, places)
-        self._set(slots, places, np.broadcast_to(self._highest[slots, None], places.shape))
+        self._priorities.set(self._first(slots) + places, np.broadcast_to(self._highest[slots, None], places.shape))
 
     def draw(self, slots: Indices, numbers: NDArray[np.float64]) -> Drawn:
         """See `StackedReplay.draw`; the priorities set between two draws act on the next."""
-        totals = self._sums[slots, 1][:, None]
-        places = self._find(slots, numbers * totals)
-        shares = self._sums[slots[:, None], self._num_leaves + places] / totals
+        totals = self._priorities.totals[slots][:, None]
+        first = self._first(slots)
+        found = self._priorities.find(np.broadcast_to(slots[:, None], numbers.shape), numbers * totals)
+        places = np.minimum(found - first, self._size[slots, None] - 1)
+        shares = self._priorities.leaves[first + places] / totals
         weights = (self._size[slots, None] * shares) ** -self._beta[slots, None]
         weights = (weights / weights.max(axis=1, keepdims=True)).astype(np.float32)
         return Drawn(self._gather(slots, places), weights, places)
@@ -201,31 +198,7 @@ class StackedPrioritizedReplay(StackedReplay):
         priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self._alpha[slots, None]
         priorities = np.where(np.isfinite(priorities), priorities, self._highest[slots, None])
         self._highest[slots] = np.maximum(self._highest[slots], priorities.max(axis=1, initial=0.0))
-        self._set(slots, indices, priorities)
-
-    def _set(self, slots: Indices, places: Indices, priorities: NDArray[np.float64]) -> None:
-        flat = self._sums.reshape(-1)
-        first = (slots * 2 * self._num_leaves)[:, None]
-        nodes = self._num_leaves + places
-        flat[first + nodes] = priorities
-        # Level by level, of which there are as many whatever the rows are, and if there are none.
-        for _ in range(self._num_levels):
-            nodes = nodes >> 1
-            flat[first + nodes] = flat[first + 2 * nodes] + flat[first + 2 * nodes + 1]
-
-    def _find(self, slots: Indices, heights: NDArray[np.float64]) -> Indices:
-        """The rows at these heights of the stack of all priorities, (M, B)."""
-        flat = self._sums.reshape(-1)
-        first = (slots * 2 * self._num_leaves)[:, None]
-        nodes = np.ones(heights.shape, dtype=np.int64)
-        for _ in range(self._num_levels):
-            left = 2 * nodes
-            sums = flat[first + left]
-            beyond = heights >= sums
-            heights = np.where(beyond, heights - sums, heights)
-            nodes = left + beyond
-        # Rounding may lead one step beyond the last row.
-        return np.minimum(nodes - self._num_leaves, self._size[slots, None] - 1)
+        self._priorities.set(self._first(slots) + indices, priorities)
 
 
 def make_stacked_replay(shared: SharedByDQN, num_inputs: int) -> StackedReplay:

@@ -1,0 +1,67 @@
+"""Sums of priorities: of one memory, of many, and of those that grow."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from policies.sum_trees import SumTrees
+
+
+def check_sums(trees: SumTrees) -> None:
+    """Every node is the sum of the two under it."""
+    for above, below in itertools.pairwise(trees._levels):
+        np.testing.assert_array_equal(above, below[::2] + below[1::2])
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 3, 64, 65])
+def test_any_height_leads_to_the_leaf_that_it_is_in(capacity):
+    rng = np.random.default_rng(capacity)
+    trees = SumTrees(3, capacity)
+    assert capacity <= trees.num_leaves
+    values = rng.integers(0, 4, (3, capacity)).astype(np.float64)
+    values[:, 0] += 1.0
+    for tree in range(3):
+        trees.set(tree * trees.num_leaves + np.arange(capacity), values[tree])
+    check_sums(trees)
+    np.testing.assert_array_equal(trees.totals, values.sum(axis=1))
+    for tree in range(3):
+        heights = np.arange(values[tree].sum())
+        found = trees.find(np.full(len(heights), tree), heights)
+        expected = np.repeat(np.arange(capacity), values[tree].astype(int))
+        np.testing.assert_array_equal(found, tree * trees.num_leaves + expected)
+
+
+def test_several_trees_are_each_as_if_alone():
+    rng = np.random.default_rng(1)
+    together, alone = SumTrees(4, 100), [SumTrees(1, 100) for _ in range(4)]
+    first = together.num_leaves * np.arange(4)[:, None]
+    for _ in range(50):
+        places, values = rng.integers(0, 100, (4, 32)), rng.random((4, 32))
+        together.set(first + places, values)
+        heights = rng.random((4, 32)) * together.totals[:, None]
+        found = together.find(np.arange(4)[:, None].repeat(32, axis=1), heights) - first
+        for tree in range(4):
+            alone[tree].set(places[tree], values[tree])
+            np.testing.assert_array_equal(together.totals[tree], alone[tree].totals[0])
+            np.testing.assert_array_equal(found[tree], alone[tree].find(np.zeros(32, dtype=np.int64), heights[tree]))
+
+
+def test_of_a_leaf_that_is_set_twice_at_once_the_last_value_stays():
+    trees = SumTrees(1, 4)
+    trees.set(np.array([2, 2, 0]), np.array([1.0, 3.0, 5.0]))
+    np.testing.assert_array_equal(trees.leaves, [5, 0, 3, 0])
+    check_sums(trees)
+    trees.set(np.zeros(0, dtype=np.int64), np.zeros(0))
+    assert trees.totals.tolist() == [8]
+
+
+def test_trees_that_grow_keep_their_leaves_and_one_is_cleared_alone():
+    trees = SumTrees(0, 0).resized(2, 3)
+    trees.set(np.array([0, 1, 2, 4, 6]), np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
+    larger = trees.resized(3, 5)
+    assert larger.leaves.reshape(3, 8).tolist() == [[1, 2, 3, *[0] * 5], [4, 0, 5, *[0] * 5], [0] * 8]
+    check_sums(larger)
+    larger.clear(0)
+    assert larger.totals.tolist() == [0, 9, 0]
+    check_sums(larger)
