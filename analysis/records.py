@@ -23,7 +23,7 @@ TRIAL_ID_PATTERN = "t[0-9]{4,9}"
 TrialId = Annotated[str, Field(pattern=f"^{TRIAL_ID_PATTERN}$")]
 Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Iteration = Count
-FINISHED: frozenset[str] = frozenset({"completed", "failed", "stopped"})
+FINISHED: frozenset[TrialStatus] = frozenset({"completed", "failed", "stopped"})
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -96,8 +96,8 @@ class ChangeRecord(_Record):
     time: Number = Field(description="Unix time, seconds.")
 
 
-class TrialRecord(_Record):
-    """One training run: one point and one seed."""
+class TrialPlan(_Record):
+    """What of a trial is known before it begins: one point and one seed."""
 
     trial_id: TrialId
     index: int
@@ -113,6 +113,11 @@ class TrialRecord(_Record):
         "rllib", description="What trains it: packed (with others, in one process), rllib, or baseline."
     )
     changes: tuple[ChangeRecord, ...] = Field((), description="What population based training changed, oldest first.")
+
+
+class TrialState(_Record):
+    """What becomes of a trial. Its process tells it; failures are counted by who drives the sweep."""
+
     status: TrialStatus = "pending"
     stop_reason: str | None = Field(None, description="The stop rule, cap or scheduler that ended it.")
     error: str | None = Field(None, description="Why it failed, with the end of its log.")
@@ -136,6 +141,10 @@ class TrialRecord(_Record):
     @classmethod
     def _finite(cls, value: float | None) -> float | None:
         return finite_or_none(value)
+
+
+class TrialRecord(TrialState, TrialPlan):
+    """One training run: trial.json. The fields of a plan come first there, then those of the state."""
 
     def point_at(self, iteration: int) -> dict[str, Any]:
         """The searched values the trial had in an iteration; they change only in a population."""

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.records import CheckpointRecord, TrialRecord, finite_or_none
+from analysis.records import FINISHED, CheckpointRecord, TrialRecord, finite_or_none
 from policies.errors import NotFoundError
 
 _MAX_ERROR_CHARS = 300
@@ -172,7 +172,7 @@ def _why_none(trials: Sequence[TrialRecord]) -> tuple[str, str]:
             f"{message} First error ({first.trial_id}): {error_summary(first.error)}",
             f"Read the log of {first.trial_id}, mend the cause and launch again.",
         )
-    if any(trial.status in {"pending", "running", "paused"} for trial in trials):
+    if any(trial.status not in FINISHED for trial in trials):
         return message, "Wait for the first evaluation, or resume the sweep if it was interrupted."
     return message, "Evaluate more often (evaluation.every_iterations), or let the trials train longer."
 

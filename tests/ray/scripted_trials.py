@@ -35,7 +35,7 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
             score = scores[int(self._trial[1].removeprefix("t"))]
             evaluated = count % evaluate_every == 0
             progress = Progress(
-                iteration=count, num_env_steps=count * steps, num_episodes=count, time_s=1.0, training_return=None,
+                num_iterations=count, num_env_steps=count * steps, num_episodes=count, time_s=1.0, training_return=None,
                 evaluation_return=score if evaluated else 1e6, best_evaluation_return=score, best_iteration=None,
                 evaluated=evaluated, status="completed" if count * steps >= max_env_steps else "running",
             )  # fmt: skip

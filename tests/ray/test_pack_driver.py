@@ -46,7 +46,7 @@ class Driven:
         steps, told = what
         status, score = (told, 1.0) if isinstance(told, str) else ("running", told)
         progress = Progress(
-            iteration=steps // 100, num_env_steps=steps, num_episodes=1, time_s=1.0, training_return=None,
+            num_iterations=steps // 100, num_env_steps=steps, num_episodes=1, time_s=1.0, training_return=None,
             evaluation_return=score, best_evaluation_return=score, best_iteration=None, evaluated=True, status=status,
         )  # fmt: skip
         return MemberReport(trial_id, progress)

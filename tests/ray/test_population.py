@@ -110,8 +110,8 @@ def simulated(seed, make):
         for index in range(num_trials)
     }  # fmt: skip
 
-    def change(trial_id, **changes):
-        records[trial_id] = records[trial_id].model_copy(update=changes)
+    def change(trial_id, become):
+        records[trial_id] = become(records[trial_id])
 
     def copy(source, target, iteration):
         if rng.random() < 0.1:
@@ -138,7 +138,7 @@ def simulated(seed, make):
             over = steps[trial] >= MAX_ENV_STEPS
             told = {
                 "num_env_steps": steps[trial], "score": score, "evaluated": bool(rng.random() < 0.8),
-                "progress/iteration": report,
+                "progress/num_iterations": report,
             }  # fmt: skip
             num_saves, num_changes = len(controller.saves), len(records[name].changes)
             decision = "STOP" if over else judge.on_trial_result(controller, trial, told)

@@ -241,7 +241,7 @@ def test_a_whole_trial_with_this_engine(engine, tmp_path):
     """The loop and the engine together; what the loop does is tested without Ray."""
     task = make_task(tmp_path, stop=StopSpec(num_env_steps=300))
     progress = run_trial(task, engine)
-    assert (progress.status, progress.iteration) == ("completed", 3)
+    assert (progress.status, progress.num_iterations) == ("completed", 3)
     assert progress.num_env_steps >= 300
     assert [record.iteration for record in progress.checkpoints] == [1, 2, 3]
     assert all(Path(tmp_path / record.path / "rllib").is_dir() for record in progress.checkpoints)

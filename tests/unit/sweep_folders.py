@@ -60,8 +60,9 @@ def train(store: SweepStore, trial_id: str, iterations: int) -> None:
     store.trial(trial_id).write_record(
         known.model_copy(
             update={
-                "status": progress.status, "stop_reason": progress.stop_reason, "num_iterations": progress.iteration,
-                "num_env_steps": progress.num_env_steps, "num_episodes": progress.num_episodes, "time_s": 1.0,
+                "status": progress.status, "stop_reason": progress.stop_reason,
+                "num_iterations": progress.num_iterations, "num_env_steps": progress.num_env_steps,
+                "num_episodes": progress.num_episodes, "time_s": 1.0,
                 "training_return": progress.training_return, "evaluation_return": progress.evaluation_return,
                 "best_evaluation_return": progress.best_evaluation_return, "best_iteration": progress.best_iteration,
                 "checkpoints": progress.checkpoints, "started_at": 1.0, "ended_at": 2.0,

@@ -104,7 +104,7 @@ def test_a_trial_with_returns_of_nan_and_infinity_goes_on_and_is_reported(tmp_pa
         first.run()
     again = Trial(tmp_path, engine=FakeEngine(episodes), scores=score, stop={"num_iterations": 12})
     progress = again.run()
-    assert (progress.status, progress.iteration, progress.best_evaluation_return) == ("completed", 12, 12.0)
+    assert (progress.status, progress.num_iterations, progress.best_evaluation_return) == ("completed", 12, 12.0)
     results = again.results
     assert [record.iteration for record in results] == list(range(1, 13))
     assert repr([record.episode_returns[0] for record in results]) == repr([VALUES[i % 4] for i in range(1, 13)])

@@ -49,7 +49,7 @@ def test_a_damaged_latest_checkpoint_is_set_aside_and_the_one_before_is_taken(tm
     log = store.log_path.read_text()
     assert "checkpoint 000006 is damaged and kept as damaged/000006; the trial goes on from checkpoint 000005" in log
     progress = again.run()
-    assert (progress.status, progress.iteration) == ("completed", 8)
+    assert (progress.status, progress.num_iterations) == ("completed", 8)
     assert progress.notes[0] in log
     assert [record.iteration for record in again.results] == list(range(1, 9))
     assert again.kept[-1] == 8
@@ -112,7 +112,7 @@ def test_a_line_that_cannot_be_read_is_set_aside_and_the_trial_goes_on(tmp_path,
     assert (again.loop.iteration, again.engine.iteration) == (4, 4)
     assert (again.store.folder / "results.damaged").read_bytes() == junk + b"\n"
     progress = again.run()
-    assert (progress.status, progress.iteration, progress.num_env_steps) == ("completed", 9, 900)
+    assert (progress.status, progress.num_iterations, progress.num_env_steps) == ("completed", 9, 900)
     # What the checkpoint had learned from is not done again, so of a line before it only the hole is left.
     expected = [number for number in range(1, 10) if number != place or place > 4]
     assert [record.iteration for record in again.results] == expected
@@ -130,7 +130,7 @@ def test_a_trial_goes_on_from_the_env_steps_of_its_checkpoint_whatever_the_line_
     first.store.keep_iterations([*before, last.model_copy(update={"num_env_steps": steps})])
     again = Trial(tmp_path, stop={"num_iterations": 6})
     progress = again.run()
-    assert (progress.status, progress.iteration, progress.num_env_steps) == ("completed", 6, 600)
+    assert (progress.status, progress.num_iterations, progress.num_env_steps) == ("completed", 6, 600)
     assert f"iteration 4 says {steps} env steps; its checkpoint says 400" in progress.notes[0]
     assert [record.iteration for record in again.results if record.iteration != 4] == [1, 2, 3, 5, 6]
 
@@ -143,7 +143,7 @@ def test_a_time_that_is_none_neither_ends_a_trial_nor_keeps_it_from_ending(tmp_p
     first.store.keep_iterations([*before, last.model_copy(update={"time_s": time_s})])
     again = Trial(tmp_path, clock=FakeClock(1.0), stop={"num_iterations": 6})
     progress = again.run()
-    assert (progress.status, progress.iteration) == ("completed", 6)
+    assert (progress.status, progress.num_iterations) == ("completed", 6)
     assert before[-1].time_s < progress.time_s < 1_000
 
 

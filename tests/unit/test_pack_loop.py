@@ -1,7 +1,6 @@
 """The life of a pack's members: trained and evaluated together, ended, failed and retried each for itself."""
 
 import contextlib
-import dataclasses
 import itertools
 import math
 import shutil
@@ -21,7 +20,7 @@ def statuses(pack):
 
 
 def without_times(progress):
-    return dataclasses.replace(progress, started_at=None, ended_at=None)
+    return progress.model_copy(update={"started_at": None, "ended_at": None})
 
 
 def results(pack, trial_id):
@@ -41,8 +40,8 @@ def test_each_member_is_told_of_as_a_trial_of_its_own(tmp_path):
         progress = pack.last(trial_id)
         assert (progress.status, progress.stop_reason) == ("completed", "evaluation_return 8 >= 8")
         assert [record.iteration for record in progress.checkpoints] == alone.kept
-        assert without_times(dataclasses.replace(progress, checkpoints=())) == without_times(
-            dataclasses.replace(expected, checkpoints=())
+        assert without_times(progress.model_copy(update={"checkpoints": ()})) == without_times(
+            expected.model_copy(update={"checkpoints": ()})
         )
         assert pack.store(trial_id).read_iterations() == alone.results
         assert [record.iteration for record in pack.store(trial_id).checkpoints()] == alone.kept
@@ -63,7 +62,7 @@ def test_members_are_evaluated_together_when_it_is_their_turn(tmp_path):
 def test_evaluations_are_reported_each_and_of_the_others_where_they_stand(tmp_path):
     pack = Pack(tmp_path, evaluation={"every_iterations": 2}, stop={"num_iterations": 9}, clock=FakeClock(step=0.001))
     reports = pack.add("t0000").advance(0.2)
-    told = [(report.progress.iteration, report.progress.evaluated) for report in reports]
+    told = [(report.progress.num_iterations, report.progress.evaluated) for report in reports]
     iterations = [iteration for iteration, evaluated in told if evaluated]
     assert iterations[:3] == [2, 4, 6]
     assert told == sorted(told)
@@ -74,7 +73,7 @@ def test_evaluations_are_reported_each_and_of_the_others_where_they_stand(tmp_pa
 def test_a_scheduler_hears_of_an_evaluation_before_the_next_iteration(tmp_path):
     pack = Pack(tmp_path, evaluation={"every_iterations": 3}).add("t0000", "t0001")
     reports = pack.advance(math.inf, until_evaluated=True)
-    assert [(report.trial_id, report.progress.iteration) for report in reports] == [("t0000", 3), ("t0001", 3)]
+    assert [(report.trial_id, report.progress.num_iterations) for report in reports] == [("t0000", 3), ("t0001", 3)]
     assert pack.engine.num_iterations == 3
 
 
@@ -82,9 +81,9 @@ def test_a_report_comes_after_so_many_seconds_and_is_on_disk(tmp_path):
     pack = Pack(tmp_path, clock=FakeClock(step=0.1), evaluation={"every_iterations": 99}).add("t0000", "t0001")
     reports = pack.advance(3.0)
     (first, second) = [report.progress for report in reports]
-    assert 1 < first.iteration == second.iteration < 99
+    assert 1 < first.num_iterations == second.num_iterations < 99
     assert not first.evaluated
-    assert results(pack, "t0001") == list(range(1, first.iteration + 1))
+    assert results(pack, "t0001") == list(range(1, first.num_iterations + 1))
 
 
 def test_it_returns_when_a_quarter_has_ended_so_that_others_can_have_their_slots(tmp_path):
@@ -106,7 +105,7 @@ def test_members_come_and_go_and_the_others_do_not_notice(tmp_path):
     pack.run()
     assert pack.engine.builds == [("t0000", None), ("t0001", None), ("t0002", None)]
     ended = pack.last("t0000")
-    assert (ended.status, ended.iteration, ended.stop_reason) == ("stopped", 4, None)
+    assert (ended.status, ended.num_iterations, ended.stop_reason) == ("stopped", 4, None)
     assert ended.ended_at is not None
     assert ended.checkpoints[-1].iteration == 4
     assert results(pack, "t0000") == [1, 2, 3, 4]
@@ -147,7 +146,7 @@ def test_a_stop_request_saves_and_pauses_all(tmp_path):
     pack.add("t0002")
     pack.stop = True
     reports = pack.advance(math.inf)
-    assert [(report.progress.status, report.progress.iteration) for report in reports] == [
+    assert [(report.progress.status, report.progress.num_iterations) for report in reports] == [
         ("paused", 4),
         ("paused", 4),
         ("paused", 0),
@@ -322,7 +321,7 @@ def test_nan_weights_end_a_member_as_failed_and_it_is_not_retried(tmp_path):
     pack = Pack(tmp_path, lambda name: scripts.get(name, FakeEngine)(), max_retries=5, stop={"num_iterations": 6})
     pack.add("t0000", "t0001").run()
     ended = pack.last("t0001")
-    assert (ended.status, ended.iteration) == ("failed", 4)
+    assert (ended.status, ended.num_iterations) == ("failed", 4)
     assert "NaN" in ended.error
     assert ended.best_iteration == 3
     assert pack.engine.builds.count(("t0001", None)) == 1
@@ -368,7 +367,7 @@ def test_a_member_that_had_reached_its_end_is_done_at_once(tmp_path):
     Pack(tmp_path, stop={"num_iterations": 3}).add("t0000").run()
     pack = Pack(tmp_path, stop={"num_iterations": 3}).add("t0000")
     (report,) = pack.advance()
-    assert (report.progress.status, report.progress.iteration) == ("completed", 3)
+    assert (report.progress.status, report.progress.num_iterations) == ("completed", 3)
     assert pack.engine.num_iterations == 0
 
 

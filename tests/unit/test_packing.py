@@ -15,7 +15,8 @@ from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
-from tune_jobs.sweeps.drive import pending_record, write_new
+from tune_jobs.store.transitions import pending_record
+from tune_jobs.sweeps.drive import write_new
 from tune_jobs.sweeps.resume import check_same_trials
 
 PACKED = engine_named("packed")

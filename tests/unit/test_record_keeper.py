@@ -8,6 +8,7 @@ from tune_jobs.store.ownership import Owner, OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.transitions import with_point
 
 
 @pytest.fixture
@@ -27,7 +28,7 @@ def progress(iteration=1, *, evaluated=True, status="running", **changes):
         "num_env_steps": 100 * iteration, "num_episodes": iteration, "time_s": 1.0, "training_return": 5.0,
         "evaluation_return": 7.0, "best_evaluation_return": 7.0, "best_iteration": 1,
     } | changes  # fmt: skip
-    return Progress(iteration=iteration, evaluated=evaluated, status=status, **values)
+    return Progress(num_iterations=iteration, evaluated=evaluated, status=status, **values)
 
 
 def on_disk(store, trial_id):
@@ -87,7 +88,7 @@ def test_running_trials_are_written_as_often_as_there_is_time_for_and_the_others
 def test_what_a_process_reads_is_on_disk_at_once(kept):
     store, keeper, _, told = kept
     for index in range(40):
-        keeper.change(f"t{index:04d}", point={"lr": 0.1}, has_point=True)
+        keeper.change(f"t{index:04d}", lambda record: with_point(record, {"lr": 0.1}, {}))
         assert on_disk(store, f"t{index:04d}").point == {"lr": 0.1}
     assert len(told) == 40
 
@@ -144,7 +145,11 @@ def test_who_lost_the_run_writes_no_record(tmp_path):
     assert on_disk(store, "t0000").status == "running"
     Owner.take(store.folder / ".owner")
     keeper.progressed("t0000", progress(status="failed", error="it is not for it to say"), node="here", pid=1)
-    for write in (keeper.flush, keeper.close, lambda: keeper.change("t0000", point={"lr": 1.0})):
+    for write in (
+        keeper.flush,
+        keeper.close,
+        lambda: keeper.change("t0000", lambda record: with_point(record, {"lr": 1.0}, {})),
+    ):
         with pytest.raises(OwnershipLostError):
             write()
     assert on_disk(store, "t0000").status == "running"

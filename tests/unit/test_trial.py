@@ -27,7 +27,7 @@ from tune_jobs.training.trial_loop import TrialLoop
 )
 def test_a_trial_ends_by_the_first_rule_that_holds(tmp_path, stop, iterations, reason):
     progress = Trial(tmp_path, stop=stop).run()
-    assert (progress.status, progress.iteration, progress.stop_reason) == ("completed", iterations, reason)
+    assert (progress.status, progress.num_iterations, progress.stop_reason) == ("completed", iterations, reason)
     assert progress.num_env_steps == 100 * iterations
     assert progress.ended_at >= progress.started_at
 
@@ -51,7 +51,7 @@ def test_training_return_counts_100_whole_episodes_and_no_fewer(tmp_path):
     stop = {"training_return": 195.0, "num_iterations": 300}
     trial = Trial(tmp_path, engine=FakeEngine(lambda _: (195.0,)), stop=stop, evaluation={"every_iterations": 999})
     progress = trial.run()
-    assert (progress.iteration, progress.stop_reason) == (100, "training_return 195 >= 195")
+    assert (progress.num_iterations, progress.stop_reason) == (100, "training_return 195 >= 195")
     assert progress.num_episodes == 100
 
 
@@ -62,7 +62,7 @@ def test_training_return_is_of_the_last_100_episodes(tmp_path):
     trial = Trial(tmp_path, engine=engine, stop=stop, evaluation={"every_iterations": 999})
     progress = trial.run()
     # 100 episodes of 200 are there after 34 more iterations.
-    assert progress.iteration == 54
+    assert progress.num_iterations == 54
     assert progress.training_return == 200.0
     returns = [value for record in trial.results for value in record.episode_returns]
     for record in trial.results:
@@ -73,7 +73,7 @@ def test_training_return_is_of_the_last_100_episodes(tmp_path):
 def test_more_than_100_episodes_in_an_iteration(tmp_path):
     engine = FakeEngine(lambda _: (0.0,) * 50 + (10.0,) * 100)
     progress = Trial(tmp_path, engine=engine, stop={"training_return": 10.0}).run()
-    assert (progress.iteration, progress.num_episodes, progress.training_return) == (1, 150, 10.0)
+    assert (progress.num_iterations, progress.num_episodes, progress.training_return) == (1, 150, 10.0)
 
 
 def test_iterations_without_an_ended_episode(tmp_path):
@@ -87,10 +87,10 @@ def test_iterations_without_an_ended_episode(tmp_path):
 def test_scores_of_zero_and_below_stop_a_trial_too(tmp_path, target):
     rising = lambda iteration: -10.0 + iteration  # noqa: E731
     progress = Trial(tmp_path / "a", scores=rising, stop={"evaluation_return": target}).run()
-    assert progress.iteration == 10 + target
+    assert progress.num_iterations == 10 + target
     engine = FakeEngine(lambda iteration: (rising(iteration),) * 100)
     progress = Trial(tmp_path / "b", engine=engine, scores=rising, stop={"training_return": target}).run()
-    assert progress.iteration == 10 + target
+    assert progress.num_iterations == 10 + target
 
 
 # -- evaluation
@@ -108,7 +108,7 @@ def test_each_evaluation_is_reported_at_once(tmp_path):
     """Schedulers compare at it: a report must be of that very iteration."""
     trial = Trial(tmp_path, evaluation={"every_iterations": 4}, stop={"num_iterations": 10})
     reports = [trial.loop.advance(math.inf) for _ in range(3)]
-    assert [(report.iteration, report.evaluated, report.evaluation_return) for report in reports] == [
+    assert [(report.num_iterations, report.evaluated, report.evaluation_return) for report in reports] == [
         (4, True, 4.0),
         (8, True, 8.0),
         (10, True, 10.0),
@@ -120,9 +120,9 @@ def test_reports_between_evaluations_come_after_so_many_seconds(tmp_path):
     trial = Trial(tmp_path, clock=clock, evaluation={"every_iterations": 50})
     report = trial.loop.advance(3.0)
     assert (report.status, report.evaluated, report.evaluation_return) == ("running", False, None)
-    assert 1 < report.iteration < 50
+    assert 1 < report.num_iterations < 50
     # What is reported is on disk.
-    assert trial.results[-1].iteration == report.iteration
+    assert trial.results[-1].iteration == report.num_iterations
     trial.run_to(50)
     report = trial.loop.advance(1.0)
     # The newest score, of an earlier iteration.
@@ -131,7 +131,7 @@ def test_reports_between_evaluations_come_after_so_many_seconds(tmp_path):
 
 def test_an_iteration_longer_than_the_interval_is_reported_alone(tmp_path):
     trial = Trial(tmp_path, clock=FakeClock(step=100.0), evaluation={"every_iterations": 50}, stop={"time_s": 1e6})
-    assert [trial.loop.advance(1.0).iteration for _ in range(3)] == [1, 2, 3]
+    assert [trial.loop.advance(1.0).num_iterations for _ in range(3)] == [1, 2, 3]
 
 
 def test_the_evaluation_is_the_mean_of_greedy_episodes_of_the_very_policy(tmp_path):
@@ -162,7 +162,7 @@ def test_a_score_that_is_no_number_is_none_and_never_the_best(tmp_path):
 def test_the_end_is_reported_with_the_iteration_that_reached_it(tmp_path):
     trial = Trial(tmp_path, stop={"evaluation_return": 3.0})
     reports = [trial.loop.advance(math.inf) for _ in range(3)]
-    assert [(report.status, report.iteration) for report in reports] == [
+    assert [(report.status, report.num_iterations) for report in reports] == [
         ("running", 1),
         ("running", 2),
         ("completed", 3),

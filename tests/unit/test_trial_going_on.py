@@ -30,7 +30,7 @@ def test_a_trial_goes_on_from_its_latest_checkpoint(tmp_path):
     assert second.loop.iteration == 4
     assert [record.iteration for record in second.results] == [1, 2, 3, 4]
     progress = second.run()
-    assert (progress.iteration, progress.num_env_steps, progress.num_episodes) == (9, 900, 9)
+    assert (progress.num_iterations, progress.num_env_steps, progress.num_episodes) == (9, 900, 9)
     assert [record.iteration for record in second.results] == list(range(1, 10))
     # The best of before still is.
     assert (progress.best_iteration, progress.best_evaluation_return) == (1, -1.0)
@@ -77,7 +77,7 @@ def test_the_window_of_100_episodes_goes_on_too(tmp_path):
         first.loop.advance(-1.0)
     second = Trial(tmp_path, **task)
     assert second.loop.iteration == 60
-    assert second.run().iteration == 100
+    assert second.run().num_iterations == 100
 
 
 def test_the_newest_score_goes_on_too(tmp_path):
@@ -86,7 +86,7 @@ def test_the_newest_score_goes_on_too(tmp_path):
     while first.loop.iteration < 6:
         first.loop.advance(-1.0)
     report = Trial(tmp_path, **task).loop.advance(-1.0)
-    assert (report.iteration, report.evaluated, report.evaluation_return) == (7, False, 4.0)
+    assert (report.num_iterations, report.evaluated, report.evaluation_return) == (7, False, 4.0)
     assert report.best_iteration == 4
 
 
@@ -164,7 +164,7 @@ def test_a_trial_that_had_reached_its_end_is_done_at_once(tmp_path):
     again = Trial(tmp_path, stop={"num_iterations": 5})
     progress = again.loop.advance(math.inf)
     assert (progress.status, progress.stop_reason) == ("completed", "num_iterations 5 >= 5")
-    assert (progress.iteration, progress.evaluation_return, progress.best_iteration) == (5, 5.0, 5)
+    assert (progress.num_iterations, progress.evaluation_return, progress.best_iteration) == (5, 5.0, 5)
     assert again.engine.iteration == 5
     assert len(again.results) == 5
 
@@ -173,7 +173,7 @@ def test_a_process_runs_one_trial_after_another(tmp_path):
     engine = FakeEngine()
     for name in ("a", "b"):
         trial = Trial(tmp_path / name, engine=engine, stop={"num_iterations": 3})
-        assert trial.run().iteration == 3
+        assert trial.run().num_iterations == 3
         assert len(trial.results) == 3
     assert engine.builds == [None, None]
 
@@ -184,7 +184,7 @@ def test_a_process_runs_one_trial_after_another(tmp_path):
 def test_nan_weights_end_a_trial_as_failed(tmp_path):
     trial = Trial(tmp_path, engine=FakeEngine(nan_from=5), checkpoints={"every_iterations": 2, "keep": 2})
     progress = trial.run()
-    assert (progress.status, progress.iteration, progress.stop_reason) == ("failed", 5, None)
+    assert (progress.status, progress.num_iterations, progress.stop_reason) == ("failed", 5, None)
     assert "NaN" in progress.error
     assert "iteration 5" in progress.error
     assert progress.ended_at is not None
@@ -204,7 +204,12 @@ def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path):
 
     trial = Trial(tmp_path, engine=Engine(), evaluation={"every_iterations": 50}, hyperparams={"lr": 0.5, "gamma": 0.9})
     progress = trial.run()
-    assert (progress.status, progress.iteration, progress.num_env_steps, progress.num_episodes) == ("failed", 3, 340, 5)
+    assert (progress.status, progress.num_iterations, progress.num_env_steps, progress.num_episodes) == (
+        "failed",
+        3,
+        340,
+        5,
+    )
     assert progress.error == "The gradients of an update are NaN or infinite.\nLower lr. (iteration 4, lr 0.5)"
     trial.loop.flush()
     assert [record.iteration for record in trial.results] == [1, 2, 3]
@@ -223,7 +228,7 @@ def test_a_stop_request_pauses_with_a_checkpoint_of_this_very_iteration(tmp_path
     trial.loop.advance(-1.0)
     SweepStore(tmp_path).request_stop()
     progress = trial.loop.advance(math.inf)
-    assert (progress.status, progress.iteration, progress.stop_reason) == ("paused", 4, None)
+    assert (progress.status, progress.num_iterations, progress.stop_reason) == ("paused", 4, None)
     assert trial.kept == [3, 4]
     assert trial.store.checkpoints()[-1].evaluation_return is None
     assert progress.ended_at is not None
@@ -246,7 +251,7 @@ def test_a_stop_request_before_the_first_iteration_saves_nothing(tmp_path):
     trial = Trial(tmp_path)
     SweepStore(tmp_path).request_stop()
     progress = trial.loop.advance(math.inf)
-    assert (progress.status, progress.iteration, progress.checkpoints) == ("paused", 0, ())
+    assert (progress.status, progress.num_iterations, progress.checkpoints) == ("paused", 0, ())
     assert trial.kept == []
 
 

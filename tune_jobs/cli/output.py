@@ -21,19 +21,20 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from analysis.records import BestRecord, EvaluationRecord, TrialRecord
+    from analysis.records import BestRecord, EvaluationRecord, TrialRecord, TrialStatus
     from tune_jobs.spec.file import Preset
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
 # Derived figures that a reader of the JSON would otherwise compute anew.
 _DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
-_STATUS_STYLES = {
+_STATUS_STYLES: dict[TrialStatus, str] = {
     "completed": "green",
     "failed": "red",
     "running": "cyan",
     "stopped": "yellow",
     "paused": "yellow",
 }
+_STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "running", "paused", "pending")
 
 
 def to_json(value: Any) -> Any:
@@ -86,7 +87,7 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
 
 
 def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None:
-    counts = dict.fromkeys(("completed", "stopped", "failed", "running", "paused", "pending"), 0)
+    counts: dict[TrialStatus, int] = dict.fromkeys(_STATUS_ORDER, 0)
     for trial in trials:
         counts[trial.status] += 1
     told = ", ".join(f"{number} {status}" for status, number in counts.items() if number)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pydantic import ValidationError
 
-from analysis.records import FINISHED, TrialRecord
+from analysis.records import FINISHED, TrialPlan, TrialRecord
 from analysis.wording import counted
 from policies.envs.make import EnvInfo
 from policies.errors import CannotRunError, SpecError
@@ -45,30 +45,6 @@ _FOR_EVER = "It would wait for ever."
 
 _Point = tuple[dict[str, Any] | None, Hyperparams | None]
 """The sampled values, and all values; both None: the search method chooses them when the trial starts."""
-
-
-@dataclass(frozen=True)
-class TrialPlan:
-    """One trial to be run."""
-
-    trial_id: str
-    index: int
-    point_index: int
-    seed_index: int
-    seed: int
-    point: dict[str, Any]
-    """The sampled values alone."""
-    hyperparams: dict[str, Any]
-    """All values, validated, as JSON."""
-    has_point: bool = True
-    """False: the search method chooses the point when the trial starts; point and hyperparams are empty until then."""
-    engine: str = "rllib"
-    """Its name."""
-
-    @property
-    def is_packed(self) -> bool:
-        """Whether a pack trains it, together with others."""
-        return engine_named(self.engine).trains_many
 
 
 @dataclass(frozen=True)
@@ -106,7 +82,7 @@ class SweepPlan:
         env = {"id": self.env.env_id, "args": self.env.env_args, "threshold": self.env.threshold}
         return data | {
             "num_trials": len(self.trials),
-            "trials": [asdict(trial) for trial in self.trials],
+            "trials": [trial.model_dump(exclude={"changes"}) for trial in self.trials],
             "env": env,
             "machine": asdict(self.machine),
             "engines": self.engines,
@@ -159,7 +135,7 @@ def make_plan(
         spec,
         env,
         [values for _, values in points],
-        [trial.is_packed for trial in first_trials],
+        [_is_packed(trial) for trial in first_trials],
         may_refuse=not records,
     )
     sizes = _sizes(spec, known)
@@ -170,7 +146,7 @@ def make_plan(
     members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
-        all_are_packed = all(trial.is_packed for trial in trials)
+        all_are_packed = all(map(_is_packed, trials))
         concurrent = packs.max_concurrent if all_are_packed else max(packs.max_concurrent, concurrent)
     return SweepPlan(
         trials=trials,
@@ -215,14 +191,14 @@ def _trials(
             index = len(trials)
             trials.append(
                 TrialPlan(
-                    trial_id(index),
-                    index,
-                    point_index,
-                    seed_index,
-                    seeds[index],
-                    point or {},
-                    dumped,
-                    point is not None,
+                    trial_id=trial_id(index),
+                    index=index,
+                    point_index=point_index,
+                    seed_index=seed_index,
+                    seed=seeds[index],
+                    point=point or {},
+                    hyperparams=dumped,
+                    has_point=point is not None,
                 )
             )
     choice = choose_engines(
@@ -232,8 +208,15 @@ def _trials(
         {record.trial_id: record.engine for record in records},
         lambda index: _place(spec, points[trials[index].point_index][0], trials[index].point_index),
     )
-    planned = (replace(trial, engine=engine) for trial, engine in zip(trials, choice.engines, strict=True))
+    planned = (
+        trial.model_copy(update={"engine": engine}) for trial, engine in zip(trials, choice.engines, strict=True)
+    )
     return tuple(planned), choice.notes
+
+
+def _is_packed(trial: TrialPlan) -> bool:
+    """Whether a pack trains it, together with others."""
+    return engine_named(trial.engine).trains_many
 
 
 def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[TrialToPack]:
@@ -242,7 +225,7 @@ def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequ
     # Points that are chosen later have as many sub-environments as the others, or it is not known how many.
     fewest_known = min((values.num_envs for _, values in points if values is not None), default=1)
     for trial in to_run:
-        if trial.is_packed:
+        if _is_packed(trial):
             values = points[trial.point_index][1]
             key = None if values is None else pack_key(values)
             fewest = fewest_known if values is None else values.num_envs

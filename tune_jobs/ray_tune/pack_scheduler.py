@@ -11,7 +11,6 @@ its retries.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ from ray.tune.schedulers import FIFOScheduler, TrialScheduler
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.ray_tune.scheduling import Decision, NobodyWaits, Scheduler, Standing
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store import transitions
 from tune_jobs.store.candidates import candidates
 from tune_jobs.store.contract import Assignment, Pack, Sweep
 from tune_jobs.store.progress import Progress
@@ -170,9 +170,6 @@ class PackDriver:
             self._leave(pack, trial_id)
 
     def _progressed(self, pack: _Pack, trial_id: str, progress: Progress, node: str, pid: int) -> None:
-        if progress.status == "stopped":
-            reason = f"scheduler, at {progress.num_env_steps} env steps"
-            progress = dataclasses.replace(progress, stop_reason=reason)
         self._keeper.progressed(trial_id, progress, node=node, pid=pid)
         standing = Standing.of(trial_id, progress)
         if progress.status == "running":
@@ -211,8 +208,8 @@ class PackDriver:
 
     def _stopped(self, pack: _Pack, trial_id: str) -> None:
         """A member that was to be ended is gone without a word: its checkpoints are those on disk."""
-        checkpoints = tuple(candidates(self._store.trial(trial_id)))
-        self._keeper.change(trial_id, checkpoints=checkpoints)
+        checkpoints = candidates(self._store.trial(trial_id))
+        self._keeper.change(trial_id, lambda record: transitions.with_checkpoints(record, checkpoints))
         self._keeper.ended(trial_id)
         self._leave(pack, trial_id)
 

@@ -28,6 +28,7 @@ from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.copies import copy_latest_checkpoint
+from tune_jobs.store.transitions import with_change
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController
@@ -36,7 +37,7 @@ _LOG = logging.getLogger(__name__)
 _ATTEMPTS = 20
 
 ReadRecord = Callable[[str], TrialRecord]
-Change = Callable[..., None]
+Change = Callable[[str, Callable[[TrialRecord], TrialRecord]], None]
 
 
 @dataclass
@@ -137,7 +138,7 @@ class PopulationScheduler(TuneScheduler):
         spec: The sweep.
         store: Its folder.
         read: The newest record of a trial.
-        change: Changes fields of a trial's record, on disk too.
+        change: Changes a trial's record, on disk too.
     """
 
     def __init__(self, spec: SweepSpec, store: Sweep, read: ReadRecord, change: Change) -> None:
@@ -182,7 +183,7 @@ class PopulationScheduler(TuneScheduler):
         pointer = self._pointer(decision.trial_id)
         record = self._read(name_of(trial))
         # The record is of the report before this one: Tune asks its scheduler first.
-        iteration, num_env_steps = result["progress/iteration"], result["num_env_steps"]
+        iteration, num_env_steps = result["progress/num_iterations"], result["num_env_steps"]
         copied = copy_latest_checkpoint(
             self._store.trial(decision.trial_id), self._store.trial(record.trial_id), iteration
         )
@@ -197,7 +198,7 @@ class PopulationScheduler(TuneScheduler):
         )
         hyperparams = point_hyperparams(self._spec, decision.point, record.point_index).model_dump(mode="json")
         # This makes the copy count; see tune_jobs.store.copies.
-        self._change(record.trial_id, point=decision.point, hyperparams=hyperparams, changes=(*record.changes, entry))
+        self._change(record.trial_id, lambda known: with_change(known, entry, hyperparams))
         controller.pause_trial(trial, should_checkpoint=False)
         trial.run_metadata.checkpoint_manager._latest_checkpoint_result = pointer  # noqa: SLF001
 

@@ -19,7 +19,6 @@ from ray.exceptions import RayActorError, RayTaskError
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
-from analysis.records import CheckpointRecord
 from policies.errors import TuneJobsError, said_by
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
@@ -263,9 +262,8 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         **info: Any,
     ) -> None:
         """A report, about once a second and after each evaluation."""
-        fields = dict(result["progress"])
-        fields["checkpoints"] = tuple(CheckpointRecord.model_validate(item) for item in fields["checkpoints"])
-        self._keeper.progressed(_trial_id(trial), Progress(**fields), node=result["node"], pid=result["pid"])
+        progress = Progress.model_validate(result["progress"])
+        self._keeper.progressed(_trial_id(trial), progress, node=result["node"], pid=result["pid"])
 
     def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
         """Schedulers pause trials and tell no one; a paused trial has saved its checkpoint and needs no waiting for."""

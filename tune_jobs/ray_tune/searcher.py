@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,6 +13,7 @@ from analysis.records import TrialRecord
 from tune_jobs.plan.sweep_plan import point_hyperparams
 from tune_jobs.search.tpe import propose_point
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.transitions import begun, with_point
 
 
 class PointChooser:
@@ -20,11 +22,14 @@ class PointChooser:
     Args:
         spec: The sweep.
         records: All records of the sweep, newest.
-        change: Changes fields of a trial's record, on disk too.
+        change: Changes a trial's record, on disk too.
     """
 
     def __init__(
-        self, spec: SweepSpec, records: Callable[[], Sequence[TrialRecord]], change: Callable[..., None]
+        self,
+        spec: SweepSpec,
+        records: Callable[[], Sequence[TrialRecord]],
+        change: Callable[[str, Callable[[TrialRecord], TrialRecord]], None],
     ) -> None:
         self._spec = spec
         self._given: set[str] = set()
@@ -40,9 +45,7 @@ class PointChooser:
         self._given.add(name)
         # A trial that was given to a process runs, though it may not have reported so.
         records = [
-            record.model_copy(update={"status": "running"})
-            if record.status == "pending" and record.trial_id in self._given
-            else record
+            begun(record, time.time()) if record.status == "pending" and record.trial_id in self._given else record
             for record in self._records()
         ]
         record = next(record for record in records if record.trial_id == name)
@@ -63,7 +66,7 @@ class PointChooser:
         hyperparams = point_hyperparams(self._spec, point, point_index).model_dump(mode="json")
         for record in records:
             if record.point_index == point_index and not record.has_point:
-                self._change(record.trial_id, point=point, hyperparams=hyperparams, has_point=True)
+                self._change(record.trial_id, lambda known: with_point(known, point, hyperparams))
 
 
 class PointSearcher(Searcher):  # type: ignore[misc]

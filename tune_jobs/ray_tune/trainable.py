@@ -7,7 +7,6 @@ that is started again anywhere goes on from what is on disk there.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import faulthandler
 import json
 import os
@@ -253,12 +252,11 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             return loop.advance(REPORT_INTERVAL_S)
 
     def _report(self, progress: Progress) -> dict[str, Any]:
-        fields = dataclasses.asdict(progress)
-        fields["checkpoints"] = [record.model_dump(mode="json") for record in progress.checkpoints]
         return {
             "done": progress.status != "running",
             **compared_by(progress, self._grace),
-            "progress": fields,
+            # Tune looks into results, and takes them apart.
+            "progress": progress.model_dump(),
             "node": self._node,
             "host": socket.gethostname(),
         }

@@ -18,6 +18,7 @@ from policies.portable.file import PortablePolicy, read_policy
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS
 from tune_jobs.store.results_file import Scored
+from tune_jobs.store.transitions import with_checkpoints
 
 _LOG = logging.getLogger(__name__)
 
@@ -91,7 +92,7 @@ def _warn(message: str) -> None:
 
 
 def _without(record: TrialRecord, checkpoint: CheckpointRecord) -> TrialRecord:
-    return record.model_copy(update={"checkpoints": tuple(item for item in record.checkpoints if item != checkpoint)})
+    return with_checkpoints(record, [item for item in record.checkpoints if item != checkpoint])
 
 
 def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:

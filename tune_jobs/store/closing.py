@@ -9,6 +9,7 @@ from typing import NoReturn
 
 from analysis.records import FINISHED
 from policies.errors import CannotRunError, TuneJobsError
+from tune_jobs.store import transitions
 from tune_jobs.store.contract import Sweep
 
 
@@ -29,7 +30,7 @@ def close_run(store: Sweep, started: float | None = None) -> None:
         if trial.status not in FINISHED:
             interrupted = True
             if trial.status == "running":
-                store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "paused"}))
+                store.trial(trial.trial_id).write_record(transitions.paused(trial))
     record = store.read_record()
     now = time.time()
     store.write_record(

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pydantic import ConfigDict
 
-from analysis.records import CheckpointRecord
+from analysis.records import TrialState
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Where a trial stands; what its process tells the one that drives the sweep."""
+class Progress(TrialState):
+    """The state of a trial as its process knows it, which is all but its failures, its node and its process's number.
 
-    iteration: int
-    num_env_steps: int
-    num_episodes: int
-    time_s: float
-    training_return: float | None
-    evaluation_return: float | None
-    best_evaluation_return: float | None
-    best_iteration: int | None
+    Its status is running, paused (asked to stop), completed or failed; a pack says stopped of a member that was to be
+    ended.
+    """
+
+    # It is no file of another version: what has no field is a mistake.
+    model_config = ConfigDict(extra="forbid")
+
     evaluated: bool
     """Whether `evaluation_return` is of this very iteration."""
-    status: str
-    """running, paused (asked to stop), completed or failed; a pack says stopped of a member that was to be ended."""
-    stop_reason: str | None = None
-    error: str | None = None
-    notes: tuple[str, ...] = ()
-    """What was damaged when the trial was opened, and what it goes on from instead."""
-    checkpoints: tuple[CheckpointRecord, ...] = ()
-    started_at: float | None = None
-    """Unix time at which the first iteration here began, seconds."""
-    ended_at: float | None = None
-    """Unix time at which the trial ended or paused; None while it runs."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -12,19 +11,17 @@ from typing import Any
 
 from analysis.records import TrialRecord
 from policies.envs.tallies import Reached, read_tally
-from policies.errors import fit
+from tune_jobs.store import transitions
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.progress import Progress
 
 Listener = Callable[[TrialRecord], None]
+Change = Callable[[TrialRecord], TrialRecord]
+"""What becomes of a trial's record; see `transitions`."""
 
 # A record is synced to disk, which takes about a millisecond: those of running trials are not written more often.
 _WRITES_PER_S = 20.0
-# Of a trial: what was damaged when it was opened, the newest.
-_MAX_NOTES = 20
-# Of a failure: what was said, and 15 lines of a log.
-_MAX_ERROR = 20_000
 
 
 class RecordKeeper:
@@ -83,39 +80,32 @@ class RecordKeeper:
         """The newest record of every trial of the sweep, those of earlier runs too."""
         return sorted([*self._others, *self._records.values()], key=lambda record: record.index)
 
-    def change(self, trial_id: str, **changes: Any) -> None:
-        """Change fields of a trial's record, on disk at once: for what its process reads."""
-        self._update(trial_id, **changes)
+    def change(self, trial_id: str, change: Change) -> None:
+        """Change a trial's record, on disk at once: for what its process reads."""
+        self._update(trial_id, change(self._records[trial_id]))
         self._write(trial_id)
 
     def started(self, trial_id: str) -> None:
         """A process took the trial."""
         self.running.add(trial_id)
-        before = self._records[trial_id].started_at
-        started_at = time.time() if before is None else before
-        self._update(trial_id, status="running", started_at=started_at, ended_at=None, error=None)
+        self._update(trial_id, transitions.begun(self._records[trial_id], time.time()))
 
     def progressed(self, trial_id: str, progress: Progress, *, node: str, pid: int) -> None:
         """A trial told where it stands."""
-        fields = {field.name: getattr(progress, field.name) for field in dataclasses.fields(progress)}
-        evaluated = fields.pop("evaluated")
-        fields["num_iterations"] = fields.pop("iteration")
         if progress.status != "running":
             self.running.discard(trial_id)
-        known = self._records[trial_id].notes
-        fields["notes"] = (*known, *(note for note in progress.notes if note not in known))[-_MAX_NOTES:]
-        self._update(trial_id, node=node, pid=pid, **fields)
-        self._scalars.write(self._records[trial_id], evaluated=evaluated)
+        record = transitions.told(self._records[trial_id], progress, node=node, pid=pid)
+        self._update(trial_id, record)
+        self._scalars.write(record, evaluated=progress.evaluated)
 
     def paused(self, trial_id: str) -> None:
         """A trial was paused that did not tell so itself; it goes on from its latest checkpoint."""
         self.running.discard(trial_id)
-        self._update(trial_id, status="paused")
+        self._update(trial_id, transitions.paused(self._records[trial_id]))
 
     def lost(self, trial_id: str) -> None:
         """A trial's process ended because another one has the trial, which waits to be continued."""
-        self.running.discard(trial_id)
-        self._update(trial_id, status="paused")
+        self.paused(trial_id)
 
     def ended(self, trial_id: str) -> None:
         """A trial runs no more: by itself, as it has told, or it was paused or stopped."""
@@ -125,10 +115,9 @@ class RecordKeeper:
         if record.status not in ("running", "paused"):
             return
         if self._store.stop_requested():
-            self._update(trial_id, status="paused")
+            self._update(trial_id, transitions.paused(record))
         else:
-            reason = f"scheduler, at {record.num_env_steps} env steps"
-            self._update(trial_id, status="stopped", stop_reason=reason, ended_at=time.time())
+            self._update(trial_id, transitions.stopped(record, time.time()))
 
     def failed(self, trial_id: str, error: str, *, retried: bool, reached: Reached | None = None) -> None:
         """A trial failed, for good or to be tried again.
@@ -142,12 +131,9 @@ class RecordKeeper:
         self.running.discard(trial_id)
         if reached is None:
             reached = read_tally(self._store.trial(trial_id).tally_path)
-        changes: dict[str, Any] = {} if reached is None else dataclasses.asdict(reached)
-        changes |= {"num_failures": self._records[trial_id].num_failures + 1, "error": fit(error, _MAX_ERROR)}
-        if retried:
-            self._update(trial_id, status="pending", **changes)
-        else:
-            self._update(trial_id, status="failed", ended_at=time.time(), **changes)
+        record = self._records[trial_id]
+        self._update(trial_id, transitions.failed(record, error, time.time(), retried=retried, reached=reached))
+        if not retried:
             self._forget_tally(trial_id)
 
     def _forget_tally(self, trial_id: str) -> None:
@@ -177,8 +163,7 @@ class RecordKeeper:
         with self.owned():
             self._scalars.flush()
 
-    def _update(self, trial_id: str, **changes: Any) -> None:
-        record = self._records[trial_id].model_copy(update=changes)
+    def _update(self, trial_id: str, record: TrialRecord) -> None:
         self._records[trial_id] = record
         self._changed.add(trial_id)
         self._listener(record)

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord
-from analysis.selection import NoUsableTrialError, score_trial
+from analysis.selection import NoUsableTrialError
+from analysis.selection import best_checkpoint as best_of
 from policies.acting.baselines import BASELINES, ConstantPolicy
 from policies.acting.load import load_policy, policy_from_portable
 from policies.acting.policy import Policy, RandomPolicy
@@ -251,13 +252,13 @@ def best_checkpoint(store: Sweep, trial_id: str) -> CheckpointRecord:
             f"List them with `tune-jobs trials {store.name}`.",
         )
     # A trial that failed later may still be looked at, though it cannot win.
-    found = score_trial(trials[trial_id].model_copy(update={"status": "completed"}))
+    found = best_of(trials[trial_id].checkpoints)
     if found is None:
         raise NotFoundError(
             f"Trial {trial_id} of sweep {store.name} has no checkpoint with a score.",
             f"See why with `tune-jobs trials {store.name}`.",
         )
-    return found.checkpoint
+    return found
 
 
 def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Path:

@@ -14,10 +14,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.records import FINISHED, BestRecord, SweepRecord, SweepState, TrialRecord
+from analysis.records import FINISHED, BestRecord, SweepRecord, SweepState
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from tune_jobs.plan.machine import Machine, local_machine
-from tune_jobs.plan.sweep_plan import SweepPlan, TrialPlan
+from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
 from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.address import check_address
@@ -26,6 +26,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.closing import close_run
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
+from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult
 
@@ -56,21 +57,6 @@ def write_new(
             address=address,
             allowed_modules=modules_of(spec),
         )
-    )
-
-
-def pending_record(trial: TrialPlan) -> TrialRecord:
-    """The record of a trial that has not begun."""
-    return TrialRecord(
-        trial_id=trial.trial_id,
-        index=trial.index,
-        point_index=trial.point_index,
-        seed_index=trial.seed_index,
-        seed=trial.seed,
-        point=trial.point,
-        hyperparams=trial.hyperparams,
-        has_point=trial.has_point,
-        engine=trial.engine,
     )
 
 

@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from analysis.records import FINISHED, TrialRecord
+from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import Selection
 from analysis.wording import PLAIN_NONE, duration, return_text, setting_text
 from tune_jobs.process.streams import quiet
@@ -22,7 +22,7 @@ from tune_jobs.sweeps.monitor import SweepMonitor
 
 _REFRESH_PER_S = 4
 _LINE_INTERVAL_S = 10.0
-_STATUS_STYLES = {
+_STATUS_STYLES: dict[TrialStatus, str] = {
     "running": "bold cyan", "completed": "green", "stopped": "yellow", "failed": "bold red", "paused": "magenta",
     "pending": "dim",
 }  # fmt: skip
@@ -64,7 +64,7 @@ def render(monitor: SweepMonitor) -> RenderableType:
     return Group(*parts)
 
 
-def _status_line(counts: dict[str, int]) -> Text:
+def _status_line(counts: dict[TrialStatus, int]) -> Text:
     words = [
         Text(f"{counts[status]} {status}", style=style)
         for status, style in _STATUS_STYLES.items()

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from analysis.records import FINISHED, TrialRecord
+from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, Selection, select_best
 
 _RATE_WINDOW_S = 20.0
@@ -81,7 +81,7 @@ class SweepMonitor:
         if seen != (record.status, record.best_evaluation_return):
             self._selection_is_old = True
 
-    def counts(self) -> dict[str, int]:
+    def counts(self) -> dict[TrialStatus, int]:
         """Number of trials by status."""
         return dict(Counter(record.status for record in self.records.values()))
 

@@ -15,7 +15,8 @@ from tune_jobs.spec.rules import check_extendable
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.names import SWEEP_RECORD
-from tune_jobs.sweeps.drive import connected, machine_here, pending_record, run_sweep, settled
+from tune_jobs.store.transitions import pending_record, tried_again
+from tune_jobs.sweeps.drive import connected, machine_here, run_sweep, settled
 from tune_jobs.sweeps.outcome import SweepResult
 
 
@@ -89,7 +90,7 @@ def _add_trials(
         if before is None:
             todo.append(pending_record(trial))
         elif retry_failed and before.status == "failed":
-            todo.append(before.model_copy(update={"status": "pending", "error": None}))
+            todo.append(tried_again(before))
     if not todo and all(trial.status in FINISHED for trial in known.values()):
         return
     # First that there are to be more: whoever is killed then leaves a sweep that lacks trials, which a resume adds.

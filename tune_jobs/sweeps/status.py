@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from analysis.records import SweepRecord
+from analysis.records import SweepRecord, TrialStatus
 from policies.arguments import checked
 from policies.errors import TuneJobsError
 from tune_jobs.store.contract import Sweep
@@ -19,7 +19,7 @@ class SweepStatus:
     """A sweep in a few numbers."""
 
     sweep: SweepRecord
-    counts: dict[str, int]
+    counts: dict[TrialStatus, int]
     """Number of trials by status."""
     alive: bool
     """Whether a process runs it now."""

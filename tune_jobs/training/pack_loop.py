@@ -198,7 +198,7 @@ class PackLoop:
         if member.loop is None:
             del self._members[trial_id]
         else:
-            leave = {member: lambda: dataclasses.replace(member.trial.leave(), status="stopped")}
+            leave = {member: lambda: member.trial.leave("stopped")}
             self._attempt(leave, saves=False, leaves=True)
 
     def advance(self, max_s: float, *, until_evaluated: bool) -> list[MemberReport]:

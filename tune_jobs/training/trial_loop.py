@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from analysis.records import CheckpointRecord, IterationRecord, finite_or_none
+from analysis.records import CheckpointRecord, IterationRecord, TrialStatus, finite_or_none
 from analysis.selection import best_checkpoint
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.load import policy_from_portable
@@ -249,7 +249,8 @@ class TrialLoop:
                 self._unwritten.append(record)
             self._last, reached = record, self._tally.reached
             progress = self._progress("failed", evaluated=False, error=text)
-            return replace(progress, num_env_steps=reached.num_env_steps, num_episodes=reached.num_episodes)
+            counts = {"num_env_steps": reached.num_env_steps, "num_episodes": reached.num_episodes}
+            return progress.model_copy(update=counts)
         if evaluation is not None:
             score = finite_or_none(sum(evaluation.returns) / len(evaluation.returns))
             record = record.model_copy(update={"evaluation_return": score})
@@ -265,7 +266,7 @@ class TrialLoop:
             or record.iteration % self.task.checkpoints.every_iterations == 0
         ):
             self._checkpoint(score)
-        status = "running" if reason is None else "completed"
+        status: TrialStatus = "running" if reason is None else "completed"
         return self._progress(status, evaluated=evaluation is not None, reason=reason)
 
     def flush(self) -> None:
@@ -273,10 +274,10 @@ class TrialLoop:
         self._store.append_iterations(self._unwritten)
         self._unwritten = []
 
-    def leave(self) -> Progress:
+    def leave(self, status: TrialStatus = "paused") -> Progress:
         """Save and stop here; the trial can go on elsewhere."""
         self.pause()
-        return self._progress("paused", evaluated=False)
+        return self._progress(status, evaluated=False)
 
     def _record(self, stats: IterationStats) -> IterationRecord:
         returns = tuple(episode_return for episode_return, _ in stats.episodes)
@@ -349,13 +350,13 @@ class TrialLoop:
                 self._checkpoints.remove(record)
 
     def _progress(
-        self, status: str, *, evaluated: bool, reason: str | None = None, error: str | None = None
+        self, status: TrialStatus, *, evaluated: bool, reason: str | None = None, error: str | None = None
     ) -> Progress:
         if status != "running":
             end_tally(self.task.trial_id)
             self._store.forget_tally()
         return Progress(
-            iteration=self._last.iteration,
+            num_iterations=self._last.iteration,
             num_env_steps=self._last.num_env_steps,
             num_episodes=self._last.num_episodes,
             time_s=self._last.time_s,
