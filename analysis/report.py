@@ -234,6 +234,7 @@ def _render(**content: Any) -> str:
         script=Markup(script),  # noqa: S704
         script_hash=f"sha256-{digest}",
         interval_text=wording.interval_text,
+        difference_text=wording.difference_text,
         number=wording.number,
     )
 

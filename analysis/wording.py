@@ -102,7 +102,12 @@ def setting_text(value: Any) -> str:
 
 def return_text(value: float | None, *, none: str = NONE) -> str:
     """A return or a score, with one decimal."""
-    return none if value is None else f"{value:.1f}"
+    return none if value is None else f"{value:z.1f}"
+
+
+def difference_text(value: float) -> str:
+    """A difference of two returns, with its sign and one decimal; what rounds to zero is "+0.0"."""
+    return f"{value:+z.1f}"
 
 
 def bytes_text(number: float) -> str:

@@ -17,7 +17,16 @@ from synthetic_sweep import make_points, make_sweep
 from analysis.records import CheckpointRecord
 from analysis.report import build_report
 from analysis.report_data import goal_of, shown_path, winner_card
-from analysis.wording import NONE, duration, moment, number, return_text, seed_range, setting_text
+from analysis.wording import (
+    NONE,
+    difference_text,
+    duration,
+    moment,
+    number,
+    return_text,
+    seed_range,
+    setting_text,
+)
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7*7 }}"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -340,7 +349,8 @@ def test_numbers_read_well():
     assert [duration(v) for v in (0.0, 42.2, 70.4, 7500)] == ["0.0 s", "42 s", "1 min 10 s", "2 h 5 min"]
     assert [duration(v, tenths=False) for v in (0.4, 9.7, 59.6)] == ["0 s", "10 s", "1 min 0 s"]
     assert [duration(v, none="-") for v in (math.nan, math.inf)] == ["-", "-"]
-    assert [return_text(v) for v in (None, 0.0, -78.25)] == [NONE, "0.0", "-78.2"]
+    assert [return_text(v) for v in (None, 0.0, -78.25, -0.04)] == [NONE, "0.0", "-78.2", "0.0"]
+    assert [difference_text(v) for v in (12.34, -0.06, -0.04, 0.0)] == ["+12.3", "-0.1", "+0.0", "+0.0"]
     assert [setting_text(v) for v in (None, 4096, 1e-3, 100000.0, [64, 64], True, "relu")] == [
         "-", "4096", "0.001", "1e+05", "64x64", "True", "relu",
     ]  # fmt: skip

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from pydantic import BaseModel
 
-from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
+from analysis.wording import PLAIN_NONE, counted, difference_text, duration, return_text, setting_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -197,7 +197,7 @@ def _print_best(console: Console, best: BestRecord) -> None:
     facts = {
         "best": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
         "chosen by": f"{return_text(best.selection_score)} mean evaluation return",
-        "confirmed at": f"{_returns(best.confirmation)}; gap {best.optimism_gap:+.1f}",
+        "confirmed at": f"{_returns(best.confirmation)}; gap {difference_text(best.optimism_gap)}",
         "random policy": _returns(best.random),
     }
     print_facts(console, facts | _verdict(best.confirmation))
