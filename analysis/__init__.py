@@ -1,7 +1,7 @@
-"""What a sweep left behind: records, selection, tables, figures, report."""
+"""The results of a sweep: records, selection, tables, figures, report."""
 
 from importlib import import_module
 
-# Which settles that a user's own folder called analysis can be imported from as well:
+# Loading tune_jobs lets a user's own folder called analysis be imported from as well:
 # see tune_jobs/process/own_packages.py.
 import_module("tune_jobs")

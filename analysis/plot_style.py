@@ -1,6 +1,6 @@
-"""What all figures share: colours, grouping of trials, and SVG that follows the page's light or dark theme.
+"""Style shared by all figures: colours, grouping of trials, and SVG that follows the page's light or dark theme.
 
-Figures are built with matplotlib's object interface alone: no pyplot, so no global state and no display.
+Figures are built with matplotlib's object interface, not with pyplot, so there is no global state and no display.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK = "#24292f"
-"""Text and axes."""
+"""The colour of text and axes."""
 MUTED = "#8b949e"
-"""What is there for context: trials of no group, failed trials."""
+"""The colour of trials shown for context: those without a group, and failed ones."""
 GRID = "#d8dee4"
 ACCENT = "#c2410c"
-"""The goal line."""
-# Okabe & Ito's colours, told apart with any colour vision; their yellow is left out, as it vanishes on white.
+"""The colour of the goal line."""
+# Okabe & Ito's colours, which can be told apart with any colour vision; yellow is left out, as it is faint on white.
 PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", "-.", ":")
@@ -52,7 +52,7 @@ CSS_DARK = CSS_LIGHT | {
 
 @dataclass(frozen=True)
 class Style:
-    """How the trials of one group look."""
+    """The look of the trials of one group."""
 
     label: str
     color: str
@@ -61,12 +61,12 @@ class Style:
 
 
 def escape(text: str) -> str:
-    """Text as matplotlib must be given it: a pair of dollar signs would be read as a formula."""
+    """Escape text for matplotlib, which would read a pair of dollar signs as a formula."""
     return text.replace("$", r"\$")
 
 
 def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
-    """Searched hyperparameters that can be an axis: numbers of at least two values, lr first."""
+    """Return the searched hyperparameters that can be an axis: numbers with at least two values, lr first."""
     names = []
     for name in point_names(trials):
         values = {trial.point[name] for trial in trials if is_number(trial.point.get(name))}
@@ -76,7 +76,7 @@ def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
 
 
 def group_names(trials: Sequence[TrialRecord], axis: str | None) -> list[str]:
-    """Up to two searched hyperparameters to tell trials apart by: of few values, other than the axis."""
+    """Return up to two searched hyperparameters that group trials: they have few values and are not the axis."""
     names = []
     for name in point_names(trials):
         values = {cell_value(trial.point.get(name)) for trial in trials}
@@ -86,7 +86,7 @@ def group_names(trials: Sequence[TrialRecord], axis: str | None) -> list[str]:
 
 
 def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[str, Style]:
-    """A style for each trial id: colour by combination of values, marker by the first, line by the last.
+    """Return a style for each trial id: colour by combination of values, marker by the first, line by the last.
 
     Without names all trials share one style with an empty label.
     """
@@ -108,14 +108,14 @@ def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[st
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
-    """An empty figure, inches, that lays itself out."""
+    """Return an empty figure with automatic layout; the size is in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained", facecolor="white")
 
 
 def style_axes(axes: Axes, *, xlabel: str, ylabel: str, title: str = "") -> None:
-    """Labels, a light grid, and no box around the data."""
+    """Give axes labels and a light grid, and no box around the data."""
     axes.set_xlabel(xlabel, color=INK)
     axes.set_ylabel(ylabel, color=INK)
     if title:
@@ -129,7 +129,7 @@ def style_axes(axes: Axes, *, xlabel: str, ylabel: str, title: str = "") -> None
 
 
 def steps_axis(axes: Axes) -> None:
-    """A horizontal axis of env steps from 0, with short numbers."""
+    """Make the horizontal axis one of env steps from 0, with short numbers."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     axes.set_xlim(left=0)
@@ -138,7 +138,7 @@ def steps_axis(axes: Axes) -> None:
 
 
 def _short(value: float) -> str:
-    """12000 as "12k", 1500000 as "1.5M"."""
+    """Format 12000 as "12k" and 1500000 as "1.5M"."""
     for unit, letter in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= unit:
             return f"{value / unit:g}{letter}"
@@ -146,12 +146,12 @@ def _short(value: float) -> str:
 
 
 def drawable(values: ArrayLike) -> NDArray[np.float64]:
-    """Finite values as matplotlib can place them: near the largest of floats its axes overflow."""
+    """Return finite values, limited so that matplotlib's axes don't overflow near the largest floats."""
     return np.clip(np.asarray(values, dtype=np.float64), -_MAX_DRAWN, _MAX_DRAWN)
 
 
 def goal_line(axes: Axes, threshold: float | None) -> None:
-    """The return to reach, dashed; nothing if there is none."""
+    """Draw the return to reach as a dashed line, if there is one."""
     if threshold is not None:
         axes.axhline(
             float(drawable([threshold])[0]),
@@ -166,7 +166,7 @@ def goal_line(axes: Axes, threshold: float | None) -> None:
 def add_legend(
     figure: Figure, axes: Axes, names: Sequence[str], size: tuple[float, float], *, below: bool = False
 ) -> None:
-    """Beside a wide figure, below a narrow one or where asked; never over the data."""
+    """Put the legend beside a wide figure, or below a narrow one or where asked; never over the data."""
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
@@ -187,35 +187,35 @@ def add_legend(
 
 
 def to_png(figure: Figure, *, dpi: int = 160) -> bytes:
-    """The figure as PNG on white."""
+    """Return the figure as PNG on white."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 
 def to_svg(figure: Figure, *, label: str, prefix: str) -> str:
-    """The figure as an `<svg>` element for a page, transparent, with colours the page may override.
+    """Return the figure as an `<svg>` element for a page, transparent, with colours that the page may override.
 
     Every colour of this module becomes `var(--name, #rrggbb)`: the page's theme sets the variables
     (`CSS_LIGHT`, `CSS_DARK`) and the picture is right without them.
 
     Args:
-        figure: What to draw.
-        label: What a screen reader says.
+        figure: The figure to draw.
+        label: The text for screen readers.
         prefix: Put before every id, or two figures in one page would take each other's clip paths.
     """
     import matplotlib as mpl
 
     buffer = io.StringIO()
-    # Letters as shapes: they look the same whatever fonts the reader has. The salt makes the ids
+    # Letters become shapes, which look the same whatever fonts the reader has. The salt makes the ids
     # reproducible.
     with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": prefix}):
         figure.savefig(buffer, format="svg", transparent=True)
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
-    # The metadata hold the date: the same figure is the same text.
+    # The metadata contain the date; without them the same figure gives the same text.
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    # Comments hold label texts, which come from spec files and errors: nothing of theirs is passed through.
+    # Comments contain label texts, which come from sweep files and errors and must not reach the page unescaped.
     svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\1{prefix}-", svg)
     for color, name in _CSS_NAMES.items():

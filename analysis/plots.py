@@ -51,13 +51,13 @@ def learning_curves(
     winner: str | None = None,
     size: tuple[float, float] = _WIDE,
 ) -> Figure:
-    """Training return (mean of the last 100 episodes) of every trial over its env steps.
+    """Plot the training return (mean of the last 100 episodes) of every trial over its env steps.
 
     The winner is drawn thick; its greedy evaluations are dots. A trial that failed ends in a cross. Where a
     point has several seeds, the band around the winner is the range of its point over the seeds.
 
     Args:
-        trials: Of one sweep.
+        trials: The trials of one sweep.
         results: Iterations by trial id, oldest first; a trial may have none.
         threshold: Return to draw as the goal; None: none.
         winner: Trial id of the selected trial.
@@ -83,7 +83,7 @@ def learning_curves(
             alpha=1.0 if wins else 0.65,
             label=escape(_curve_label(style.label, wins=wins, known=style.label in labelled)),
             rasterized=total > _MAX_VECTOR_POINTS,
-            # A trial of one iteration is a line of no length: show its end.
+            # A trial of one iteration is a line without length, so a dot marks its end.
             marker=style.marker if steps.size == 1 else "",
             zorder=4 if wins else 2,
         )
@@ -109,15 +109,14 @@ def score_by_lr(
     winner: str | None = None,
     size: tuple[float, float] = _WIDE,
 ) -> Figure:
-    """Score of each trial against its learning rate, coloured by the hyperparameters of few values.
+    """Plot the score of each trial against its learning rate, coloured by the hyperparameters with few values.
 
-    Trials that cannot win stand as grey crosses on the lower edge: they are part of the result.
+    Trials that cannot win are grey crosses on the lower edge, because they are part of the result.
 
     Args:
-        trials: Of one sweep.
-        name: Hyperparameter of the horizontal axis; None: lr if it was searched, else the first searched
-        number, else
-            the groups themselves side by side.
+        trials: The trials of one sweep.
+        name: Hyperparameter of the horizontal axis; None: lr if it was searched, else the first searched number,
+            else the groups themselves, side by side.
         threshold: Return to draw as the goal; None: none.
         winner: Trial id of the selected trial; it gets a ring.
         size: Width and height, inches.
@@ -161,12 +160,12 @@ def score_per_episode(
     title: str = "",
     size: tuple[float, float] = _WIDE,
 ) -> Figure:
-    """Score of each episode with goal and linear trend; beside it, the histogram of the last 50.
+    """Plot the score of each episode with goal and linear trend; beside it, the histogram of the last 50.
 
     Args:
         returns: Undiscounted return of each training episode, in order. Shape (num_episodes,).
         goal: Score that counts as solved; None: none.
-        title: Above the figure.
+        title: Text above the figure.
         size: Width and height, inches; taller than wide puts the histogram below.
 
     Raises:
@@ -177,7 +176,7 @@ def score_per_episode(
         raise ValueError(f"expected the returns of at least one episode, got shape {scores.shape}")
     figure = new_figure(size)
     tall = size[1] > size[0]
-    # Ratios are heights or widths, so the long axis of the figure is the one that is shared out.
+    # The ratios are of heights or of widths, so that the longer side of the figure is divided.
     grid = figure.add_gridspec(2, 1, height_ratios=[3, 2]) if tall else figure.add_gridspec(1, 2, width_ratios=[2, 1])
     left, right = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     episodes = np.arange(1, scores.size + 1)
@@ -206,12 +205,12 @@ def score_per_episode(
         )
     style_axes(left, xlabel="episode", ylabel="score (episode return)", title=escape(title))
     goal_line(left, goal)
-    # The trend of a learner that has arrived overshoots what can be scored: it must not set the scale.
+    # The trend of a policy that scores the maximum goes beyond any possible score, so it must not set the scale.
     low, high = float(scores.min()), max(float(scores.max()), goal if goal is not None else -np.inf)
     left.set_ylim(min(0.0, low), high + 0.06 * max(high - min(0.0, low), 1.0))
     add_legend(figure, left, [], size, below=True)
     last = scores[-_HISTOGRAM_EPISODES:]
-    # Bins over the range of the whole training: fifty equal scores are then a bar, and its place says how high.
+    # The bins cover the range of the whole training, so that fifty equal scores are one bar at their height.
     right.hist(last, bins=20, range=(min(0.0, low), high), color=PALETTE[4], rwidth=0.92)
     style_axes(right, xlabel="score", ylabel="episodes", title=f"last {last.size} episodes")
     if goal is not None:
@@ -220,7 +219,7 @@ def score_per_episode(
 
 
 def _curve(items: Sequence[IterationRecord]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Env steps and training returns of the iterations that have one, thinned to at most 300 points."""
+    """Return env steps and training returns of the iterations that have one, thinned to at most 300 points."""
     pairs = [(item.num_env_steps, item.training_return) for item in items if item.training_return is not None]
     if not pairs:
         return np.empty(0), np.empty(0)
@@ -231,7 +230,7 @@ def _curve(items: Sequence[IterationRecord]) -> tuple[NDArray[np.float64], NDArr
 
 
 def _curve_label(group: str, *, wins: bool, known: bool) -> str:
-    """Legend text of a curve: the winner always has one, a group only once."""
+    """Return the legend text of a curve: the winner always has one, each group only once."""
     if wins:
         return f"winner: {group}" if group else "winner"
     return "" if known else group
@@ -244,7 +243,7 @@ def _draw_winner(
     results: Mapping[str, Sequence[IterationRecord]],
     style: Style,
 ) -> None:
-    """The winner's greedy evaluations and, where its point has several seeds, their range."""
+    """Draw the winner's greedy evaluations and, where its point has several seeds, their range."""
     items = results.get(winner.trial_id, ())
     evaluated = [(i.num_env_steps, i.evaluation_return) for i in items if i.evaluation_return is not None]
     if evaluated:
@@ -264,7 +263,7 @@ def _draw_winner(
     curves = [_curve(results.get(t.trial_id, ())) for t in trials if t.point_index == winner.point_index]
     curves = [curve for curve in curves if curve[0].size > 1]
     if len(curves) > 1:
-        # Only where every seed has values: beyond the shortest run the range would be that of fewer seeds.
+        # Only where every seed has values: after the shortest trial, the range would be that of fewer seeds.
         start, stop = max(c[0][0] for c in curves), min(c[0][-1] for c in curves)
         if stop > start:
             grid = np.linspace(start, stop, 100)
@@ -282,14 +281,14 @@ def _draw_winner(
 
 
 def _positions(trials: Sequence[TrialRecord], name: str | None, styles: Mapping[str, Style]) -> dict[str, float]:
-    """Where each trial stands on the horizontal axis: its value, or the number of its group."""
+    """Return each trial's position on the horizontal axis: its value, or the number of its group."""
     if name is not None:
         return {trial.trial_id: float(trial.point[name]) for trial in trials if trial.point.get(name) is not None}
     labels = list(dict.fromkeys(style.label for style in styles.values()))
     positions = {}
     for i, label in enumerate(labels):
         members = [trial.trial_id for trial in trials if styles[trial.trial_id].label == label]
-        # Side by side within the group, or equal scores would hide each other.
+        # Placed side by side within the group, or equal scores would hide each other.
         for trial_id, shift in zip(members, np.linspace(-0.2, 0.2, len(members) + 2)[1:-1], strict=True):
             positions[trial_id] = i + float(shift)
     return positions
@@ -329,7 +328,7 @@ def _mark_lost_and_winner(
 
 
 def _value_axis(axes: Axes, values: Sequence[float], name: str | None, styles: Mapping[str, Style]) -> None:
-    """Logarithmic where positive values span more than a decade; group names where there is no number."""
+    """Make the axis logarithmic if positive values span more than a decade, or show group names without numbers."""
     if name is None:
         labels = list(dict.fromkeys(style.label for style in styles.values()))
         axes.set_xticks(range(len(labels)), [escape(label) or "all trials" for label in labels])
@@ -338,7 +337,7 @@ def _value_axis(axes: Axes, values: Sequence[float], name: str | None, styles: M
         from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
         axes.set_xscale("log")
-        # Over less than two decades the powers of ten alone are too few labels, and matplotlib's ten overlap.
+        # Over less than two decades, powers of ten are too few labels, and matplotlib's ten per decade overlap.
         subs = (1.0, 2.0, 5.0) if max(values) < 100 * min(values) else (1.0,)
         axes.xaxis.set_major_locator(LogLocator(subs=subs))
         axes.xaxis.set_minor_locator(NullLocator())

@@ -1,6 +1,6 @@
-"""The report of a sweep: one HTML file that needs nothing else; figures and tables also as files beside it.
+"""Write the report of a sweep: one HTML file that needs no other; figures and tables are also files beside it.
 
-    index.html   figures as inline SVG, videos as base64: it can be mailed as it is
+    index.html   with figures as inline SVG and videos as base64, so it can be mailed as it is
     trials.csv, iterations.csv, steps_to_solve.csv, figures/*.png
 
 Everything in the page is escaped (error texts and env ids come from elsewhere), and the page's own content
@@ -40,7 +40,7 @@ _VIDEO_TITLES = {
 
 @dataclass(frozen=True)
 class _Sweep:
-    """What a report is made from."""
+    """The data that a report is made from."""
 
     folder: Path
     sweep: SweepRecord
@@ -49,16 +49,16 @@ class _Sweep:
     best: BestRecord | None
     goal: float | None
     why_no_best: tuple[str, str] | None = None
-    """What is wrong, and what to do; None: it is found in the trials."""
+    """Why there is no winner, and what to do; None: the reason is found in the trials."""
 
     @property
     def axis(self) -> str | None:
-        """The searched number that stands on the horizontal axis."""
+        """The searched number on the horizontal axis."""
         return next(iter(numeric_names(self.trials)), None)
 
     @property
     def video_titles(self) -> Mapping[str, str]:
-        """Of the videos by name: a baseline has not been trained, so it has no before and after."""
+        """The titles of videos by name; a baseline has not been trained, so it has no before and after."""
         if report_data.is_trained(self.sweep):
             return _VIDEO_TITLES
         return {"before": "Random actions", "after": "The winner"}
@@ -94,13 +94,13 @@ def build_report(
 
     Args:
         folder: The sweep folder, as the report names it.
-        target: The folder that the report goes to.
-        sweep: What was asked for, and where it ran.
+        target: The folder that the report is written to.
+        sweep: The sweep's record.
         trials: All trials, in any status.
         results: Iterations by trial id, oldest first; a trial may have none.
         best: The confirmed winner; None: the report says why there is none.
         videos: Files to embed, by "before", "after" or another name; those that do not exist are left out.
-        why_no_best: Why the winner could not be confirmed, and what to do; None: it is found in the trials.
+        why_no_best: Why the winner could not be confirmed, and what to do; None: the reason is found in the trials.
 
     Returns:
         Path of index.html.
@@ -132,7 +132,7 @@ def build_report(
 
 
 def _content(source: _Sweep) -> dict[str, Any]:
-    """Everything the template shows except figures and videos."""
+    """Return everything that the template shows except figures and videos."""
     import yaml
 
     sweep, trials, results, best, goal = source.sweep, source.trials, source.results, source.best, source.goal
@@ -161,7 +161,7 @@ def _content(source: _Sweep) -> dict[str, Any]:
 
 
 def _pictures(source: _Sweep) -> list[_Picture]:
-    """The figures there is data for."""
+    """Return the figures for which there is data."""
     trials, results, goal, winner = source.trials, source.results, source.goal, source.winner
     pictures = []
     if any(item.training_return is not None for items in results.values() for item in items):
@@ -174,7 +174,7 @@ def _pictures(source: _Sweep) -> list[_Picture]:
                 lambda size: plots.learning_curves(trials, results, threshold=goal, winner=winner, size=size),
             )
         )
-    # One dot says less than the winner's card.
+    # One dot would say less than the winner's card.
     if sum(score_trial(trial) is not None for trial in trials) > 1:
         pictures.append(
             _Picture(
@@ -200,7 +200,7 @@ def _pictures(source: _Sweep) -> list[_Picture]:
 
 
 def _stem(name: str | None) -> str:
-    """A hyperparameter's name as part of a file name: it is an identifier, but records are not trusted."""
+    """Return a hyperparameter's name as part of a file name; records are not trusted to hold identifiers."""
     return "".join(letter if letter.isalnum() or letter == "_" else "_" for letter in name or "trial")
 
 
@@ -218,7 +218,7 @@ def _render(**content: Any) -> str:
     from markupsafe import Markup
 
     environment = _environment()
-    # Markup marks text as HTML. It is given only what this package made: figures, its script, its style.
+    # Markup marks text as safe HTML. It gets only what this package makes: figures, its script, its style.
     figures = [
         figure | {"wide": Markup(figure["wide"]), "narrow": Markup(figure["narrow"])}  # noqa: S704
         for figure in content.pop("figures")

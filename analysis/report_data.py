@@ -1,4 +1,4 @@
-"""What the report says, taken from the records and worded for a reader; `report.py` draws and writes it."""
+"""The texts and numbers of the report, taken from the records; `report.py` draws and writes it."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _MAX_ERROR_CHARS = 4_000
 
 
 def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
-    """The return that counts as solved: the env's threshold, else the stop rule's; None without both."""
+    """Return the return that counts as solved: the env's threshold, else the stop rule's; None without both."""
     if best is not None and best.confirmation.threshold is not None:
         return best.confirmation.threshold
     import gymnasium
 
-    # The registry itself, not gymnasium.spec(): that would import what a "module:Env-v0" names.
+    # gymnasium.spec() would import the module that an id such as "module:Env-v0" names, so the registry is read.
     env_spec = gymnasium.registry.get(env_of(sweep))
     if env_spec is not None and env_spec.reward_threshold is not None:
         return float(env_spec.reward_threshold)
@@ -42,19 +42,19 @@ def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
 
 
 def env_of(sweep: SweepRecord) -> str:
-    """The env id of a sweep, from its resolved spec."""
+    """Return the env id of a sweep, from its resolved spec."""
     env = sweep.spec.get("env")
     return str(env.get("id", "?")) if isinstance(env, Mapping) else str(env)
 
 
 def algorithm_of(sweep: SweepRecord) -> str:
-    """What a sweep ran, as a heading names it: "PPO", "Random play"."""
+    """Return the sweep's algorithm as a heading names it: "PPO", "Random play"."""
     name = str(sweep.spec.get("algorithm", "?"))
     return {"random": "Random play", "constant": "A constant action"}.get(name, name.upper())
 
 
 def is_trained(sweep: SweepRecord) -> bool:
-    """Whether a sweep's policies learn; those of baselines don't."""
+    """Whether a sweep's policies learn, which those of baselines don't."""
     return sweep.spec.get("algorithm") not in BASELINE_KINDS
 
 
@@ -64,7 +64,7 @@ def headline(
     results: Mapping[str, Sequence[IterationRecord]],
     goal: float | None,
 ) -> list[tuple[str, str]]:
-    """The sweep in a few numbers: label and value."""
+    """Return the sweep's main numbers as pairs of label and value."""
     frame = trials_frame(trials, results, threshold=goal)
     statuses = Counter(trial.status for trial in trials)
     facts = [
@@ -81,7 +81,7 @@ def headline(
 
 
 def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRecord, folder: Path) -> dict[str, Any]:
-    """The winner: its point, both scores, the random baseline, and how to load it."""
+    """Return the winner's data: its point, both scores, the random baseline, and how to load it."""
     confirmation, random = best.confirmation, best.random
     rng = random_streams.fixed()
     interval = gain = None
@@ -110,7 +110,7 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
 
 
 def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
-    """Message and hint for a sweep that has no confirmed winner."""
+    """Return message and hint for a sweep that has no confirmed winner."""
     try:
         selection = select_best(trials)
     except NoUsableTrialError as error:
@@ -124,7 +124,7 @@ def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
 def fewest_env_steps(
     trials: Sequence[TrialRecord], results: Mapping[str, Sequence[IterationRecord]], goal: float | None
 ) -> str:
-    """Which hyperparameters solve the env in the fewest env steps, as a sentence; empty without a goal or trials."""
+    """Say which hyperparameters solve the env in the fewest env steps; empty without a goal or trials."""
     if goal is None or not trials:
         return ""
     frame = steps_to_solve_frame(trials, results, threshold=goal)
@@ -145,7 +145,7 @@ def fewest_env_steps(
 
 
 def failures(trials: Sequence[TrialRecord]) -> list[dict[str, str]]:
-    """Failed trials with the line that names the error and the end of the whole text."""
+    """Return the failed trials, each with the line that names the error and the end of the whole text."""
     return [
         {
             "trial_id": trial.trial_id,
@@ -160,7 +160,7 @@ def failures(trials: Sequence[TrialRecord]) -> list[dict[str, str]]:
 
 
 def facts(sweep: SweepRecord) -> list[tuple[str, str]]:
-    """When, with what and on which seeds the sweep ran."""
+    """Return when, with what and on which seeds the sweep ran."""
     rows = [
         ("started", moment(sweep.started_at)),
         ("ended", moment(sweep.ended_at)),
@@ -175,7 +175,7 @@ def facts(sweep: SweepRecord) -> list[tuple[str, str]]:
 
 
 def _is_stale(best: BestRecord, trials: Sequence[TrialRecord]) -> bool:
-    """Whether the selection has since moved to another checkpoint (the sweep was extended, say)."""
+    """Whether another checkpoint leads by now, for example because the sweep was extended."""
     try:
         return select_best(trials).checkpoint.path != best.checkpoint.path
     except NoUsableTrialError:

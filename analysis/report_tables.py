@@ -1,6 +1,6 @@
-"""The tables of the report: what stands in each cell, what it sorts by, and how it is set.
+"""The tables of the report: the text of each cell, the value it sorts by, and its style.
 
-A row is one trial, one combination of the hyperparameters of few values, or one point.
+A row is one trial, one combination of the hyperparameters with few values, or one point.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from analysis.wording import NONE, interval_text, is_number, number, return_text
 from policies import random_streams
 
 MAX_STEPS_ROWS = 20
-"""Points that the table of env steps to solve shows; the CSV file beside the report has them all."""
+"""How many points the table of env steps to solve shows; the CSV file beside the report has them all."""
 _ONE_DECIMAL = {"score", "training_return", "time_s", "best_score", "mean_score"}
 
 
 class Cell(NamedTuple):
-    """One cell."""
+    """One cell of a table."""
 
     value: Any
-    """What the column sorts by; None: not known, last in any order."""
+    """The value that the column sorts by; None: not known, which is last in any order."""
     text: str
     kind: str = ""
     """CSS class: "winner", a trial status, or "wide" for text that may wrap."""
@@ -42,7 +42,7 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """For each column, whether its known values are numbers (and so stand to the right)."""
+        """For each column, whether its known values are numbers, which are aligned to the right."""
         known = [[row[i].value for row in self.rows if row[i].value is not None] for i in range(len(self.headings))]
         return [all(map(is_number, values)) for values in known]
 
@@ -54,7 +54,7 @@ def trial_table(
     goal: float | None,
     best: BestRecord | None,
 ) -> Table:
-    """All trials, those that can win first, in the order of the selection."""
+    """Return all trials, first those that can win, in the order of the selection."""
     frame = trials_frame(trials, results, threshold=goal)
     ranked = [item.trial.trial_id for point in rank_points(trials) for item in point.trial_scores]
     order = {trial_id: rank for rank, trial_id in enumerate(ranked)}
@@ -81,7 +81,7 @@ def group_table(
     *,
     goal: float | None,
 ) -> Table:
-    """The combinations of some hyperparameters: which of them solves, and in how few env steps."""
+    """Return the combinations of some hyperparameters, with which of them solve the env and in how few env steps."""
     if not names:
         return Table([], [])
     frame = groups_frame(trials, results, names, threshold=goal)
@@ -99,7 +99,7 @@ def steps_table(
     *,
     goal: float | None,
 ) -> Table:
-    """The points that solve the env, those in the fewest env steps first, with each seed; none without a goal."""
+    """Return the points that solve the env with each seed, fewest env steps first; none without a goal."""
     if goal is None:
         return Table([], [])
     frame = steps_to_solve_frame(trials, results, threshold=goal)
@@ -120,7 +120,7 @@ def steps_table(
 
 
 def point_table(trials: Sequence[TrialRecord]) -> Table:
-    """The points, best first, where they have several seeds; else nothing."""
+    """Return the points, best first, if they have several seeds, else an empty table."""
     points = rank_points(trials)
     if all(point.num_seeds < 2 for point in points):
         return Table([], [])

@@ -1,12 +1,12 @@
 """The one place that decides which checkpoint of a sweep is "best".
 
 Words: a *usable* trial did not fail and keeps at least one checkpoint with a finite evaluation return; its
-*score* is the highest of them. The score of a *point* is the mean score of its usable trials, one a seed. A
+*score* is the highest of them. The score of a *point* is the mean score of its usable trials, one per seed. A
 point is *complete* when every one of its seeds is usable.
 
 The rule, in order:
 
-1. Complete points come before incomplete ones: a failed seed must not flatter its point by leaving the mean.
+1. Complete points come before incomplete ones, because a failed seed must not raise its point's mean by its absence.
 2. The higher point score wins; then fewer env steps (mean over the seeds); then the lower trial index.
 3. Within the winning point: the trial with the highest score; then fewer env steps; then the lower index.
 4. Within the winning trial: the checkpoint with the highest evaluation return; then fewer env steps.
@@ -26,7 +26,7 @@ _MAX_ERROR_CHARS = 300
 
 
 class NoUsableTrialError(NotFoundError):
-    """Not one trial of the sweep has a checkpoint that may win; the message says why."""
+    """No trial of the sweep has a checkpoint that may win; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PointScore:
     num_env_steps: float
     """Env steps to those scores, mean over the usable seeds."""
     num_seeds: int
-    """Seeds the point should have; `len(trial_scores)` of them are usable."""
+    """The number of seeds the point should have; `len(trial_scores)` of them are usable."""
     trial_scores: tuple[TrialScore, ...]
     """The usable trials, best first."""
 
@@ -67,18 +67,18 @@ class Selection:
     checkpoint: CheckpointRecord
     trial: TrialRecord
     score: float
-    """Evaluation return of the winning checkpoint alone: what its confirmation is compared with."""
+    """Evaluation return of the winning checkpoint, which its confirmation is compared with."""
     ranking: tuple[PointScore, ...]
     """Every point with a usable trial, best first; the winner is in the first."""
 
     @property
     def point_score(self) -> float:
-        """Score of the winning point: the mean over its seeds that it was chosen by."""
+        """The winning point's score, the mean over its seeds, by which it was chosen."""
         return self.ranking[0].score
 
 
 def score_trial(trial: TrialRecord) -> TrialScore | None:
-    """The checkpoint a trial would win with, or None if the trial is not usable."""
+    """Return the checkpoint that a trial would win with, or None if the trial is not usable."""
     if trial.status == "failed":
         return None
     best = _best_of(trial.checkpoints)
@@ -86,9 +86,9 @@ def score_trial(trial: TrialRecord) -> TrialScore | None:
 
 
 def best_checkpoint(checkpoints: Iterable[CheckpointRecord]) -> CheckpointRecord | None:
-    """The best of some checkpoints of one trial, by number 4 of the rule; None if none was evaluated.
+    """Return the best of some checkpoints of one trial, by number 4 of the rule; None if none was evaluated.
 
-    A trial keeps this one of its own, whatever else it deletes.
+    A trial always keeps this checkpoint, whichever others it deletes.
     """
     best = _best_of(checkpoints)
     return None if best is None else best[1]
@@ -101,14 +101,14 @@ def _best_of(checkpoints: Iterable[CheckpointRecord]) -> tuple[float, Checkpoint
 
 
 def rank_points(trials: Sequence[TrialRecord]) -> list[PointScore]:
-    """Every point that has a usable trial, best first by the rule of this module.
+    """Return every point that has a usable trial, best first by the rule of this module.
 
     Trials may be in any order and in any status, so that a live view can call this while the sweep runs.
     """
     by_point: defaultdict[int, list[TrialRecord]] = defaultdict(list)
     for trial in trials:
         by_point[trial.point_index].append(trial)
-    # A seed without a record is as little proof as one that failed: all points owe the same number of seeds.
+    # A seed without a record counts like one that failed: all points should have the same number of seeds.
     num_seeds = max((len(members) for members in by_point.values()), default=0)
     points = []
     for point_index, members in by_point.items():
@@ -153,7 +153,7 @@ def _point_order(item: PointScore) -> tuple[bool, float, float, int]:
 
 
 def _why_none(trials: Sequence[TrialRecord]) -> tuple[str, str]:
-    """Message and hint for a sweep without a usable trial."""
+    """Return message and hint for a sweep without a usable trial."""
     if not trials:
         return "No trial is usable: the sweep has no trials yet.", "Launch it, or wait for its first result."
     failed = [trial for trial in trials if trial.status == "failed"]
@@ -178,13 +178,13 @@ def _why_none(trials: Sequence[TrialRecord]) -> tuple[str, str]:
 
 
 def error_summary(error: str | None) -> str:
-    """The one line of a recorded error that names it: its first, or a traceback's exception; shortened."""
+    """Return the line of a recorded error that names it, shortened: its first, or a traceback's exception."""
     lines = [line.rstrip() for line in (error or "").splitlines() if line.strip()]
     if not lines:
         return "no message was recorded"
     line = lines[0]
     if line.startswith("Traceback"):
-        # Frames are indented; the first line that is not names the exception.
+        # Frames are indented; the first line that is not indented names the exception.
         line = next((item for item in lines[1:] if not item[0].isspace()), line)
     line = line.strip()
     return line if len(line) <= _MAX_ERROR_CHARS else line[: _MAX_ERROR_CHARS - 1] + "…"

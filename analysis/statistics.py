@@ -1,11 +1,11 @@
-"""Numbers about few, skewed returns: interquartile mean, bootstrap intervals, paired differences.
+"""Statistics for few, skewed returns: interquartile mean, bootstrap intervals, paired differences.
 
-What is resampled decides what an interval means. Over *seeds*: how another training run of the point would
-do. Over *episodes* of one policy: how that policy would do in other episodes, which says nothing about
-training it again.
+The meaning of an interval depends on what is resampled. An interval over *seeds* says how another training run of the
+point would do. One over *episodes* of one policy says how that policy would do in other episodes, which says nothing
+about training it again.
 
-A percentile bootstrap of fewer than `MIN_SEEDS_FOR_INTERVAL` values is too narrow (of three, its bounds can
-never leave them): callers that show one should say so, by `small_sample_note`.
+A percentile bootstrap of fewer than `MIN_SEEDS_FOR_INTERVAL` values is too narrow: that of three values can never go
+beyond them. Callers that show one should say so, by `small_sample_note`.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Estimate:
 
 
 def iqm(values: Sequence[float] | NDArray[np.float64]) -> float:
-    """Interquartile mean: the mean of the middle half; floor(n / 4) values are cut at each end.
+    """Return the interquartile mean, the mean of the middle half; floor(n / 4) values are cut at each end.
 
-    Of fewer than four values nothing is cut: it is their mean.
+    With fewer than four values nothing is cut: it is their mean.
 
     Raises:
-        ValueError: No value, not 1-D, or a value that is not finite.
+        ValueError: There is no value, the array is not 1-D, or a value is not finite.
 
     Source:
         Agarwal et al. 2021, "Deep RL at the Edge of the Statistical Precipice", section 4.
@@ -53,16 +53,16 @@ def mean_with_ci(
     num_resamples: int = 2_000,
     level: float = 0.95,
 ) -> Estimate:
-    """Mean and percentile bootstrap interval.
+    """Return the mean and its percentile bootstrap interval.
 
     Args:
-        values: What is resampled: scores of seeds or returns of episodes (see the module). Shape (n,).
+        values: The values to resample: scores of seeds or returns of episodes (see the module). Shape (n,).
         rng: Draws the resamples; the same state gives the same interval.
-        num_resamples: Resamples drawn.
+        num_resamples: How many resamples are drawn.
         level: Share of resampled means inside the interval, in (0, 1).
 
     Raises:
-        ValueError: No value, not 1-D, a value that is not finite, or a level outside (0, 1).
+        ValueError: There is no value, the array is not 1-D, a value is not finite, or the level is outside (0, 1).
 
     Source:
         Efron & Tibshirani 1993, "An Introduction to the Bootstrap", chapter 13.
@@ -70,7 +70,7 @@ def mean_with_ci(
     if not 0.0 < level < 1.0:
         raise ValueError(f"level {level} is not in (0, 1)")
     array = _finite_1d(values)
-    # Resamples in blocks, or 2,000 x 100,000 indices would take 1.6 GB.
+    # Resampled in blocks, because 2,000 x 100,000 indices would take 1.6 GB.
     block = max(1, _CHUNK_VALUES // array.size)
     means = np.empty(num_resamples)
     for start in range(0, num_resamples, block):
@@ -90,13 +90,13 @@ def paired_difference(
     num_resamples: int = 2_000,
     level: float = 0.95,
 ) -> Estimate:
-    """Mean of `left - right`, pair by pair, with a bootstrap interval over the pairs.
+    """Return the mean of `left - right`, pair by pair, with a bootstrap interval over the pairs.
 
-    Two policies on the same episode seeds meet the same initial states, which cancel in the difference: the
+    Two policies on the same episode seeds meet the same initial states, whose effect cancels in the difference: the
     interval is narrower than that of two separate means.
 
     Raises:
-        ValueError: Different lengths, or as `mean_with_ci`.
+        ValueError: The lengths differ, or in the same cases as `mean_with_ci`.
     """
     left_array, right_array = _finite_1d(left), _finite_1d(right)
     if left_array.size != right_array.size:
@@ -105,13 +105,13 @@ def paired_difference(
 
 
 def median_steps(steps: Sequence[int | None]) -> float | None:
-    """Median of the env steps that several seeds took to get somewhere.
+    """Return the median of the env steps that several seeds took to reach a goal.
 
     Args:
-        steps: Of each seed; None: it never got there, which counts as later than any number of steps.
+        steps: The env steps of each seed; None: it never reached the goal, which counts as more than any number.
 
     Returns:
-        The median; None if that is "never", as it is where half of the seeds or more never got there.
+        The median; None if half of the seeds or more never reached the goal.
 
     Raises:
         ValueError: There are no seeds.
@@ -123,7 +123,7 @@ def median_steps(steps: Sequence[int | None]) -> float | None:
 
 
 def small_sample_note(num_values: int) -> str:
-    """What a reader must know about an interval over this many seeds; empty if nothing."""
+    """Return a warning about an interval over this many seeds, or an empty string if none is needed."""
     if num_values < 2:
         return "one seed: no interval"
     if num_values < MIN_SEEDS_FOR_INTERVAL:

@@ -1,7 +1,7 @@
-"""Trials and iterations as pandas DataFrames and CSV files.
+"""Tables of trials and iterations, as pandas DataFrames and CSV files.
 
-One row is one trial or one iteration of a trial. Units stand in the column names; returns are undiscounted
-and in reward units. A value that is not known is missing (NaN, an empty CSV cell), never 0.
+One row is one trial or one iteration of a trial. Column names include units; returns are undiscounted and in reward
+units. A value that is not known is missing (NaN, an empty CSV cell), never 0.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _AFTER_POINT = [
 
 
 def cell_value(value: Any) -> Any:
-    """A sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text."""
+    """Return a sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text."""
     if isinstance(value, list | tuple):
         return "x".join(str(item) for item in value)
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def describe_changes(trial: TrialRecord) -> str | None:
-    """What population based training changed, such as "at 4,096 env steps from t0003: lr 0.01"; None: nothing."""
+    """Describe what population based training changed: "at 4,096 env steps from t0003: lr 0.01"; None: nothing."""
     texts = [
         f"at {change.num_env_steps:,} env steps from {change.source_trial_id}: "
         + ", ".join(f"{name} {cell_value(value)}" for name, value in change.after.items())
@@ -57,7 +57,7 @@ def describe_changes(trial: TrialRecord) -> str | None:
 
 
 def point_names(trials: Sequence[TrialRecord]) -> list[str]:
-    """Names of the searched hyperparameters, in the order of the sweep file."""
+    """Return the names of the searched hyperparameters, in the order of the sweep file."""
     return list(dict.fromkeys(name for trial in trials for name in trial.point))
 
 
@@ -66,12 +66,12 @@ def env_steps_to(
     iterations: Sequence[IterationRecord],
     num_episodes: int = SOLVED_OVER_NUM_EPISODES,
 ) -> int | None:
-    """Env steps until the training return first reached a threshold; None if it never did.
+    """Return the env steps until the training return first reached a threshold; None if it never did.
 
     Args:
         threshold: Mean episode return to reach; None: there is nothing to reach.
-        iterations: Of one trial, oldest first.
-        num_episodes: Whole episodes that must stand behind the mean.
+        iterations: The iterations of one trial, oldest first.
+        num_episodes: How many whole episodes the mean must be over.
     """
     if threshold is None:
         return None
@@ -88,14 +88,14 @@ def trials_frame(
     *,
     threshold: float | None = None,
 ) -> pd.DataFrame:
-    """One row a trial, in order of index.
+    """Return a table with one row per trial, in order of index.
 
-    Columns: trial_id, status, one for each searched hyperparameter, seed, score (what the selection goes by;
+    Columns: trial_id, status, one for each searched hyperparameter, seed, score (which the selection compares;
     missing if the trial cannot win), score_num_env_steps (when it was reached), training_return,
     evaluation_return (the newest), num_env_steps_to_solve (see `env_steps_to`; all missing without results
     and a threshold), num_iterations, num_env_steps, num_episodes, time_s, stop_reason, num_failures, error
-    (its first line). Of a population, the searched values are those its score was reached with, and the last column is
-    changes (see `describe_changes`).
+    (its first line). In a population, the searched values are those that the score was reached with, and the last
+    column is changes (see `describe_changes`).
     """
     import pandas as pd
 
@@ -134,7 +134,7 @@ def trials_frame(
 
 
 def iterations_frame(results: Mapping[str, Sequence[IterationRecord]]) -> pd.DataFrame:
-    """One row an iteration: trial_id, its numbers, and `learner/<name>` for each learner metric."""
+    """Return a table with one row per iteration: trial_id, its numbers, and `learner/<name>` for each metric."""
     import pandas as pd
 
     base = ["iteration", "num_env_steps", "num_episodes", "time_s", "training_return", "evaluation_return"]
@@ -161,12 +161,12 @@ def groups_frame(
     *,
     threshold: float | None,
 ) -> pd.DataFrame:
-    """One row for each combination of some searched hyperparameters: which of them solves, and how fast.
+    """Return a table with one row per combination of some searched hyperparameters: which solve, and how fast.
 
     Args:
-        trials: Of one sweep.
+        trials: The trials of one sweep.
         results: Iterations by trial id, oldest first.
-        names: Hyperparameters to group by; the others are what varies within a group.
+        names: Hyperparameters to group by; the others vary within a group.
         threshold: Training return that counts as solved; None: none does.
 
     Returns:
@@ -193,10 +193,10 @@ def steps_to_solve_frame(
     *,
     threshold: float | None,
 ) -> pd.DataFrame:
-    """One row a point: how many env steps it takes to solve the env, seed by seed (see `env_steps_to`).
+    """Return a table with one row per point: its env steps to solve the env, seed by seed (see `env_steps_to`).
 
     Args:
-        trials: Of one sweep.
+        trials: The trials of one sweep.
         results: Iterations by trial id, oldest first.
         threshold: Training return that counts as solved; None: none does.
 
@@ -217,7 +217,7 @@ def steps_to_solve_frame(
     rows = []
     for index, members in sorted(points.items()):
         steps = {trial.seed_index: env_steps_to(threshold, results.get(trial.trial_id, ())) for trial in members}
-        # A seed that still runs may solve it yet.
+        # A seed that still runs may yet solve it.
         known = [steps[t.seed_index] for t in members if t.status in FINISHED or steps[t.seed_index] is not None]
         solved = [value for value in known if value is not None]
         rows.append(
@@ -238,9 +238,9 @@ def steps_to_solve_frame(
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:
-    """Write a frame as CSV (UTF-8, no index), so that no reader sees half of it.
+    """Write a frame atomically as CSV (UTF-8, no index).
 
-    Text that a spreadsheet would run as a formula gets a leading apostrophe: error texts are not ours.
+    Text that a spreadsheet would run as a formula gets a leading apostrophe, because error texts are not trusted.
 
     Raises:
         CannotRunError: The file cannot be written.

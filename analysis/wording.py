@@ -1,4 +1,4 @@
-"""Numbers, times, seeds and paths as text for a reader."""
+"""Format numbers, times, seeds and paths for readers."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any
 from analysis.statistics import Estimate
 
 NONE = "\u2013"
-"""What stands for a value that is not known."""
+"""The text for a value that is not known."""
 PLAIN_NONE = "-"
-"""The same in a terminal, which may not have the other one."""
+"""The same for a terminal, which may not be able to show the other character."""
 
 
 def number(value: Any) -> str:
-    """A cell's text: thousands apart, four significant digits, a dash for what is not known."""
+    """Return a cell's text: separated thousands, four significant digits, a dash if it is not known."""
     if value is None:
         return NONE
     if isinstance(value, bool | str) or not is_number(value):
@@ -29,16 +29,16 @@ def number(value: Any) -> str:
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
-    """A number with what it counts: "1 point", "1,024 points"."""
+    """Return a number with what it counts: "1 point", "1,024 points"."""
     return f"{count:,} {noun if count == 1 else plural or f'{noun}s'}"
 
 
 def duration(seconds: float, *, tenths: bool = True, none: str = NONE) -> str:
-    """Seconds as "8.2 s", "42 s", "1 min 10 s" or "2 h 5 min".
+    """Format seconds as "8.2 s", "42 s", "1 min 10 s" or "2 h 5 min".
 
     Args:
-        seconds: How long.
-        tenths: Whether less than 10 s has them: a clock that runs, or an estimate, is better without.
+        seconds: The duration.
+        tenths: Whether tenths are shown below 10 s: a running clock, or an estimate, is better without them.
         none: The text if it is not finite.
     """
     if not math.isfinite(seconds):
@@ -53,7 +53,7 @@ def duration(seconds: float, *, tenths: bool = True, none: str = NONE) -> str:
 
 
 def moment(unix_time: float | None) -> str:
-    """A Unix time as UTC, to the minute; a dash if it is not known or no time."""
+    """Format a Unix time as UTC, to the minute; a dash if it is not known or not a valid time."""
     if unix_time is None:
         return NONE
     try:
@@ -63,7 +63,7 @@ def moment(unix_time: float | None) -> str:
 
 
 def seed_range(seeds: Sequence[int]) -> str:
-    """Seeds as "10 (4711 to 4720)"; listed where they are not contiguous."""
+    """Format seeds as "10 (4711 to 4720)", or as a list where they are not contiguous."""
     if not seeds:
         return "none"
     if tuple(seeds) == tuple(range(seeds[0], seeds[0] + len(seeds))):
@@ -72,27 +72,27 @@ def seed_range(seeds: Sequence[int]) -> str:
 
 
 def interval_text(estimate: Estimate) -> str:
-    """An interval as "188.1 to 199.9"."""
+    """Format an interval as "188.1 to 199.9"."""
     return f"{return_text(estimate.lower)} to {return_text(estimate.upper)}"
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a real number, NumPy's included; True and False are not."""
+    """Whether a value is a real number, including NumPy's; True and False are not."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def shown_path(path: Path) -> str:
-    """A path as a user would type it: relative where it lies below the current folder."""
+    """Return a path as a user would type it: relative if it is below the current folder."""
     try:
         here = Path.cwd()
-    except FileNotFoundError:  # it was deleted
+    except FileNotFoundError:  # the current folder was deleted
         return str(path)
     absolute = path.absolute()
     return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)
 
 
 def setting_text(value: Any) -> str:
-    """A hyperparameter in a terminal, as a sweep file has it: no thousands apart; 64x64 for lists."""
+    """Return a hyperparameter's text for a terminal, as in a sweep file: no separated thousands; 64x64 for lists."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list | tuple):
@@ -101,17 +101,17 @@ def setting_text(value: Any) -> str:
 
 
 def return_text(value: float | None, *, none: str = NONE) -> str:
-    """A return or a score, with one decimal."""
+    """Format a return or a score, with one decimal."""
     return none if value is None else f"{value:z.1f}"
 
 
 def difference_text(value: float) -> str:
-    """A difference of two returns, with its sign and one decimal; what rounds to zero is "+0.0"."""
+    """Format a difference of two returns, with its sign and one decimal; what rounds to zero is "+0.0"."""
     return f"{value:+z.1f}"
 
 
 def bytes_text(number: float) -> str:
-    """Bytes in powers of 1,000."""
+    """Format bytes in powers of 1,000."""
     for unit in ("B", "kB", "MB", "GB"):
         if number < 1000:
             return f"{number:.0f} {unit}"

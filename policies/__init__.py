@@ -2,6 +2,6 @@
 
 from importlib import import_module
 
-# Which settles that a user's own folder called policies can be imported from as well:
+# Loading tune_jobs lets a user's own folder called policies be imported from as well:
 # see tune_jobs/process/own_packages.py.
 import_module("tune_jobs")

@@ -1,4 +1,4 @@
-"""The activations that networks may have: the one place of their names.
+"""The names of the activations that networks may have; they are defined nowhere else.
 
 | name | after a layer's output x |
 |---|---|
@@ -9,7 +9,7 @@
 | elu | x where x > 0, else e^x - 1 |
 | gelu | x times the normal distribution function of x; not its approximation by tanh |
 
-Each maps 0 to 0, which padded networks rely on. What computes them is looked up by these names: torch's modules in
+Each maps 0 to 0, which padded networks rely on. Implementations are looked up by these names: torch's modules in
 `policies.networks.layers`, RLlib's names in `policies.networks.parts`, NumPy's functions in
 `policies.portable.forward`, and forward and backward passes of packs in `policies.packed.networks`.
 """

@@ -1,7 +1,7 @@
 """The arguments of public functions, checked against their annotations before anything is done with them.
 
-What a caller gave wrong is told at once, by its name, instead of failing somewhere below. NumPy's numbers become
-Python's, and paths of any library pathlib's.
+A wrong argument is reported at once, by its name, instead of causing an error deeper in the code. NumPy's numbers
+become Python's, and paths of other libraries become pathlib's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 
 
 class Range(NamedTuple):
-    """Of a whole number, both ends included; for use in `Annotated`."""
+    """The range of a whole number, both ends included; for use in `Annotated`."""
 
     low: int
     high: int | None = None
@@ -38,16 +38,16 @@ NumEpisodes = Annotated[int, Range(1, 2**18)]
 
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Decorate a function: its arguments are checked against its annotations.
+    """Decorate a function so that its arguments are checked against its annotations.
 
     Raises:
-        SpecError: By the function, when an argument is of a kind that it does not take.
+        SpecError: Raised by the decorated function when an argument has a wrong type.
     """
     signature = inspect.signature(function)
 
     @functools.cache
     def kinds() -> dict[str, Any]:
-        # Without what is returned: that may be named for type checkers alone.
+        # Without the type of the result, which may be imported for type checkers only.
         given = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
         holder = types.SimpleNamespace(__annotations__=given)
         return get_type_hints(holder, globalns=inspect.unwrap(function).__globals__, include_extras=True)
@@ -66,7 +66,7 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _fit(value: Any, kind: Any) -> Any:
-    """The value as the kind, or `_WRONG`."""
+    """Return the value converted to the kind, or `_WRONG` where it does not fit."""
     origin = get_origin(kind)
     if origin in (Union, types.UnionType):
         return _fit_one_of(value, get_args(kind))
@@ -96,7 +96,7 @@ def _fit_range(value: Any, kind: Any, limits: Range) -> Any:
 def _fit_items(value: Any, container: Any, kind: Any) -> Any:
     if _is_numpys("ndarray", value):
         value = value.tolist()
-    # A text is a sequence of its letters, which nobody means.
+    # A string is a sequence of letters too, but nobody means that.
     if isinstance(value, str | bytes | bytearray | Mapping) or not isinstance(value, container):
         return _WRONG
     items = tuple(_fit(item, kind) for item in value)
@@ -115,7 +115,7 @@ def _path(value: Any) -> Any:
 
 
 def _can_be_path(text: str) -> bool:
-    """Whether the system can be asked for a file of that name."""
+    """Whether the operating system accepts this as a path."""
     try:
         data = os.fsencode(text)
     except UnicodeEncodeError:
@@ -133,7 +133,7 @@ def _scalar(value: Any) -> Any:
 
 
 def _is_numpys(kind: str, value: Any) -> bool:
-    """Whether it is of that class of NumPy, which is not loaded for this: the command line has to answer at once."""
+    """Whether a value is of that class of NumPy; NumPy is not imported for it, so that the command line is fast."""
     numpy = sys.modules.get("numpy")
     return numpy is not None and isinstance(value, getattr(numpy, kind))
 
@@ -160,7 +160,7 @@ _NAMES = {
 def _words(kind: Any) -> str:
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
-        # A text beside a path is one, and is looked at as one.
+        # Where a path may be given too, a string is taken for a path.
         named = [_words(part) for part in parts if part is not str or Path not in parts]
         return " or ".join(named)
     if origin is Literal:

@@ -1,8 +1,8 @@
-"""Where child processes begin, so that they find this package and not a user's folder of the same name.
+"""Entry functions for child processes, which make them find this package and not a user's folder of the same name.
 
-A spawned process imports the module of its function first, by a path that a user's own `policies` may come first on;
-`tune_jobs` settles whose that name is (see `tune_jobs/process/own_packages.py`). It is named by text here,
-as all that it may be in this package.
+A spawned process first imports the module of its function, and a user's own `policies` may come first on its path.
+Importing `tune_jobs` decides which of the two the name means (see `tune_jobs/process/own_packages.py`). It is imported
+by its name as a string here, because this package may not import it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _BEGIN = "tune_jobs.process.own_packages:run"
 
 
 class _ByName:
-    """A function that is looked up by its name where it is unpickled."""
+    """A function that is pickled by its name and looked up where it is unpickled."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -29,5 +29,5 @@ class _ByName:
 
 
 def entry(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The target to give a `multiprocessing.Process` of the kind `spawn`, for a function at the top of a module."""
+    """Return the target for a spawned `multiprocessing.Process` that runs a function defined at the top of a module."""
     return functools.partial(_ByName(_BEGIN), f"{function.__module__}:{function.__qualname__}")

@@ -9,7 +9,7 @@ import re
 import traceback
 from typing import Any, ClassVar
 
-# Halves of surrogate pairs, which no file takes, and what moves a terminal's cursor; not the ends of lines, nor tabs.
+# Halves of surrogate pairs, which cannot be written to files, and control characters except newlines and tabs.
 _UNFIT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _MAX_SAID = 2_000
 
@@ -25,7 +25,7 @@ class TuneJobsError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, message: str, hint: str = "") -> None:
-        # It quotes what others wrote, and goes into files and to terminals.
+        # Messages quote texts of others, and are written to files and terminals.
         message, hint = fit(message), fit(hint)
         # Both go to Exception.args, or the error cannot be unpickled when Ray carries it between processes.
         super().__init__(message, hint)
@@ -33,7 +33,7 @@ class TuneJobsError(Exception):
         self.hint = hint
 
     def __str__(self) -> str:
-        """Message and hint, the hint on a line of its own."""
+        """Return the message and the hint, the hint on a line of its own."""
         return f"{self.message}\n{self.hint}" if self.hint else self.message
 
 
@@ -44,7 +44,7 @@ class SpecError(TuneJobsError):
 
 
 class EnvError(SpecError):
-    """An environment is not registered, cannot be made, or does not go with the algorithm."""
+    """An environment is not registered, cannot be made, or does not fit the algorithm."""
 
 
 class EnvFailedError(EnvError):
@@ -52,33 +52,33 @@ class EnvFailedError(EnvError):
 
 
 class TrialsFailedError(TuneJobsError):
-    """The sweep finished but some trials failed."""
+    """The sweep has finished, but some of its trials failed."""
 
     exit_code = 3
 
 
 class NotFoundError(TuneJobsError):
-    """No such sweep, trial, checkpoint or policy file."""
+    """There is no such sweep, trial, checkpoint or policy file."""
 
     exit_code = 4
 
 
 class CheckpointError(NotFoundError):
-    """A checkpoint or policy file is there but incomplete, altered, or of another kind."""
+    """A checkpoint or policy file exists, but it is incomplete, altered, or of another kind."""
 
 
 class CannotRunError(TuneJobsError):
-    """This machine or cluster cannot run it: resources, storage, address."""
+    """This machine or cluster cannot run it, because of its resources, its storage or its address."""
 
     exit_code = 5
 
 
 def fit(text: str, max_length: int | None = None) -> str:
-    """A text such as every file and terminal takes it.
+    """Return a text with all characters escaped that a file or a terminal could not take.
 
     Args:
         text: Any text.
-        max_length: Of what is longer the middle is left out, and said so; None: nothing is.
+        max_length: If the text is longer, its middle is replaced by a note; None: the text is not cut.
     """
     if max_length is not None and len(text) > max_length:
         end = max_length // 4
@@ -88,7 +88,7 @@ def fit(text: str, max_length: int | None = None) -> str:
 
 
 def said_by(error: BaseException) -> str:
-    """What an exception of somebody else's says, without a dot at its end: it may be anything, megabytes too."""
+    """Return the message of any exception, without a full stop at its end; a very long one is cut."""
     try:
         text = str(error)
     except Exception:  # noqa: BLE001 (its own `__str__` fails)
@@ -97,19 +97,19 @@ def said_by(error: BaseException) -> str:
 
 
 def tellable(error: Exception) -> Exception:
-    """The exception, or one that says the same, if its traceback holds what is no text: Ray 2.60 can't carry that."""
+    """Return the exception, or one with its message if its traceback is no valid text, which Ray 2.60 can't send."""
     try:
         "".join(traceback.format_exception(error)).encode()
     except UnicodeEncodeError:
         if isinstance(error, TuneJobsError):
-            # Its words are fit; those of what it was raised for are not.
+            # Its own message is valid text; that of its cause is not.
             return type(error)(error.message, error.hint)
         return TuneJobsError(f"{type(error).__name__}: {said_by(error)}")
     return error
 
 
 def shortened(value: Any) -> str:
-    """A value's repr, at most 80 characters of it."""
+    """Return a value's repr, cut to at most 80 characters."""
     try:
         text = repr(value)
     except Exception:  # noqa: BLE001 - an object of a user's own may raise anything
@@ -120,12 +120,12 @@ def shortened(value: Any) -> str:
 MALFORMED = (
     ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError,
 )  # fmt: skip
-"""What data of another kind than was expected raises; who reads a file turns these into a `CheckpointError`."""
+"""The exceptions that unexpected data raises; code that reads a file turns them into a `CheckpointError`."""
 
 
 class ObservationError(TuneJobsError):
-    """An observation is not of the shape that the policy takes."""
+    """An observation does not have the shape that the policy takes."""
 
 
 class NonFiniteWeightsError(TuneJobsError):
-    """A network holds NaN or infinite weights: its training went wrong, and what it does means nothing."""
+    """A network has NaN or infinite weights: its training failed, and its actions mean nothing."""

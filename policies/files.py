@@ -1,7 +1,7 @@
-"""Files that a reader never sees half of: written under a temporary name, synced, then renamed into place.
+"""Write files atomically, and read only regular files.
 
-And files that others may have put there: who opens a named pipe waits for its other end, perhaps for ever, and a device
-may give bytes without end. What is opened here is a regular file.
+A file is written under a temporary name, synced and renamed into place, so that a reader never sees half of it. When
+files are read, named pipes and devices are refused: opening a pipe may wait for ever, and a device may never end.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from pathlib import Path
 
 from policies.errors import CannotRunError
 
-# Of a temporary name: where its process ran (not told until 0.9), its id, and chance.
+# The parts of a temporary name: where its process ran (missing until 0.9), the process id, and random characters.
 _WRITER = re.compile(r"\.((?P<place>[0-9a-f]{8})-)?(?P<pid>[0-9]+)-[0-9a-f]{8}(\.\w+)?")
-# What cannot be seen from here, as it is another machine's, is nobody's after so long.
+# Seconds after which a temporary file of another machine counts as abandoned; its process cannot be looked up here.
 _ABANDONED_AFTER_S = 24 * 3600.0
 _OTHER_KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"}
 MAX_RECORD_BYTES = 64 * 2**20
-"""Of a file that is one record: far more than any has."""
+"""The most bytes that a file with one record may have; real ones are far smaller."""
 
 
 class RefusedFileError(OSError):
-    """It is no file, or far too large; it stays so, where other errors of reading may pass."""
+    """A path is not a regular file, or far too large; unlike other errors of reading, this one is permanent."""
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a file to read, without waiting for anybody.
+    """Open a file to read; never wait for another process.
 
     Raises:
-        OSError: It cannot be opened, or is no file but a folder, a named pipe, a socket or a device.
+        OSError: It cannot be opened, or it is a folder, a named pipe, a socket or a device.
     """
     return open(path, "rb", opener=_open_at_once)
 
@@ -48,7 +48,7 @@ def open_to_append(path: Path) -> BufferedWriter:
     """Open a log or another file that grows; missing parent folders are made.
 
     Raises:
-        CannotRunError: It cannot be written, or is no file.
+        CannotRunError: It cannot be written, or is not a regular file.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,14 +58,14 @@ def open_to_append(path: Path) -> BufferedWriter:
 
 
 def read_regular(path: Path, max_bytes: int | None = MAX_RECORD_BYTES) -> bytes:
-    """The content of a file.
+    """Read a file.
 
     Args:
         path: The file.
-        max_bytes: A larger one is not read; None: there is no bound.
+        max_bytes: A larger file is refused; None: there is no bound.
 
     Raises:
-        OSError: It cannot be read, is larger, or is no file.
+        OSError: It cannot be read, is larger, or is not a regular file.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -77,14 +77,14 @@ def read_regular(path: Path, max_bytes: int | None = MAX_RECORD_BYTES) -> bytes:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    # Asked first, as opening a device may do something; and again, as there may be another one by then.
+    # Checked before, because opening a device may have effects; and after, because the path may have been replaced.
     with contextlib.suppress(FileNotFoundError):
         refuse_others(os.stat(path), path)  # noqa: PTH116 (as `open` gives it)
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
     try:
         refuse_others(os.fstat(descriptor), path)
         if hasattr(os, "O_NONBLOCK"):
-            # It stays with the file, and so with the processes that it is passed on to.
+            # The flag would stay with the open file, also in the processes that it is passed on to.
             os.set_blocking(descriptor, True)
     except OSError:
         os.close(descriptor)
@@ -93,10 +93,10 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def refuse_others(found: os.stat_result, path: str | Path) -> None:
-    """Raise unless it is a regular file.
+    """Raise an error unless a path is a regular file.
 
     Raises:
-        RefusedFileError: It is not; the text says what it is.
+        RefusedFileError: It is something else; the message says what.
     """
     if not stat.S_ISREG(found.st_mode):
         kind = _OTHER_KINDS.get(stat.S_IFMT(found.st_mode), "device")
@@ -104,10 +104,10 @@ def refuse_others(found: os.stat_result, path: str | Path) -> None:
 
 
 def absolute(path: Path) -> Path:
-    """A path from the root.
+    """Return a path as an absolute one.
 
     Raises:
-        CannotRunError: It is relative, and the working directory was deleted.
+        CannotRunError: The path is relative, and the working directory was deleted.
     """
     try:
         return path.absolute()
@@ -133,7 +133,7 @@ def write_atomic(path: Path, data: bytes | str) -> None:
 
 
 def write_plain(path: Path, data: bytes | str) -> None:
-    """Write a file into a folder that nobody looks into yet; who shows the folder syncs what is in it.
+    """Write a file into a folder that is not visible to readers yet; its files are synced before it becomes visible.
 
     Args:
         path: File to write; missing parent folders are made.
@@ -151,9 +151,9 @@ def write_plain(path: Path, data: bytes | str) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` that becomes `path` when the block ends without an error.
+    """Yield a temporary path beside `path` that is renamed to `path` when the block ends without an error.
 
-    It is for writers that want a file name (video encoders). The temporary name keeps the suffix of `path`.
+    It is for writers that take a file name, such as video encoders. The temporary name keeps the suffix of `path`.
     If the block raises, the temporary file is removed and `path` is left as it was.
 
     Raises:
@@ -178,7 +178,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def is_abandoned(path: Path) -> bool:
-    """Whether this is a temporary file of `atomic_path` whose writer is gone: killed, before it could remove it."""
+    """Whether this is a temporary file of `atomic_path` whose process was killed before it could remove the file."""
     found = _WRITER.search(path.name) if path.name.startswith(".") else None
     if found is None or found.end() != len(path.name) or path.is_symlink() or not path.is_file():
         return False
@@ -192,7 +192,7 @@ def is_abandoned(path: Path) -> bool:
 
 @functools.cache
 def _this_place() -> str:
-    """Eight digits for where process ids mean something: this run of this machine, in this container."""
+    """Return eight digits for the scope of process ids: this boot of this machine, in this container."""
     known = []
     with contextlib.suppress(OSError):
         known.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
@@ -207,7 +207,7 @@ def _is_alive(pid: int) -> bool:
         return False
     except OSError:
         return True
-    # Its parent has not asked how it ended; it writes no more.
+    # A zombie: it has ended, though its parent has not asked for its exit status, and writes no more.
     with contextlib.suppress(OSError, IndexError):
         known = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
         return known.rpartition(")")[2].split()[0] != "Z"
@@ -222,7 +222,7 @@ def _cannot_write(path: Path, error: OSError) -> CannotRunError:
 
 
 def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's content, as 64 lower-case hexadecimal digits."""
+    """Return the SHA-256 of a file's content as 64 lower-case hexadecimal digits."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -231,8 +231,8 @@ def sync(path: Path) -> None:
     """Wait until a file's content, or the names in a folder, are on disk.
 
     Raises:
-        OSError: The file cannot be opened or synced; of a folder nothing is told, as Windows and some network file
-            systems cannot do it.
+        OSError: The file cannot be opened or synced. Errors for a folder are ignored, as Windows and some network file
+            systems cannot sync folders.
     """
     with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
         # Windows refuses to sync a file that is open for reading only; others may refuse to open it for writing.

@@ -24,12 +24,12 @@ PositiveInt = Annotated[int, Field(ge=1)]
 
 
 def as_sizes(value: Any) -> Any:
-    """A number alone as the list of one that it stands for."""
+    """Turn a single number into the list of one number that it stands for."""
     return (value,) if _is_number(value) else value
 
 
 def _as_action(value: Any) -> Any:
-    """An action as one type or the other, so that a wrong one is told once."""
+    """Return an action as a number or as a list, so that pydantic reports a wrong one only once."""
     if _is_number(value):
         return int(value) if float(value).is_integer() else (float(value),)
     if isinstance(value, list | tuple) and value and all(map(_is_number, value)):
@@ -47,7 +47,7 @@ _SIZE = {"type": "integer", "minimum": 1}
 _SIZES = {"anyOf": [_SIZE, {"type": "array", "items": _SIZE, "minItems": 1}]}
 _ACTION = {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}, "minItems": 1}]}
 Sizes = Annotated[tuple[PositiveInt, ...], BeforeValidator(as_sizes), WithJsonSchema(_SIZES)]
-"""Whole numbers; one alone stands for a list of one."""
+"""A list of whole numbers; a single number stands for a list of one."""
 
 
 class _Frozen(BaseModel):
@@ -55,12 +55,12 @@ class _Frozen(BaseModel):
 
 
 class _Hyperparams(_Frozen):
-    """What PPO and DQN share."""
+    """The hyperparameters that PPO and DQN share."""
 
     hidden_sizes: Sizes = Field(
         (64, 64),
         min_length=1,
-        description="Units of each hidden layer, from input to output; a number alone: of the only one.",
+        description="Units of each hidden layer, from input to output; a single number stands for one layer.",
     )
     activation: Activation = Field("tanh", description="Activation after each hidden layer.")
     initializer: Initializer = Field(
@@ -71,7 +71,7 @@ class _Hyperparams(_Frozen):
     conv_filters: tuple[tuple[PositiveInt, PositiveInt, PositiveInt], ...] | None = Field(
         None,
         min_length=1,
-        description="Convolutions before the hidden layers, for image observations: [channels, kernel, stride] each.",
+        description="Convolutions before the hidden layers, for images; each is [channels, kernel, stride].",
     )
     normalize_observations: bool = Field(
         False, description="Shift and scale observations by their running mean and deviation in training."
@@ -81,7 +81,7 @@ class _Hyperparams(_Frozen):
         None, description="Move lr linearly to this over lr_decay_steps; null: lr stays."
     )
     lr_decay_steps: PositiveInt | None = Field(None, description="Env steps from lr to lr_final.")
-    gamma: Fraction = Field(0.99, description="Discount a step, in [0, 1].")
+    gamma: Fraction = Field(0.99, description="Discount factor per env step, in [0, 1].")
     grad_clip: PositiveFloat | None = Field(
         None, description="Clip the gradient's global L2 norm at this; null: no clipping."
     )
@@ -115,8 +115,8 @@ class PPOHyperparams(_Hyperparams):
     use_kl_loss: bool = Field(False, description="Add RLlib's adaptive KL penalty to the loss.")
     kl_coeff: NonNegativeFloat = Field(0.2, description="First weight of the KL penalty, if used.")
     kl_target: PositiveFloat = Field(0.01, description="KL divergence the penalty aims at, if used.")
-    train_batch_size: PositiveInt = Field(1024, description="Env steps an iteration, over all env runners.")
-    minibatch_size: PositiveInt = Field(256, description="Env steps a gradient step; at most train_batch_size.")
+    train_batch_size: PositiveInt = Field(1024, description="Env steps per iteration, over all env runners.")
+    minibatch_size: PositiveInt = Field(256, description="Env steps per gradient step; at most train_batch_size.")
     num_epochs: PositiveInt = Field(6, description="Passes over each train batch.")
 
     @model_validator(mode="after")
@@ -141,8 +141,8 @@ class DQNHyperparams(_Hyperparams):
     activation: Activation = Field("relu", description="Activation after each hidden layer.")
     lr: PositiveFloat = Field(5e-4, description="The optimizer's learning rate, > 0.")
     num_envs: PositiveInt = Field(1, le=512, description="Sub-environments that one env runner steps at once.")
-    train_batch_size: PositiveInt = Field(32, description="Transitions an update.")
-    env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps an iteration, at least.")
+    train_batch_size: PositiveInt = Field(32, description="Transitions per update.")
+    env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps per iteration, at least.")
     train_freq: PositiveInt = Field(4, description="Env steps sampled between two training phases, at least num_envs.")
     updates_per_env_step: PositiveFloat = Field(
         0.25, description="Updates for each env step sampled (training intensity); may be a fraction."
@@ -228,14 +228,14 @@ class DQNHyperparams(_Hyperparams):
 
 
 class RandomHyperparams(_Frozen):
-    """Of the baseline that draws its actions uniformly."""
+    """Hyperparameters of the baseline that draws its actions uniformly."""
 
     num_envs: PositiveInt = Field(1, le=512, description="Sub-environments stepped at once.")
-    env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps an iteration, at least.")
+    env_steps_per_iteration: PositiveInt = Field(1000, description="Env steps per iteration, at least.")
 
 
 class ConstantHyperparams(RandomHyperparams):
-    """Of the baseline that repeats one action."""
+    """Hyperparameters of the baseline that repeats one action."""
 
     action: Annotated[int | tuple[float, ...], BeforeValidator(_as_action), WithJsonSchema(_ACTION)] = Field(
         0, description="The action: a number, or a list for continuous actions."
@@ -256,13 +256,13 @@ HYPERPARAMS_BY_ALGORITHM: dict[str, type[Hyperparams]] = {
     "random": RandomHyperparams,
     "constant": ConstantHyperparams,
 }
-"""Of every algorithm, baselines last."""
+"""The hyperparameter class of every algorithm, baselines last."""
 
 
 def make_hyperparams(algorithm: Algorithm, values: dict[str, Any]) -> Hyperparams:
     """Validate values as the hyperparameters of an algorithm.
 
     Raises:
-        pydantic.ValidationError: A name is unknown or a value is of the wrong type or out of range.
+        pydantic.ValidationError: A name is unknown, or a value has the wrong type or is out of range.
     """
     return HYPERPARAMS_BY_ALGORITHM[algorithm].model_validate(values)

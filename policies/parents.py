@@ -1,7 +1,7 @@
-"""Processes that end with the one that started them, however that one ends.
+"""Let processes end with their parent, however the parent ends.
 
-A thread looks at the parent, and the kernel sends a signal where it can (Linux): a process that is inside an
-environment's C code, which lets no thread run, ends too.
+A thread watches the parent, and on Linux the kernel sends a signal too, so that a process ends even inside an
+environment's C code, which lets no other thread run.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ def end_with_parent(
 ) -> None:
     """End this process within a second after its parent, or once one of the conditions holds.
 
-    It ends at once and unconditionally, as by SIGKILL: who outlives what it works for must not clean up after others.
+    It ends at once and unconditionally, as by SIGKILL, because a process that outlives its parent must not clean up
+    what others may use by then.
 
     Args:
-        also: Further reasons to end, asked twice a second in a thread; one that raises is no reason.
+        also: More conditions, asked twice a second in a thread; one that raises an error counts as not met.
         parent: The parent's process id, where it was known before this process could look; None: it is looked up.
-        by_kernel: Whether the kernel may watch too. It watches the very thread of the parent that started this process:
-            not where that may end before its process does.
+        by_kernel: Whether the kernel may watch too. It watches the thread of the parent that started this process, so
+            this must be False where that thread may end before the parent does.
     """
     expected = os.getppid() if parent is None else parent
     if by_kernel and sys.platform == "linux":
@@ -43,7 +44,7 @@ def _watch(reasons: list[Callable[[], bool]]) -> None:
     never = threading.Event()
     while True:
         for reason in reasons:
-            # What can't be asked now may be asked in a moment.
+            # It is asked again in a moment.
             with contextlib.suppress(Exception):
                 if reason():
                     os._exit(1)
@@ -51,7 +52,7 @@ def _watch(reasons: list[Callable[[], bool]]) -> None:
 
 
 def this_process() -> str:
-    """This process, as `is_gone` knows it again; empty where the system does not tell (no Linux)."""
+    """Return an identifier of this process for `is_gone`; it is empty on systems other than Linux."""
     try:
         return f"{_here()} {os.getpid()} {_started(os.getpid())}"
     except OSError:
@@ -59,10 +60,10 @@ def this_process() -> str:
 
 
 def is_gone(process: str) -> bool:
-    """Whether a process has ended; False for one that cannot be seen from here: of another machine or container.
+    """Whether a process has ended; False for one of another machine or container, which cannot be seen from here.
 
     Args:
-        process: What `this_process` gave there.
+        process: What `this_process` returned in that process.
     """
     try:
         if not process.startswith(_here() + " "):
@@ -77,13 +78,13 @@ def is_gone(process: str) -> bool:
 
 
 def _here() -> str:
-    """This boot of this machine, and in it what sees the same process ids."""
+    """Return an identifier of this boot of this machine and of the namespace of process ids."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
 
 
 def _started(pid: int) -> str:
-    """When a process started, in ticks since the boot; one that has ended and is not waited for has not."""
-    # After the name, which is in parentheses and may hold anything.
+    """Return when a process started, in ticks since the boot; empty for a zombie, which has ended already."""
+    # The fields after the process's name, which is in parentheses and may contain anything.
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     return "" if fields[0] in "ZX" else fields[19]

@@ -1,6 +1,6 @@
-"""Every stream of random numbers is derived here, so that no two are the same by mistake.
+"""Derive every stream of random numbers, all in this module, so that no two are the same by mistake.
 
-From the seed of a sweep, by `spawn_key` of `numpy.random.SeedSequence`:
+Streams derived from the seed of a sweep, by `spawn_key` of `numpy.random.SeedSequence`:
 
 | spawn key | stream |
 |---|---|
@@ -8,11 +8,11 @@ From the seed of a sweep, by `spawn_key` of `numpy.random.SeedSequence`:
 | (1, trial) | where the block of a trial's training seeds begins |
 | (2,) | where the evaluation seeds begin |
 | (3,) | where the confirmation seeds begin |
-| (4, trial, change) | population based training: what a trial's change number `change` makes of its values |
+| (4, trial, change) | population based training: how a trial's change number `change` changes its values |
 | (5, point) | search method tpe: its sampler |
 
-From the seed of a trial, which is entropy together with further numbers. A trial that goes on from iteration i > 0 does
-so with other numbers than it began with, as only packs save the state of theirs:
+Streams derived from the seed of a trial, which is the entropy together with further numbers. A trial that is continued
+from iteration i > 0 uses new numbers, because only packs save the state of their generators:
 
 | entropy | stream |
 |---|---|
@@ -22,7 +22,7 @@ so with other numbers than it began with, as only packs save the state of theirs
 | [seed, i, 1] | packs: environments |
 
 Random policies in evaluations draw from [the episode's seed]. Resampling in reports, and trial steps of environments
-that are measured, begin at a fixed seed. What an environment does with its seed is Gymnasium's matter.
+that are measured, use a fixed seed. An environment's use of its seed is up to Gymnasium.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from collections.abc import Sequence
 import numpy as np
 
 _POINT, _TRAINING, _EVALUATION, _CONFIRMATION, _MUTATION, _TPE = range(6)
-"""First elements of spawn keys: whoever needs a new stream takes the next number and adds a row above."""
+"""The first elements of spawn keys: for a new stream, take the next number and add a row to the table above."""
 
 
 def _spawned(sweep_seed: int, *spawn_key: int) -> np.random.SeedSequence:
@@ -44,12 +44,12 @@ def _words(entropy: int | Sequence[int], num_words: int) -> list[int]:
 
 
 def seeded(seed: int) -> np.random.Generator:
-    """The generator of a seed itself."""
+    """Return the generator of a seed itself."""
     return np.random.default_rng(seed)
 
 
 def fixed() -> np.random.Generator:
-    """The same numbers each time, for what belongs to no sweep or must not differ between two looks at one."""
+    """Return a generator with a fixed seed, for numbers that must be the same each time or belong to no sweep."""
     return seeded(0)
 
 
@@ -57,32 +57,32 @@ def fixed() -> np.random.Generator:
 
 
 def point_values(sweep_seed: int, point_index: int) -> np.random.Generator:
-    """Draws the values of a point."""
+    """Return the generator that draws the values of a point."""
     return np.random.default_rng(_spawned(sweep_seed, _POINT, point_index))
 
 
 def training_block(sweep_seed: int, trial_index: int) -> np.random.Generator:
-    """Draws which block of training seeds is a trial's."""
+    """Return the generator that draws a trial's block of training seeds."""
     return np.random.default_rng(_spawned(sweep_seed, _TRAINING, trial_index))
 
 
 def evaluation_start(sweep_seed: int) -> np.random.Generator:
-    """Draws the first evaluation seed."""
+    """Return the generator that draws the first evaluation seed."""
     return np.random.default_rng(_spawned(sweep_seed, _EVALUATION))
 
 
 def confirmation_start(sweep_seed: int) -> np.random.Generator:
-    """Draws the first confirmation seed."""
+    """Return the generator that draws the first confirmation seed."""
     return np.random.default_rng(_spawned(sweep_seed, _CONFIRMATION))
 
 
 def mutation(sweep_seed: int, trial_index: int, num_changes: int) -> np.random.Generator:
-    """Draws what population based training makes of a trial's values next: the same in every run of a sweep."""
+    """Return the generator by which population based training changes a trial's values; the same in every run."""
     return np.random.default_rng(_spawned(sweep_seed, _MUTATION, trial_index, num_changes))
 
 
 def tpe_seed(sweep_seed: int, point_index: int) -> int:
-    """Seed of the sampler that proposes a point."""
+    """Return the seed of the sampler that proposes a point."""
     return int(_spawned(sweep_seed, _TPE, point_index).generate_state(1)[0])
 
 
@@ -90,21 +90,21 @@ def tpe_seed(sweep_seed: int, point_index: int) -> int:
 
 
 def member_draws(trial_seed: int) -> np.random.Generator:
-    """What a new member of a pack draws from."""
+    """Return the generator of a new member of a pack."""
     return np.random.default_rng(np.random.SeedSequence([trial_seed, 0]))
 
 
 def seeds_after(trial_seed: int, iteration: int) -> tuple[int, int]:
-    """Two seeds for a trial that goes on after an iteration: its own, and its environments'.
+    """Return two seeds for a trial that continues after an iteration: its own and that of its environments.
 
-    Where one does for both, it is the first.
+    Where one seed is used for both, it is the first.
     """
     first, second = _words([trial_seed, iteration], 2)
     return first, second
 
 
 def member_env_seed_after(trial_seed: int, iteration: int) -> int:
-    """Seed of the environments of a pack's member that goes on after an iteration: they begin new episodes."""
+    """Return the seed of the environments of a pack's member that continues after an iteration, with new episodes."""
     return _words([trial_seed, iteration, 1], 1)[0]
 
 
@@ -112,9 +112,9 @@ def member_env_seed_after(trial_seed: int, iteration: int) -> int:
 
 
 def random_actions_seed(episode_seed: int) -> int:
-    """Seed of a random policy's actions in an episode.
+    """Return the seed of a random policy's actions in an episode.
 
-    Gymnasium seeds an env's generator with the episode's very seed: actions drawn from that would be drawn from the
-    numbers that the env's start states and noise come from.
+    Gymnasium seeds an env's generator with the episode's seed itself. Actions drawn with the same seed would be drawn
+    from the same numbers as the env's start states and noise.
     """
     return int(np.random.SeedSequence(episode_seed).generate_state(1, np.uint64)[0])

@@ -1,7 +1,7 @@
-"""Replay memories of arrays, for DQN: uniform, prioritized, or none at all.
+"""Replay memories for DQN, held in arrays: uniform, prioritized, or none at all.
 
 Words: a *transition* is (observation, action, reward, next observation, discount); its reward is the discounted sum of
-the rewards of n steps, and its *discount* is what the value of the next observation counts: gamma^n, or 0 where the
+the rewards of n steps, and its *discount* is the factor of the next observation's value: gamma^n, or 0 where the
 episode terminated. A truncated episode is bootstrapped. Array shapes: T vector steps, N sub-environments, B rows.
 """
 
@@ -27,7 +27,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """Rows of equal length; the first axis is (B,) or, of several batches at once, (batches, B)."""
+    """Columns of transitions, shape (B, ...) or, for several batches at once, (batches, B, ...)."""
 
     obs: NDArray[Any]
     actions: NDArray[np.int64]
@@ -37,18 +37,18 @@ class Transitions:
     weights: NDArray[np.float32] | None = None
     """Importance weights; None: all 1."""
     indices: NDArray[np.int64] | None = None
-    """Where prioritized rows lie, to set their priorities."""
+    """The indices of prioritized rows, by which their priorities are set."""
 
 
 class NStep:
-    """Turns steps of N streams into n-step transitions, over fragment boundaries.
+    """Turns steps of N sub-environments into n-step transitions, across the ends of fragments.
 
-    The last steps of an episode have fewer rewards, and say so in their discount.
+    The last steps of an episode have fewer rewards, and their discount is larger accordingly.
 
     Args:
-        num_envs: N.
+        num_envs: The number of sub-environments, N.
         n_step: Steps of reward before bootstrapping.
-        gamma: Discount a step.
+        gamma: Discount factor per step.
     """
 
     def __init__(self, num_envs: int, n_step: int, gamma: float) -> None:
@@ -56,15 +56,15 @@ class NStep:
         self._pending: list[deque[list[Any]]] = [deque() for _ in range(num_envs)]
 
     def forget(self) -> None:
-        """The streams begin anew: what waits for further rewards will not get them."""
+        """Drop the transitions that wait for rewards, because the episodes begin anew."""
         for pending in self._pending:
             pending.clear()
 
     def transitions(self, columns: Columns) -> Transitions:
-        """Those that are complete after these steps, oldest first; there may be none.
+        """Return the transitions that are complete after these steps, oldest first; there may be none.
 
         Args:
-            columns: T steps of N sub-environments: obs of shape (T + 1, N, ...), the others (T, N).
+            columns: T steps of N sub-environments: obs has the shape (T + 1, N, ...), the others have (T, N).
         """
         if self._n_step == 1:
             mask = columns["stepped"]
@@ -101,10 +101,10 @@ class NStep:
 
 
 class ReplayBuffer:
-    """A ring of transitions, drawn from uniformly and with replacement.
+    """A ring of transitions, from which batches are drawn uniformly and with replacement.
 
     Args:
-        capacity: Transitions it holds; the oldest go first.
+        capacity: The most transitions it holds; the oldest are dropped first.
         rng: Draws the batches.
     """
 
@@ -116,14 +116,14 @@ class ReplayBuffer:
         self._size = 0
 
     def __len__(self) -> int:
-        """Transitions in it."""
+        """Return the number of transitions."""
         return self._size
 
     def add(self, transitions: Transitions) -> NDArray[np.int64]:
-        """Append transitions, shape (B, ...); of more than fit, the newest stay.
+        """Append transitions, shape (B, ...); if more are given than fit, the newest stay.
 
         Returns:
-            Where they lie now.
+            The indices at which they were stored.
         """
         rows = {name: getattr(transitions, name) for name in ("obs", "actions", "rewards", "next_obs", "discounts")}
         if not self._columns:
@@ -143,7 +143,7 @@ class ReplayBuffer:
         if not self._size or not num_batches:
             return
         row_bytes = 2 * self._columns["obs"][0].nbytes + 24
-        # Gathered many at once: one fancy index a batch costs more than the rows of a small batch.
+        # Many batches are gathered at once, because indexing costs more than copying the rows of a small batch.
         at_once = max(1, min(num_batches, _MAX_GATHER_BYTES // (row_bytes * batch_size)))
         for first in range(0, num_batches, at_once):
             shape = (min(at_once, num_batches - first), batch_size)
@@ -153,14 +153,14 @@ class ReplayBuffer:
                 yield Transitions(**{name: values[number] for name, values in drawn.items()})
 
     def set_priorities(self, indices: NDArray[np.int64], td_errors: NDArray[np.float32]) -> None:
-        """Nothing: all rows are alike."""
+        """Do nothing, because all rows are equally likely."""
 
 
 class LastTransitions(ReplayBuffer):
-    """No replay: every batch is the newest transitions, in order."""
+    """A memory without replay: every batch is the newest transitions, in order."""
 
     def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
-        """The newest transitions, each time; fewer than asked for while there are fewer."""
+        """Yield the newest transitions each time; fewer than asked for while there are fewer."""
         if not self._size:
             return
         batch_size = min(batch_size, self._size)
@@ -170,13 +170,13 @@ class LastTransitions(ReplayBuffer):
 
 
 class PrioritizedReplayBuffer(ReplayBuffer):
-    """Drawn from in proportion to |TD error|^alpha.
+    """A ring of transitions, from which batches are drawn in proportion to |TD error|^alpha.
 
     Source: Schaul et al. 2016, "Prioritized Experience Replay", section 3.3 (proportional variant).
 
     Args:
-        capacity: As `ReplayBuffer`.
-        rng: As `ReplayBuffer`.
+        capacity: The most transitions it holds; the oldest are dropped first.
+        rng: Draws the batches.
         alpha: Exponent of the priorities.
         beta: Exponent of the importance weights, which are divided by the batch's largest.
     """
@@ -189,13 +189,13 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         self._highest = 1.0
 
     def add(self, transitions: Transitions) -> NDArray[np.int64]:
-        """As `ReplayBuffer.add`; new rows get the highest priority so far, so that each is soon seen."""
+        """Append transitions; they get the highest priority so far, so that each is soon drawn."""
         where = super().add(transitions)
         self._priorities.set(where, np.full(len(where), self._highest))
         return where
 
     def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
-        """Draw batches; the priorities set between two of them act on the next."""
+        """Draw batches; priorities that are set between two of them affect the next."""
         if not self._size:
             return
         root = np.zeros(batch_size, dtype=np.int64)
@@ -218,7 +218,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
 
 def make_replay(hyperparams: DQNHyperparams, seed: int) -> ReplayBuffer:
-    """The replay memory that the hyperparameters name."""
+    """Return the replay memory that the hyperparameters name."""
     rng = random_streams.seeded(seed)
     if hyperparams.replay == "none":
         return LastTransitions(hyperparams.train_batch_size, rng)

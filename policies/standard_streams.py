@@ -1,6 +1,6 @@
-"""Standard input, output and error of a process that was started without them, as daemons and some shells do.
+"""Open standard input, output and error in a process that was started without them, by a daemon for example.
 
-Whatever such a process opens next gets their numbers, and what is printed goes into it.
+Otherwise the next files that such a process opens get their descriptors, and what is printed goes into those files.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ _STREAMS = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
 
 @contextlib.contextmanager
 def standard_streams() -> Iterator[None]:
-    """Let those that are closed lead nowhere in the block; child processes inherit them."""
+    """Redirect the closed streams to nowhere in the block, also for child processes."""
     with contextlib.ExitStack() as stack:
         for number, (name, mode) in enumerate(_STREAMS):
             if not _is_open(number):
-                # The lowest number that is free is this one.
+                # A new descriptor gets the lowest free number, which is this one.
                 opened = os.open(os.devnull, os.O_RDWR)
                 stack.callback(_close, opened)
                 os.set_inheritable(opened, True)  # noqa: FBT003 (takes no keyword)

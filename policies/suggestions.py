@@ -1,4 +1,4 @@
-"""The name that was probably meant."""
+"""Suggest the name that was probably meant."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Iterable
 
 
 def did_you_mean(name: object, known: Iterable[str], *, at_most: int = 1, cutoff: float = 0.6) -> str:
-    """' Did you mean ...?' with the nearest of the known names, or nothing. Small and capital letters are the same.
+    """Return ' Did you mean ...?' with the nearest of the known names, or nothing. Case does not matter.
 
     Args:
-        name: What was given; it may be no text at all.
-        known: The names that there are.
-        at_most: How many of the nearest are named.
+        name: What was given; it need not be a string.
+        known: The names that exist.
+        at_most: The most names that are suggested.
         cutoff: How near a name has to be, from 0 (any is) to 1 (the same).
     """
     wanted, names = str(name).lower(), {other.lower(): other for other in known}

@@ -1,4 +1,4 @@
-"""What pydantic finds wrong with values, in plain words: it is not quoted."""
+"""Explain in plain words what pydantic finds wrong with values, in place of pydantic's own messages."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from policies.errors import shortened
 from policies.suggestions import did_you_mean
 
 Detail = Mapping[str, Any]
-"""One thing that pydantic found: type, loc, input, ctx."""
+"""One error that pydantic found, with the keys type, loc, input and ctx."""
 
 
-# By the type of pydantic's error; in braces what its context holds.
+# What is wanted, by the type of pydantic's error; names in braces come from the error's context.
 _WANTED = {
     "bool_type": "true or false",
     "bool_parsing": "true or false",
@@ -42,10 +42,10 @@ _WANTED = {
 
 
 def details_of(error: ValidationError) -> list[Detail]:
-    """Everything that pydantic found, each thing once."""
+    """Return the errors that pydantic found, each of them once."""
     details: list[Detail] = list(error.errors(include_url=False))
     places = [detail["loc"] for detail in details]
-    # It misses the wrong values of a list among its values, and calls it too short for that.
+    # pydantic also calls a list too short if some of its values are wrong; only the wrong values are reported.
     return [
         detail
         for detail in details
@@ -55,7 +55,7 @@ def details_of(error: ValidationError) -> list[Detail]:
 
 
 def explain(detail: Detail) -> str:
-    """What is wrong with one value, and what it should be."""
+    """Return what is wrong with one value, and what it should be."""
     kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "value_error":
         return str(context["error"])
@@ -69,7 +69,7 @@ def explain(detail: Detail) -> str:
         return text
     text += f": it should be {wanted.format(**context)}"
     if kind == "literal_error" and isinstance(value, str):
-        # The words that are allowed stand in quotes.
+        # pydantic's context has the allowed words in quotes.
         text += "." + did_you_mean(value, context["expected"].split("'")[1::2])
     return text
 
@@ -82,6 +82,6 @@ def _of_wrong_length(kind: str, value: Any, context: Mapping[str, Any]) -> str:
 
 
 def dotted(location: Iterable[int | str], *, root: bool = True) -> str:
-    """A location in the sweep file as people write it: ('space', 'lr', 'grid', 0) is space.lr.grid[0]."""
+    """Return a location in the sweep file as people write it: ('space', 'lr', 'grid', 0) is space.lr.grid[0]."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     return text.removeprefix(".") if root else text

@@ -1,1 +1,1 @@
-"""Policies that act: loaded from files, or baselines; played, evaluated and filmed."""
+"""Policies that act: load them from files, make baselines, and play, evaluate and film their episodes."""

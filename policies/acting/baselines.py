@@ -1,4 +1,4 @@
-"""The baselines: policies that observe nothing and learn nothing, for trained ones to be held against.
+"""The baselines: policies that ignore observations and learn nothing, to compare trained policies with.
 
 `random` draws its actions uniformly (`policies.acting.policy.RandomPolicy`), `constant` repeats one. Both can be
 evaluated, filmed, put into a portable policy file and read back like a trained policy.
@@ -24,17 +24,17 @@ BASELINES: tuple[str, ...] = ("random", "constant")
 
 
 class ConstantPolicy(Policy):
-    """The same action, whatever is observed.
+    """A policy that repeats one action, whatever it observes.
 
     Args:
-        observation_space: Of the env; only the shape matters.
-        action_space: What the action is one of.
+        observation_space: The env's; only its shape matters.
+        action_space: The space that holds the action.
         action: An int (Discrete), or one number for each component (Box).
         env_id: The environment it is for.
         env_args: The arguments of that environment.
 
     Raises:
-        SpecError: The action is none of the action space.
+        SpecError: The action is not in the action space.
     """
 
     def __init__(
@@ -60,11 +60,11 @@ class ConstantPolicy(Policy):
     def for_env(
         cls, env_id: str, env_args: Mapping[str, Any] | None, action: int | tuple[float, ...]
     ) -> ConstantPolicy:
-        """A policy that repeats one action of an environment.
+        """Return a policy that repeats one action of an environment.
 
         Raises:
             EnvError: The environment cannot be made, or its spaces are not supported.
-            SpecError: The action is none of its actions.
+            SpecError: The action is not in its action space.
         """
         info = check_env(env_id, env_args)
         return cls(info.observation_space, info.action_space, action, env_id=info.env_id, env_args=info.env_args)
@@ -82,14 +82,14 @@ def baseline_policy(
     action_space: gym.Space[Any],
     training: dict[str, Any] | None = None,
 ) -> PortablePolicy:
-    """A baseline as a portable policy.
+    """Return a baseline as a portable policy.
 
     Args:
-        hyperparams: Of `random` or `constant`.
+        hyperparams: Those of `random` or `constant`.
         env_id: The environment it is for.
         env_args: The arguments of that environment.
-        observation_space: Of the environment.
-        action_space: Of the environment.
+        observation_space: The environment's.
+        action_space: The environment's.
         training: Free metadata, such as the trial's id.
     """
     if isinstance(hyperparams, ConstantHyperparams):

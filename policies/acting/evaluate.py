@@ -1,8 +1,7 @@
 """Seeded greedy episodes of any policy.
 
-Episode i is exactly this: `env.reset(seed=seeds[i])`, then greedy actions until the episode is terminated,
-truncated or
-as long as the cap. Its return and length depend on nothing else: neither on the episodes evaluated beside it
+Episode i is exactly this: `env.reset(seed=seeds[i])`, then greedy actions until the episode terminates, is truncated or
+reaches the cap on its steps. Its return and length depend on nothing else: neither on the episodes evaluated beside it
 nor on their order, so the same seed gives the same episode in a trial, on the command line and in a video.
 """
 
@@ -37,22 +36,22 @@ class Episodes:
 
     seeds: tuple[int, ...]
     returns: tuple[float, ...]
-    """Undiscounted sum of the rewards of each."""
+    """The undiscounted sum of each episode's rewards."""
     lengths: tuple[int, ...]
-    """Env steps of each."""
+    """The number of env steps of each episode."""
 
     @property
     def mean_return(self) -> float:
-        """Mean episode return."""
+        """The mean of the episodes' returns."""
         return math.fsum(self.returns) / len(self.returns)
 
 
 @runtime_checkable
 class Resettable(Protocol):
-    """A policy that draws numbers: reset from each episode's seed, its episodes are reproducible too."""
+    """A policy that draws random numbers; resetting it with each episode's seed makes its episodes reproducible."""
 
     def reset(self, seed: int) -> None:
-        """Start again from a seed."""
+        """Seed the policy's random numbers anew."""
 
 
 class Evaluator:
@@ -61,7 +60,7 @@ class Evaluator:
     Args:
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
-        seeds: One episode for each, in this order; none negative.
+        seeds: One episode is played for each, in this order; none may be negative.
         max_episode_steps: Cap on the env steps of an episode; None: the env's time limit, or 10,000 if it has
             none.
 
@@ -86,20 +85,20 @@ class Evaluator:
 
     @property
     def cartpole_starts(self) -> NDArray[np.float64] | None:
-        """CartPole's start states by seed, shape (num_seeds, 4); None: it is another env, or has wrappers."""
+        """CartPole's start state for each seed, shape (num_seeds, 4); None for another env or one with wrappers."""
         return None if self._cartpoles is None else self._cartpoles.start_states
 
     def check(self, policy: Policy) -> None:
-        """Check that a policy can be run.
+        """Check that a policy can act in this environment.
 
         Raises:
-            NonFiniteWeightsError: Its weights are NaN or infinite.
-            EnvError: It is for other observations or actions.
+            NonFiniteWeightsError: A weight is NaN or infinite.
+            EnvError: The policy is for other observations or actions.
         """
         check_policy(policy, self._envs[0])
 
     def run(self, policy: Policy) -> Episodes:
-        """One greedy episode a seed.
+        """Play one greedy episode for each seed.
 
         Raises:
             NonFiniteWeightsError: The policy's weights are NaN or infinite.
@@ -107,7 +106,7 @@ class Evaluator:
         """
         self.check(policy)
         if isinstance(policy, Resettable):
-            # It draws numbers in the order of its calls, so its episodes must be played one after the other.
+            # It draws random numbers in the order of its calls, so its episodes must be played one after the other.
             results = [self._play_alone(policy, seed) for seed in self.seeds]
         elif self._cartpoles is not None:
             results = self._cartpoles.play(policy, self.max_episode_steps)
@@ -117,7 +116,7 @@ class Evaluator:
         return Episodes(self.seeds, returns, lengths)
 
     def close(self) -> None:
-        """Close the environments; no `run` after it."""
+        """Close the environments; `run` cannot be called afterwards."""
         for env in self._envs:
             close_env(env)
 
@@ -131,7 +130,7 @@ class Evaluator:
         return play_episode(policy, self._envs[0], seed, max_episode_steps=self.max_episode_steps)
 
     def _play_side_by_side(self, policy: Policy) -> list[tuple[float, int]]:
-        """Several envs at once, so that the network sees a batch; a free env takes the next seed."""
+        """Play in several envs at once, so that the network gets batches; an env that is free takes the next seed."""
         while len(self._envs) < min(len(self.seeds), _MAX_ENVS):
             self._envs.append(make_env(self.env_id, self.env_args))
         waiting = deque(enumerate(self.seeds))
@@ -156,13 +155,13 @@ def evaluate_policy(
     seeds: Sequence[int],
     max_episode_steps: int | None = None,
 ) -> Episodes:
-    """One greedy episode a seed.
+    """Play one greedy episode for each seed.
 
     Args:
-        policy: What acts.
+        policy: The policy that acts.
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
-        seeds: One episode for each, in this order.
+        seeds: One episode is played for each, in this order.
         max_episode_steps: Cap on the env steps of an episode; None: the env's time limit, or 10,000 if it has
             none.
 
@@ -175,9 +174,9 @@ def evaluate_policy(
 
 
 def play_episode(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int) -> tuple[float, int]:
-    """One greedy episode in one environment: its return and its env steps.
+    """Play one greedy episode in one environment and return its return and its number of env steps.
 
-    Args and errors are those of `episode_steps`.
+    Arguments and errors are those of `episode_steps`.
     """
     *_, (length, total, _) = episode_steps(policy, env, seed, max_episode_steps=max_episode_steps)
     return total, length
@@ -186,16 +185,16 @@ def play_episode(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episo
 def episode_steps(
     policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int
 ) -> Iterator[tuple[int, float, bool]]:
-    """One greedy episode in one environment, step by step.
+    """Play one greedy episode in one environment, step by step.
 
     Args:
-        policy: What acts; reset from the seed if it can be.
-        env: Where; it is not closed.
-        seed: Of the env's reset.
-        max_episode_steps: Cap on its env steps.
+        policy: The policy that acts; it is reset with the seed if it is `Resettable`.
+        env: The environment it acts in; it is not closed.
+        seed: The seed that the env is reset with.
+        max_episode_steps: Cap on the env steps of the episode.
 
     Yields:
-        After the reset and after each step: env steps so far, return so far, whether the episode is over.
+        After the reset and after each step, the env steps so far, the return so far, and whether the episode is over.
 
     Raises:
         EnvError: The env raised an error.
@@ -211,7 +210,7 @@ def episode_steps(
 
 
 def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
-    """Check that a policy's weights are finite and that it goes with an environment.
+    """Check that a policy's weights are finite and that its spaces are those of an environment.
 
     Raises:
         NonFiniteWeightsError: The policy's weights are NaN or infinite.
@@ -235,10 +234,10 @@ def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
 
 
 def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
-    """The seeds as ints.
+    """Return the seeds as ints.
 
     Raises:
-        SpecError: There are none, or one is negative.
+        SpecError: There are no seeds, or one is negative.
     """
     result = tuple(int(seed) for seed in seeds)
     if not result:
@@ -249,7 +248,7 @@ def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
 
 
 def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
-    """Env steps after which an episode is cut off.
+    """Return the number of env steps after which an episode is cut off.
 
     Raises:
         SpecError: The given cap is below 1.
@@ -263,7 +262,7 @@ def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
 
 
 class _Running:
-    """An episode being played in a scalar environment."""
+    """An episode that is being played in a scalar environment."""
 
     def __init__(self, env: gym.Env[Any, Any], index: int, seed: int) -> None:
         self.env, self.index, self.seed = env, index, seed
@@ -276,7 +275,7 @@ class _Running:
         check_observation(self.observation, self._env_id, 0)
 
     def step(self, action: Any) -> bool:
-        """Step once; whether the episode has ended."""
+        """Step once and return whether the episode has ended."""
         # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
         if isinstance(action, np.generic):
             action = action.item()
@@ -305,11 +304,11 @@ class _Running:
 
 
 class _CartPoles:
-    """CartPole by Gymnasium's own vectorised version: ten times as fast as ten environments.
+    """Plays CartPole in Gymnasium's own vectorised version, which is ten times as fast as ten environments.
 
-    That version draws the start states of all sub-environments from one generator, so they are drawn here as
-    the scalar env draws them, seed by seed, and set. From equal states the two take the same steps, to the
-    last bit; tests hold the returns and lengths of both against each other.
+    That version draws the start states of all sub-environments from one generator. So the states are drawn here as
+    the scalar env draws them, seed by seed, and put into the vectorised version. From equal states the two take the
+    same steps, to the last bit; tests compare the returns and lengths of both.
     """
 
     def __init__(self, env: Any, start_states: NDArray[np.float64]) -> None:
@@ -320,7 +319,7 @@ class _CartPoles:
     def make_if_cartpole(
         cls, scalar_env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any], seeds: Sequence[int]
     ) -> _CartPoles | None:
-        """For a CartPole without further wrappers; None for any other env."""
+        """Return a player for a CartPole without further wrappers, or None for any other env."""
         from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
 
         inner = scalar_env.unwrapped
@@ -338,7 +337,7 @@ class _CartPoles:
         return cls(vector_env, np.array(start_states, dtype=np.float64))
 
     def play(self, policy: Policy, max_episode_steps: int) -> list[tuple[float, int]]:
-        """One episode a start state: return and length of each."""
+        """Play one episode from each start state and return the return and the length of each."""
         num_envs: int = self._env.num_envs
         results: list[tuple[float, int]] = []
         for first in range(0, len(self.start_states), num_envs):
@@ -359,7 +358,7 @@ class _CartPoles:
         for _ in range(max_episode_steps):
             actions[:num_episodes] = policy.act(observations[:num_episodes])
             observations, rewards, terminated, truncated, _ = env.step(actions)
-            # Sub-environments that have ended start further episodes by themselves, which do not count.
+            # Sub-environments whose episode has ended begin further ones by themselves, which do not count.
             returns[running] += rewards[:num_episodes][running]
             lengths[running] += 1
             running &= ~(terminated | truncated)[:num_episodes]

@@ -1,4 +1,4 @@
-"""Policies from their portable files."""
+"""Load policies from their portable files."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from policies.portable.file import (
 
 
 def policy_from_portable(portable: PortablePolicy, description: str | None = None) -> Policy:
-    """The policy that a portable one describes: a network's, or a baseline's.
+    """Return the policy that a portable policy describes: a network or a baseline.
 
     Args:
-        portable: What was read from a file, or made in memory.
-        description: Shown in captions and messages; None: by kind, algorithm and env.
+        portable: Read from a file, or made in memory.
+        description: Shown in captions and messages; None: made from kind, algorithm and env.
     """
     network = portable.network
     policy: Policy
@@ -43,9 +43,9 @@ def policy_from_portable(portable: PortablePolicy, description: str | None = Non
 
 @checked
 def load_policy(path: str | Path) -> Policy:
-    """Read a policy from its portable file; needs no Ray and no torch, and executes nothing in the file.
+    """Read a policy from its portable file; this needs neither Ray nor torch, and executes nothing in the file.
 
-    A policy whose network is an RLModule of the user's own does need them, and its class from an allowed module.
+    A policy whose network is an RLModule of the user's own needs both, and its class has to be in an allowed module.
 
     Args:
         path: `policy.json`, `policy.safetensors`, or the folder that holds them.

@@ -1,4 +1,4 @@
-"""Greedy actions of a user's own RLModule, from its portable file; needs torch and RLlib, but no running Ray."""
+"""Act greedily by a user's own RLModule, loaded from its portable file; needs torch and RLlib, but no running Ray."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from policies.portable.file import ModuleWeights, PortablePolicy
 
 
 class ModulePolicy(WeightsPolicy):
-    """Greedy actions of an RLModule class of the user's own.
+    """A policy that acts greedily by an RLModule class of the user's own.
 
-    Each observation is a forward pass of its own, so that its action does not depend on what else is in a batch.
+    Each observation gets a forward pass of its own, so that its action does not depend on what else is in a batch.
 
     Args:
         portable: A policy whose network is of kind `module`.
@@ -48,7 +48,7 @@ class ModulePolicy(WeightsPolicy):
             # As in training, where RLlib gives a module its algorithm's catalog.
             catalog_class=PPOCatalog if self.portable.algorithm == "ppo" else DQNCatalog,
         ).build()
-        # torch takes writable arrays alone, and safetensors gives others.
+        # torch takes writable arrays only, and those of safetensors are not.
         state = {name: torch.from_numpy(np.array(tensor)) for name, tensor in saved.tensors.items()}
         try:
             module.load_state_dict(state)
@@ -63,7 +63,7 @@ class ModulePolicy(WeightsPolicy):
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         if len(observations) == 0:
             return np.zeros((0, *(self.action_space.shape or ())), dtype=self.action_space.dtype)
-        # As the env runner gives them: bytes stay bytes.
+        # Observations reach the module as the env runner gives them: bytes stay bytes.
         dtype = np.uint8 if self.observation_space.dtype == np.uint8 else np.float32
         batch = torch.from_numpy(np.ascontiguousarray(observations, dtype=dtype))
         with torch.no_grad():
@@ -73,7 +73,7 @@ class ModulePolicy(WeightsPolicy):
         return self._to_actions(actions)
 
     def _greedy(self, observation: torch.Tensor) -> NDArray[Any]:
-        """Actions of a batch of one, as the module counts or scales them."""
+        """Return the actions for a batch of one observation, as the module numbers or scales them."""
         out = self.module.forward_inference({Columns.OBS: observation})
         if Columns.ACTIONS not in out:
             distribution = self.module.get_inference_action_dist_cls().from_logits(out[Columns.ACTION_DIST_INPUTS])

@@ -1,4 +1,4 @@
-"""Encoders: pictures in, an MP4 or a GIF out, complete or not there at all."""
+"""Write pictures to an MP4 or a GIF; the file is complete or not there at all."""
 
 from __future__ import annotations
 
@@ -23,19 +23,18 @@ GIF_MAX_BYTES = 3_000_000
 _GIF_MAX_FPS = 25.0  # GIF delays are whole hundredths of a second, and many viewers slow down those below 3 of them
 _GIF_MAX_FRAMES = 500
 _GIF_COLORS = 128
-# (share of the size, one frame in so many): tried in turn until the GIF is small enough.
+# Pairs (scale, n): every n-th frame is kept, at this scale; tried in turn until the GIF is small enough.
 _GIF_ATTEMPTS = ((1.0, 1), (1.0, 2), (0.75, 2), (0.75, 4), (0.5, 4), (0.5, 8), (0.25, 8))
 
 
 class Mp4Writer:
-    """H.264 in the form that browsers and players take: yuv420p, even sizes, its index at the front.
+    """Writes H.264 in the form that browsers and players accept: yuv420p, even sizes, the index at the front.
 
-    A context manager; the file appears when the block ends without an error. All pictures are of the first
-    one's size.
+    A context manager; the file appears when the block ends without an error. All pictures have the size of the first.
 
     Args:
         path: File to write.
-        fps: Pictures a second.
+        fps: Pictures per second.
 
     Raises:
         CannotRunError: There is no encoder for this machine, it failed, or the file cannot be written.
@@ -67,7 +66,7 @@ class Mp4Writer:
         self._stack.__exit__(kind, error, traceback)
 
     def add(self, picture: Image.Image, times: int = 1) -> None:
-        """Add a picture, or hold it for several frames."""
+        """Add a picture, `times` times in a row."""
         if self._process is None:
             self._process = self._start(picture.size)
         data = (picture if picture.mode == "RGB" else picture.convert("RGB")).tobytes()
@@ -142,14 +141,14 @@ class Mp4Writer:
 
 
 class GifWriter:
-    """A looping GIF in real time, of bounded size.
+    """Writes a looping GIF that plays in real time and has a bounded size.
 
-    Of a long or colourful episode it keeps fewer and smaller pictures.
+    It keeps fewer and smaller pictures of a long or colourful episode.
 
     Args:
         path: File to write.
-        fps: Pictures a second that `add` is called with.
-        max_bytes: Size to stay under.
+        fps: Pictures per second of the episode, one for each call of `add`.
+        max_bytes: The size in bytes that the file stays under.
     """
 
     def __init__(self, path: Path, fps: float, *, max_bytes: int = GIF_MAX_BYTES) -> None:
@@ -160,11 +159,11 @@ class GifWriter:
         self._count = 0
 
     def add(self, draw: Callable[[], Image.Image], *, hold_s: float = 0.0) -> None:
-        """Add a picture, or pass over it: many are not needed, so `draw` is called only for those that are.
+        """Add a picture, or skip it: not all are needed, so `draw` is called only for those that are.
 
         Args:
             draw: Makes the picture.
-            hold_s: Show it longer, by so many seconds; such a picture is never passed over.
+            hold_s: Seconds that it is shown for in addition; if not 0, the picture is never skipped.
         """
         if hold_s > 0 or self._count % self._stride == 0:
             self._frames.append((self._time_s, hold_s > 0, draw()))
@@ -218,7 +217,7 @@ def _every(step: int, frames: list[tuple[float, bool, Image.Image]]) -> list[tup
 
 
 def _common_palette(pictures: list[Image.Image]) -> Image.Image:
-    """A palette for all pictures, from up to eight of them."""
+    """Return one palette for all pictures, made from up to eight of them."""
     sample = pictures[:: max(1, len(pictures) // 8)][-8:]
     width, height = sample[0].size
     montage = Image.new("RGB", (width, height * len(sample)))

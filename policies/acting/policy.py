@@ -1,4 +1,4 @@
-"""Policies that act: a network read from a portable file, or a baseline without one; NumPy alone.
+"""Policies that act, computed by NumPy alone: a network read from a portable file, or a random policy.
 
 `Policy.act` takes one observation, shape (n,) or (height, width, channels), and gives one action ready for `env.step`,
 or takes a batch, shape (num, ...), and gives a batch of actions. Acting is greedy. The actions are those that RLlib
@@ -20,6 +20,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import override
 
 from policies import random_streams
 from policies.envs.action_bounds import ToBounds
@@ -41,11 +42,11 @@ NON_FINITE_HINT = "Lower the learning rate, or set grad_clip; scale rewards and 
 
 
 class Policy(ABC):
-    """Something that acts greedily in an environment.
+    """Acts greedily in an environment; the base class of all policies.
 
     Args:
-        observation_space: What it observes.
-        action_space: What its actions are taken from.
+        observation_space: The space of the observations it takes.
+        action_space: The space of the actions it gives.
         env_id: The environment it is for.
         env_args: The arguments of that environment.
         description: What it is, in a few words; captions and messages show it.
@@ -67,17 +68,17 @@ class Policy(ABC):
         self.description = description
 
     def act(self, observations: ArrayLike) -> Action:
-        """The greedy action for one observation, or for each of a batch.
+        """Return the greedy action for one observation, or for each observation of a batch.
 
         Args:
-            observations: Of the shape of an observation, or (num, *that shape).
+            observations: Shape: that of one observation, or (num, *that shape).
 
         Returns:
-            For one observation what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
-            (Box). For a batch an array of shape (num,) or (num, action_dim).
+            For one observation, what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
+            (Box). For a batch, an array of shape (num,) or (num, action_dim).
 
         Raises:
-            ObservationError: The observations are of another shape, or no numbers.
+            ObservationError: The observations have another shape, or are not numbers.
         """
         shape = self.observation_space.shape or ()
         try:
@@ -102,7 +103,7 @@ class Policy(ABC):
         )
 
     def check_finite(self) -> None:  # noqa: B027 (a baseline has no weights)
-        """Raise unless all weights are finite.
+        """Raise an error unless all weights are finite.
 
         Raises:
             NonFiniteWeightsError: A weight is NaN or infinite; the message names its layer.
@@ -110,11 +111,11 @@ class Policy(ABC):
 
     @abstractmethod
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
-        """Actions for observations of shape (num, ...)."""
+        """Return the actions for observations of shape (num, ...)."""
 
 
 class WeightsPolicy(Policy):
-    """Greedy actions by the weights of a portable policy; the base of those that have any.
+    """Acts by the weights of a portable policy; the base class of all policies that have weights.
 
     Args:
         portable: The weights and their spaces.
@@ -133,16 +134,16 @@ class WeightsPolicy(Policy):
         self.portable = portable
         self._to_actions = action_function(portable, action_space)
 
+    @override
     def check_finite(self) -> None:
-        """See `Policy.check_finite`."""
         check_finite_tensors(self.portable.network, self.description)
 
 
 class NetworkPolicy(WeightsPolicy):
-    """Greedy actions of a portable network.
+    """Acts greedily by a portable network.
 
-    The result for an observation does not depend on what else is in its batch, to the last bit, so an episode
-    is the same one whether it is evaluated alone, beside others, or filmed.
+    To the last bit, the action for an observation does not depend on what else is in its batch. So an episode is the
+    same whether it is evaluated alone, evaluated beside others, or filmed.
 
     Args:
         portable: The network and its spaces.
@@ -154,7 +155,7 @@ class NetworkPolicy(WeightsPolicy):
         self._forward = ForwardPass(portable.network)
 
     def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
-        """The network's raw output: logits, means and log standard deviations, or Q-values or advantages.
+        """Return the network's raw output: logits, means and log standard deviations, Q-values, or advantages.
 
         Args:
             observations: Shape (num, n), or (num, height, width, channels).
@@ -169,14 +170,14 @@ class NetworkPolicy(WeightsPolicy):
 
 
 class RandomPolicy(Policy):
-    """Actions drawn uniformly from the action space, as `action_space.sample()` draws them.
+    """Draws actions uniformly from the action space, as `action_space.sample()` does.
 
     Args:
-        observation_space: Of the env; only the shape matters.
-        action_space: What is drawn from.
+        observation_space: The env's; only its shape matters.
+        action_space: The space that actions are drawn from.
         env_id: The environment it is for.
         env_args: The arguments of that environment.
-        seed: First seed; `reset` sets another.
+        seed: The first seed; `reset` sets another.
     """
 
     def __init__(
@@ -195,7 +196,7 @@ class RandomPolicy(Policy):
 
     @classmethod
     def for_env(cls, env_id: str, env_args: Mapping[str, Any] | None = None, *, seed: int = 0) -> RandomPolicy:
-        """A random policy for an environment.
+        """Return a random policy for an environment.
 
         Raises:
             EnvError: The environment cannot be made, or its spaces are not supported.
@@ -204,7 +205,7 @@ class RandomPolicy(Policy):
         return cls(info.observation_space, info.action_space, env_id=info.env_id, env_args=info.env_args, seed=seed)
 
     def reset(self, seed: int) -> None:
-        """Start again from a seed: the same seed gives the same actions."""
+        """Seed the random numbers anew: the same seed gives the same actions."""
         self.action_space.seed(random_streams.random_actions_seed(seed))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -213,7 +214,7 @@ class RandomPolicy(Policy):
 
 
 def copy_space(space: gym.Space[Any]) -> ActionSpace:
-    """A space equal to this one, with a random generator of its own."""
+    """Return a copy of a space, with a random generator of its own."""
     if isinstance(space, gym.spaces.Box):
         return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
     if isinstance(space, gym.spaces.Discrete):
@@ -222,11 +223,11 @@ def copy_space(space: gym.Space[Any]) -> ActionSpace:
 
 
 def check_finite_tensors(network: PolicyNetwork, description: str) -> None:
-    """Raise unless all numbers of a network are finite.
+    """Raise an error unless all numbers of a network are finite.
 
     Args:
-        network: Of any kind.
-        description: Of the policy, for the message.
+        network: A network of any kind.
+        description: The policy's description, for the message.
 
     Raises:
         NonFiniteWeightsError: A weight or a statistic is NaN or infinite; the message says where.
@@ -243,7 +244,7 @@ def check_finite_tensors(network: PolicyNetwork, description: str) -> None:
 def action_function(
     portable: PortablePolicy, action_space: ActionSpace
 ) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
-    """What turns the network's outputs, shape (num, num_outputs), into actions for the env."""
+    """Return the function that turns a network's outputs, shape (num, num_outputs), into actions for the env."""
     if isinstance(action_space, gym.spaces.Discrete):
         start = int(action_space.start)
         return lambda outputs: np.argmax(outputs, axis=1) + start
@@ -259,7 +260,7 @@ def action_function(
 
 
 def action_transform(action_space: gym.Space[Any]) -> ActionTransform:
-    """What a policy file says of how its actions become those of this space, as they did in training."""
+    """Return the name by which a policy file says how the network's outputs become actions of this space."""
     if not isinstance(action_space, gym.spaces.Box):
         return "none"
     return "unsquash" if ToBounds(action_space).stretches_all else "by_component"

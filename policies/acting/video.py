@@ -1,4 +1,4 @@
-"""Episodes of any policy as MP4 and GIF, with a caption strip that counts steps and return.
+"""Film episodes of any policy as MP4 and GIF, with a caption strip that shows the steps and the return so far.
 
 The episodes are those that `policies.acting.evaluate` plays on the same seeds. Frames go to the encoder as they are
 drawn, so a long episode needs no memory for its MP4; the GIF keeps a bounded number of small frames.
@@ -39,7 +39,7 @@ _DIM = (158, 164, 176)
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """A frame and what its caption strip says; one that is held is the very same object."""
+    """A frame and the contents of its caption strip; a frame that is held is the very same object each time."""
 
     frame: Image.Image
     title: str
@@ -60,18 +60,18 @@ def record_video(
     fps: float | None = None,
     max_steps: int | None = None,
 ) -> Episodes:
-    """Film one greedy episode a seed, one after the other.
+    """Film one greedy episode for each seed, one after the other.
 
     Args:
-        policy: What acts.
+        policy: The policy that acts.
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
         seeds: One seed or several.
         mp4: File to write (H.264); None: no MP4.
         gif: File to write (looping, half the size, at most about 3 MB); None: no GIF.
-        caption: Left half of the caption strip; None: the policy's description.
+        caption: Text in the left half of the caption strip; None: the policy's description.
         fps: Frames a second; None: the env's `render_fps`, so that it plays in real time.
-        max_steps: Cap on the env steps of an episode; None: as `evaluate_policy`.
+        max_steps: Cap on the env steps of an episode; None: the same as in `evaluate_policy`.
 
     Returns:
         The episodes that were filmed.
@@ -111,20 +111,20 @@ def record_comparison(
     """Film one episode of each of two policies, alone and next to each other, drawing each frame once.
 
     Args:
-        left: What acts on the left.
-        right: What acts on the right.
+        left: The policy shown on the left.
+        right: The policy shown on the right.
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
-        seed: Of both episodes.
-        captions: Of the left and the right.
-        left_mp4: File of the left one alone.
-        right_mp4: File of the right one alone.
-        right_gif: The same as a GIF.
-        both_mp4: File of the two side by side; the shorter one holds its last frame.
-        max_steps: Cap on the env steps of an episode; None: as `evaluate_policy`.
+        seed: The seed of both episodes.
+        captions: The captions of the left and of the right episode.
+        left_mp4: File to write with the left episode alone.
+        right_mp4: File to write with the right episode alone.
+        right_gif: File to write with the right episode as a GIF.
+        both_mp4: File to write with the two side by side; the shorter one holds its last frame.
+        max_steps: Cap on the env steps of an episode; None: the same as in `evaluate_policy`.
 
     Returns:
-        The episodes of the left and of the right.
+        The left policy's episodes and the right policy's episodes.
 
     Raises:
         EnvError: The environment cannot be made or drawn, does not go with a policy, or raised an error.
@@ -153,7 +153,7 @@ def record_comparison(
 
 
 class _Stage:
-    """An environment that can be drawn, and the policy that acts in it; a context manager."""
+    """An environment that can be filmed, and the policy that acts in it; a context manager."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ class _Stage:
         close_env(self._env)
 
     def play(self, seed: int) -> Iterator[_Panel]:
-        """The episode of a seed, a panel for the reset and for each step."""
+        """Play the episode of a seed, and yield a panel for the reset and for each step."""
         for steps, total, over in episode_steps(self._policy, self._env, seed, max_episode_steps=self._cap):
             yield _Panel(self._draw(), self._title, steps, total, over)
 
@@ -202,7 +202,7 @@ class _Stage:
 
 
 class _Film:
-    """The files that are being written; a context manager: they appear when it ends without an error."""
+    """The files that are being written; a context manager: they appear when the block ends without an error."""
 
     def __init__(self, mp4: Path | None, gif: Path | None, fps: float) -> None:
         if not 0 < fps < 1000:
@@ -225,7 +225,7 @@ class _Film:
             self._gif.save()
 
     def add(self, panels: Sequence[_Panel], *, last: bool) -> None:
-        """Add the next moment; the last one of an episode is held."""
+        """Add the next frame of each film; the last one of an episode is held."""
         if self._mp4 is not None:
             self._mp4.add(_picture(panels, 1.0), 1 + round(self._fps * _HOLD_S) if last else 1)
         if self._gif is not None:
@@ -250,7 +250,7 @@ def _make_drawable_env(env_id: str, env_args: Mapping[str, Any] | None) -> gym.E
 
 
 def _in_step(plays: Sequence[Iterator[_Panel]]) -> Iterator[list[_Panel]]:
-    """The panels of several episodes until the longest is over; the others stay as they ended."""
+    """Yield the panels of several episodes until the longest is over; the others hold their last panel."""
     panels = [next(play) for play in plays]
     yield panels
     while not all(panel.over for panel in panels):
@@ -259,7 +259,7 @@ def _in_step(plays: Sequence[Iterator[_Panel]]) -> Iterator[list[_Panel]]:
 
 
 def _picture(panels: Sequence[_Panel], scale: float) -> Image.Image:
-    """The panels next to each other, each under its caption strip."""
+    """Return a picture of the panels next to each other, each with its caption strip."""
     parts = [_captioned(panel, scale) for panel in panels]
     gap = max(2, round(12 * scale)) if len(parts) > 1 else 0
     width = sum(part.width for part in parts) + gap * (len(parts) - 1)
@@ -271,7 +271,7 @@ def _picture(panels: Sequence[_Panel], scale: float) -> Image.Image:
     return picture
 
 
-# Both panels at both scales: the same ones go into several films, or are held.
+# Enough for both panels at both scales: the same panels go into several films, or are held.
 @lru_cache(maxsize=4)
 def _captioned(panel: _Panel, scale: float) -> Image.Image:
     width, height = (max(1, round(length * scale)) for length in panel.frame.size)
@@ -285,7 +285,7 @@ def _captioned(panel: _Panel, scale: float) -> Image.Image:
     font = _font(round(strip * 0.46))
     pad, middle = round(strip * 0.3), strip / 2
     total = f"{panel.total:.0f}" if float(panel.total).is_integer() else f"{panel.total:.1f}"
-    # Two columns of fixed width, or the words would move at each step as the numbers grow.
+    # Two columns of fixed width, or the words would move whenever the numbers grow.
     right: float = width - pad
     for label, number, colour in (("return", total, _TEXT), ("step", str(panel.steps), _DIM)):
         draw.text((right, middle), f"{label} {number}", font=font, fill=colour, anchor="rm")
@@ -295,7 +295,7 @@ def _captioned(panel: _Panel, scale: float) -> Image.Image:
 
 
 def _filter(scale: float) -> Image.Resampling:
-    # The mean of whole pixels is as good where it goes out even, and four times as fast.
+    # Where the scale is one over a whole number, the mean of whole pixels is as good, and four times as fast.
     return Image.Resampling.BOX if (1.0 / scale).is_integer() else Image.Resampling.LANCZOS
 
 

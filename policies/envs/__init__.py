@@ -1,1 +1,1 @@
-"""Make, check, wrap, seed and draw Gymnasium environments; what their code may do, and who it belongs to."""
+"""Make, check, wrap, seed and draw Gymnasium environments, and handle the errors of their code."""

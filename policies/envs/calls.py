@@ -1,9 +1,9 @@
-"""Which call of a user's code a process is in, told to the process that watches it.
+"""Let a process tell the process that watches it which call of a user's code it is in.
 
 A *call* is one of an environment's constructor or methods, the import of its module, or a policy's `act`. The process
-that runs them writes into a *page* of memory that it shares with its watcher: where the count goes up no more, a call
-has hung; where the process ended, the call that it was in has ended it. Where nobody watches, in trials, nothing is
-told and nothing costs.
+that runs them writes into a *page* of memory that it shares with its watcher. If the count of calls stops rising, a
+call hangs; if the process has ended, the call that it was in has ended it. Trials are not watched: nothing is written
+there, and it costs nothing.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _Watched = TypeVar("_Watched")
 
 
 class Call(enum.IntEnum):
-    """What a process is in."""
+    """The call of a user's code that a process is in."""
 
     NONE = 0
-    """Code of this package."""
+    """No call: the process runs code of this package."""
     IMPORT = 1
     CONSTRUCTOR = 2
     RESET = 3
@@ -34,7 +34,7 @@ class Call(enum.IntEnum):
 
     @property
     def phrase(self) -> str:
-        """In a message."""
+        """The words for the call in a message."""
         return _PHRASES.get(self, f"{self.name.lower()}()")
 
 
@@ -48,35 +48,35 @@ _ENV_METHODS = {"reset": Call.RESET, "step": Call.STEP, "render": Call.RENDER, "
 
 
 class Page:
-    """Shared memory: what is told, and what was.
+    """Shared memory with the number of calls so far, the call that runs and the env's steps.
 
     Args:
-        number: Descriptor of a file of `PAGE_BYTES`, which both processes have open.
+        number: Descriptor of a file of `PAGE_BYTES` bytes, which both processes have open.
     """
 
     def __init__(self, number: int) -> None:
         self._cells = memoryview(mmap.mmap(number, PAGE_BYTES)).cast("Q")
         self.last_raised = Call.NONE
-        """The outermost call that raised last; not shared."""
+        """The outermost call that raised an error last; not shared."""
 
     @property
     def count(self) -> int:
-        """Begins and ends of calls so far."""
+        """How many calls have begun, plus how many have ended."""
         return self._cells[_COUNT]
 
     @property
     def call(self) -> Call:
-        """What the process is in."""
+        """The call that the process is in."""
         return Call(self._cells[_CALL])
 
     @property
     def steps(self) -> int:
-        """Of the environment that was stepped last: its steps since its last reset, the one that runs included."""
+        """Steps since its last reset of the environment stepped last, including a step that still runs."""
         return self._cells[_STEPS]
 
     @contextlib.contextmanager
     def inside(self, call: Call) -> Iterator[None]:
-        """Tell that the block is such a call."""
+        """Mark the block as a call of this kind."""
         cells = self._cells
         around = cells[_CALL]
         cells[_CALL] = call
@@ -91,16 +91,16 @@ class Page:
             cells[_COUNT] += 1
 
     def telling(self, method: Callable[..., Any], call: Call, steps: list[int]) -> Callable[..., Any]:
-        """The method, which tells of each time that it is called.
+        """Return a method that does the same and writes each of its calls to the page.
 
         Args:
-            method: Of an environment or a policy.
-            call: Which it is.
-            steps: Of the same environment's methods: one number, its steps since its last reset.
+            method: A method of an environment or a policy.
+            call: The kind of call that it is.
+            steps: A list of one number, the environment's steps since its last reset; its methods share it.
         """
         cells = self._cells
 
-        # Not by `inside`, which takes ten times as long: fast environments make hundreds of thousands of calls.
+        # `inside` would take ten times as long, and fast environments make hundreds of thousands of calls.
         def told(*args: Any, **kwargs: Any) -> Any:
             around = cells[_CALL]
             cells[_CALL] = call
@@ -128,26 +128,26 @@ _page: Page | None = None
 
 
 def tell(page: Page) -> None:
-    """Tell a page from now on what this process is in; it was started to be watched."""
+    """Write every call of this process to a page from now on; for a process that was started to be watched."""
     global _page  # noqa: PLW0603 (as a process has one watcher)
     _page = page
 
 
 def inside(call: Call) -> contextlib.AbstractContextManager[None]:
-    """Tell that the block is such a call, if anybody watches."""
+    """Mark the block as a call of this kind, if this process is watched."""
     return contextlib.nullcontext() if _page is None else _page.inside(call)
 
 
 def watch_env(env: _Watched) -> _Watched:
-    """Let an environment, scalar or vector, tell of its calls, if anybody watches.
+    """Have an environment, scalar or vector, write its calls to the page, if this process is watched.
 
-    It stays what it is: no wrapper is put around it, because what an env is made of decides how it is stepped.
+    No wrapper is put around it, because the classes of an env decide how it is stepped.
     """
     return _watch(env, _ENV_METHODS)
 
 
 def watch_policy(policy: _Watched) -> _Watched:
-    """Let a policy tell of its calls, if anybody watches."""
+    """Have a policy write its calls to the page, if this process is watched."""
     return _watch(policy, {"act": Call.ACT})
 
 

@@ -1,7 +1,7 @@
-"""Numbers of an environment that are none, found where it gives them.
+"""Refuse NaN and infinite rewards and observations where an environment returns them.
 
-A NaN or an infinite number in a reward or an observation ruins the weights of whoever learns from it, many steps later
-and far away. Bounds of a space that are infinite allow any number, but not these.
+A NaN or an infinite number in a reward or an observation ruins the weights that are trained on it, many steps later
+and far away. A space with infinite bounds allows any number, but neither of these.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from policies.envs.tallies import only_tally
 from policies.errors import EnvError, EnvFailedError
 
 _LARGEST = float(np.finfo(np.float32).max)
-"""Learners compute in 32 bits: what is larger is infinite to them."""
+"""The largest number of 32 bits; training computes in 32 bits, where anything larger is infinite."""
 _LARGEST_32 = np.finfo(np.float32).max
-"""The same with its precision, or numbers of 16 bits would be compared with infinity."""
+"""The same number as a NumPy scalar of 32 bits; numbers of 16 bits would be compared with infinity otherwise."""
 _HINT = "Mend the env: training on it would ruin the weights."
 
 
 def is_sound(values: NDArray[Any]) -> bool:
     """Whether all numbers are finite, in 32 bits too."""
-    # NaN is not <= anything.
+    # Comparisons with NaN are false.
     return values.dtype == np.uint8 or bool((np.abs(values) <= _LARGEST_32).all())
 
 
 def reward_as_number(reward: Any) -> float:
-    """A reward as the number that it is, or that is the only one of an array or a list, of any shape.
+    """Return a reward as a float; arrays and lists of any shape may hold it, if they hold a single number.
 
     Raises:
-        TypeError: It is no number.
-        ValueError: It is not one number.
+        TypeError: The reward is not a number.
+        ValueError: There are several numbers, or none.
     """
     if isinstance(reward, np.ndarray | list | tuple):
-        # From NumPy 2.4 on, float() takes arrays without dimensions alone.
+        # From NumPy 2.4 on, float() takes arrays only if they have no dimensions.
         reward = np.asarray(reward).item()
     return float(reward)
 
 
 class PlainSteps(gym.Wrapper[Any, Any, Any, Any]):
-    """A sub-environment for a vector of them: its rewards are plain numbers, and it tells no infos.
+    """Wraps a sub-environment of a vector: its rewards are plain numbers, and its infos are empty.
 
-    Nobody here reads infos, but Gymnasium makes arrays of them: it fails where those of two environments have other
-    types or shapes, or a number has more than 64 bits.
+    Nothing here reads infos, but Gymnasium makes arrays of them, and fails where two environments' infos differ in type
+    or shape, or where a number has more than 64 bits.
     """
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -65,12 +65,12 @@ def check_reward(reward: float, env_id: str, num_steps: int) -> None:
     """Refuse a reward that is not finite.
 
     Args:
-        reward: The env's own.
-        env_id: For the message.
-        num_steps: Env steps of its episode, that of the reward included.
+        reward: A reward as the env returned it.
+        env_id: The env's id, for the message.
+        num_steps: Env steps of the episode, including the one that gave the reward.
 
     Raises:
-        EnvFailedError: It is NaN or infinite.
+        EnvFailedError: The reward is NaN or infinite.
     """
     if not abs(reward) <= _LARGEST:
         raise EnvFailedError(
@@ -82,12 +82,12 @@ def check_observation(observation: Any, env_id: str, num_steps: int) -> None:
     """Refuse an observation that is not finite, whatever the bounds of its space.
 
     Args:
-        observation: Of any shape.
-        env_id: For the message.
-        num_steps: Env steps of its episode so far; 0: it is the reset's.
+        observation: An observation of any shape.
+        env_id: The env's id, for the message.
+        num_steps: Env steps of the episode so far; 0: the reset returned the observation.
 
     Raises:
-        EnvFailedError: A number of it is NaN or infinite.
+        EnvFailedError: A number in it is NaN or infinite.
     """
     values = np.asarray(observation)
     if is_sound(values):
@@ -110,14 +110,15 @@ def _name(value: float) -> str:
 
 
 class CheckedEnvs(gym.vector.VectorWrapper):
-    """A vector environment whose errors are `EnvError`s, and whose rewards and observations are finite.
+    """Wraps a vector environment: its errors become `EnvError`s, and its rewards and observations have to be finite.
 
-    For those that reset in the step after an episode's end, as `make_vector_env` makes them. A vectorised version of a
-    user's own may return lists, or columns of rewards; here these are arrays. It has no infos, as nobody reads them.
+    It is for vector environments that reset in the step after an episode's end, as `make_vector_env` makes them. A
+    user's own vectorised version may return lists, or rewards as a column; this wrapper makes them arrays of the
+    expected shape. It returns no infos, as nothing reads them.
 
     Args:
-        env: Without a failure penalty: its own rewards are looked at.
-        env_id: For messages.
+        env: A vector environment without a failure penalty, as the env's own rewards are checked.
+        env_id: The env's id, for messages.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
@@ -131,7 +132,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         """Reset all sub-environments.
 
         Raises:
-            EnvFailedError: One raised an error, or its observation is not finite.
+            EnvFailedError: A sub-environment raised an error, or its observation is not finite.
         """
         try:
             observations, _ = self.env.reset(seed=seed, options=options)
@@ -146,8 +147,8 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         """Step all sub-environments.
 
         Raises:
-            EnvFailedError: One raised an error, or its reward or observation is not finite.
-            EnvError: The vectorised version returned something else than rows of numbers.
+            EnvFailedError: A sub-environment raised an error, or its reward or observation is not finite.
+            EnvError: The vectorised version returned something other than rows of numbers.
         """
         try:
             observations, rewards, terminated, truncated, _ = self.env.step(actions)
@@ -173,7 +174,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         return observations, rewards, terminated, truncated, {}
 
     def _as_array(self, values: Any, what: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """What a vectorised version returned, of this shape; one of one dimension may have further ones of length 1."""
+        """Return what a vectorised version returned as an array of this shape; one row may come as a column."""
         try:
             array = np.asarray(values)
         except Exception:  # noqa: BLE001 (ragged lists, say)
@@ -192,6 +193,6 @@ class CheckedEnvs(gym.vector.VectorWrapper):
                 check_observation(observation, self._env_id, length)
 
     def close(self, **kwargs: Any) -> None:
-        """Close all; that one cannot be closed harms nobody."""
+        """Close all sub-environments; errors of closing are ignored."""
         del kwargs
         close_env(self.env)

@@ -1,8 +1,8 @@
-"""When the end of an episode is a failure: what a failure penalty is for.
+"""Find out when the end of an episode is a failure, for which a failure penalty is given.
 
-Termination alone does not say it. CartPole terminates when the pole falls, MountainCar when the car has arrived. So it
-is known for Gymnasium's own environments, by the classes that they are made from, and an environment of somebody's own
-says it: `metadata = {"failure": "terminated"}`.
+Termination alone is not enough: CartPole terminates when the pole falls, but MountainCar when the car has arrived. For
+Gymnasium's own environments the rule is looked up by their class; a user's own environment declares it with
+`metadata = {"failure": "terminated"}`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TERMINATED = "terminated"
 
 @dataclass(frozen=True)
 class FailureRule:
-    """Which steps end an episode by failure: those that terminate it, with a certain reward if one is given."""
+    """Says which steps end an episode by failure: those that terminate it, and have a certain reward if one is set."""
 
     reward: float | None = None
 
@@ -31,11 +31,11 @@ class FailureRule:
         """Whether each step failed.
 
         Args:
-            rewards: The env's own, of shape (num_envs,).
-            terminated: Of shape (num_envs,).
+            rewards: The env's own rewards, shape (num_envs,).
+            terminated: Whether each step terminated its episode, shape (num_envs,).
 
         Returns:
-            Of shape (num_envs,).
+            An array of shape (num_envs,).
         """
         if self.reward is None:
             return np.asarray(terminated, dtype=np.bool_)
@@ -43,9 +43,9 @@ class FailureRule:
         return failed
 
 
-# Class of the environment, in Gymnasium's packages of them -> its rule. Read in the sources of Gymnasium 1.2.
+# Maps the class of an environment of Gymnasium's to its rule, as its source code in Gymnasium 1.2 has it.
 _TERMINATION = FailureRule()
-# The lander's and the walker's crash; a lander that has come to rest terminates too, with 100.
+# The reward of a crash of the lander and of the walker; a lander at rest terminates too, with a reward of 100.
 _CRASH = FailureRule(reward=-100.0)
 _KNOWN = {
     "CartPoleEnv": _TERMINATION,
@@ -58,22 +58,22 @@ _KNOWN = {
     "LunarLander": _CRASH,
     "BipedalWalker": _CRASH,
 }
-_SWITCH = "terminate_when_unhealthy"  # of MuJoCo's walkers
+_SWITCH = "terminate_when_unhealthy"  # an argument of MuJoCo's walkers
 
 
 def failure_rule(
     env_id: str, spec: EnvSpec, metadata: Mapping[str, Any], env_args: Mapping[str, Any]
 ) -> FailureRule | None:
-    """When an environment's episodes end by failure; None: never, or it is not known.
+    """Return the rule by which an environment's episodes end by failure; None if they never do, or it is not known.
 
     Args:
-        env_id: For messages.
-        spec: What the environment is made from.
-        metadata: The environment's own.
-        env_args: What its constructor is given.
+        env_id: The env's id, for messages.
+        spec: The entry of Gymnasium's registry that the environment is made from.
+        metadata: The environment's metadata.
+        env_args: The arguments of its constructor.
 
     Raises:
-        EnvError: Its metadata says something else than "terminated".
+        EnvError: The metadata says something other than "terminated".
     """
     said = metadata.get(_METADATA_KEY)
     if said == _TERMINATED:
@@ -92,10 +92,10 @@ def failure_rule(
 
 
 def check_failure_penalty(env_id: str, rule: FailureRule | None, penalty: float) -> FailureRule:
-    """The rule, if there is one.
+    """Return the rule, if there is one.
 
     Raises:
-        EnvError: There is none, so that the penalty would never be given.
+        EnvError: There is no rule, so the penalty would never be given.
     """
     if rule is None:
         raise EnvError(

@@ -1,7 +1,7 @@
-"""Exceptions out of an environment's code, which may be anything.
+"""Handle the exceptions of an environment's code, which may be of any class.
 
-`SystemExit`, `KeyboardInterrupt` and the like would end the process of a trial, and all that train in it. Raised by an
-env they are its error and no more; raised for a signal to the process they have to pass.
+`SystemExit`, `KeyboardInterrupt` and the like would end the process of a trial, and with it every trial trained there.
+Raised by an env, they are treated as any other error of the env; raised for a signal to the process, they pass.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _signalled = False
 
 
 def note_signals() -> None:
-    """Let this process tell the exceptions of its signals from those that its environments raise.
+    """Let this process tell exceptions raised for its signals from those that its environments raise.
 
-    For processes of trials, whose handlers of SIGTERM and SIGINT raise SystemExit and KeyboardInterrupt. Called in
-    another thread than the main one it does nothing.
+    It is for processes of trials, whose handlers of SIGTERM and SIGINT raise SystemExit and KeyboardInterrupt. Outside
+    the main thread it does nothing.
     """
     global _notes_signals  # noqa: PLW0603 (signals are the process's)
     if _notes_signals or threading.current_thread() is not threading.main_thread():
@@ -47,17 +47,17 @@ def _noting(handler: Callable[[int, FrameType | None], Any]) -> Callable[[int, F
 
 
 def is_of_env(error: BaseException) -> bool:
-    """Whether an exception that came out of an env's code was raised by it, and not by a signal to this process."""
+    """Whether an exception from a call of an env was raised by the env, and not for a signal to this process."""
     if isinstance(error, Exception):
         return True
     if _notes_signals:
         return not _signalled
-    # Elsewhere only Ctrl-C and what acts as it does, in the process of whoever launched.
+    # In the process that launched the sweep, only Ctrl-C and signals that act like it raise such an exception.
     return not isinstance(error, KeyboardInterrupt)
 
 
 def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or choose another one.") -> EnvFailedError:
-    """The error for an exception that came out of an env's code.
+    """Return the error that reports an exception of an env's code.
 
     Args:
         what: What failed, such as "CartPole-v1 raised an error in step()".
@@ -73,32 +73,32 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     frames = [
         Frame(frame.f_code.co_filename, line, frame.f_code.co_name) for frame, line in walk_tb(error.__traceback__)
     ]
-    # The outermost is the caller's.
+    # The outermost frame is the caller's.
     if (place := frame_of_env(frames[:0:-1])) is not None:
         detail += f" ({place})" if detail else f"at {place}"
     return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint)
 
 
 class Frame(NamedTuple):
-    """A call of a function."""
+    """A frame of a traceback."""
 
     file: str
     line: int
     name: str
 
     def __str__(self) -> str:
-        """Where it is, as editors take it."""
+        """Its place in the form that editors understand."""
         return f"{self.file}:{self.line} in {self.name}"
 
 
 def frame_of_env(frames: Sequence[Frame]) -> Frame | None:
-    """Of the frames inside a call of an env, innermost first, the innermost that is the env's own.
+    """Return the innermost frame that is the env's own, of the frames of a call of the env, innermost first.
 
-    What an env calls of others is inside its own frames, Gymnasium and its wrappers around them. Those that lie in the
-    folder of the outermost one are its own.
+    Gymnasium and its wrappers are outside the env's own frames, and the libraries that the env calls are inside of
+    them. Frames whose file is in the folder of the env's outermost frame are its own.
 
     Returns:
-        None: all are of this package or of Gymnasium.
+        The frame, or None if all are of this package or of Gymnasium.
     """
     own = [frame for frame in frames if not _is_around(frame.file)]
     if not own:
@@ -108,13 +108,13 @@ def frame_of_env(frames: Sequence[Frame]) -> Frame | None:
 
 
 def _is_around(file: str) -> bool:
-    """Whether a file is of Gymnasium, but for its environments, or of this package."""
+    """Whether a file belongs to this package, or to Gymnasium except its environments."""
     path = PurePath(file)
     return ("gymnasium" in path.parts and "envs" not in path.parts) or _PACKAGE in path.parents
 
 
 def close_env(env: Any) -> None:
-    """Close an environment that nobody needs any more; that it cannot be closed harms nobody."""
+    """Close an environment that is not needed any more; errors of closing are ignored."""
     try:
         env.close()
     except BaseException as error:

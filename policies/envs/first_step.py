@@ -1,7 +1,7 @@
-"""The first reset and the first step of an environment: whether it returns what Gymnasium asks for.
+"""Check that the first reset and the first step of an environment return what Gymnasium's API asks for.
 
-Training would find out too, in each trial and each retry; here it is found before anything starts. What is harmless,
-such as observations of float64 where the space says float32, passes: whatever steps environments converts it.
+Training would find out too, in each trial and each retry; this check finds out before anything starts. Harmless
+deviations pass, such as observations of float64 where the space says float32: they are converted in training.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
 
     Args:
         env: The environment.
-        env_id: For messages.
-        env_args: For messages.
+        env_id: Its id, for messages.
+        env_args: Its arguments, for messages.
 
     Raises:
-        EnvFailedError: It raised an error.
-        EnvError: It returned something else than it should.
+        EnvFailedError: The env raised an error.
+        EnvError: It returned something other than it should.
     """
     name = f"The environment {env_id!r}" + (f" with arguments {dict(env_args)!r}" if env_args else "")
     _check_call(
@@ -71,7 +71,7 @@ def _check_call(
         try:
             problem = find_problem(call(), env.observation_space)
         except BaseException as error:  # an env may raise anything
-            # A wrapper around it may have stumbled over what it returned.
+            # The error may be a wrapper's, caused by what the env returned.
             problem = find_problem(inner[-1], env.unwrapped.observation_space) if inner else None
             if problem is None:
                 raise env_failed(complaint, error, f"Check the env's arguments, or mend its {method}().") from error
@@ -81,7 +81,7 @@ def _check_call(
 
 @contextlib.contextmanager
 def _returned_by(inner: Any, method: str) -> Iterator[list[Any]]:
-    """What the method returns to the wrappers around an environment."""
+    """Collect in a list what a method of an environment returns to the wrappers around it."""
     returned: list[Any] = []
     original = getattr(inner, method)
 
@@ -103,7 +103,7 @@ def _returned_by(inner: Any, method: str) -> Iterator[list[Any]]:
 
 
 def _reset_problem(returned: Any, space: gym.Space[Any]) -> str | None:
-    """What is wrong with what reset() returned, or None."""
+    """Return what is wrong with the values that reset() returned, or None."""
     if not isinstance(returned, tuple) or len(returned) != 2:
         return f"{_kind(returned)}, not the two values (observation, info)"
     observation, info = returned
@@ -113,7 +113,7 @@ def _reset_problem(returned: Any, space: gym.Space[Any]) -> str | None:
 
 
 def _step_problem(returned: Any, space: gym.Space[Any]) -> str | None:
-    """What is wrong with what step() returned, or None."""
+    """Return what is wrong with the values that step() returned, or None."""
     if not isinstance(returned, tuple) or len(returned) != 5:
         return f"{_kind(returned)}, not the five values (observation, reward, terminated, truncated, info)"
     observation, reward, terminated, truncated, info = returned
@@ -157,7 +157,7 @@ def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
         return f"{_kind(observation)} as observation, not an array of shape {space.shape}"
     if array.shape != space.shape:
         return f"observations of shape {array.shape} but declares {space.shape}"
-    # Of a fraction, bytes would lose what is behind the point.
+    # Bytes would lose the decimals of a fraction.
     if array.dtype.kind not in ("biuf" if wanted.kind == "f" else "biu"):
         return f"observations of dtype {array.dtype} but declares {wanted}"
     for place in np.ndindex(array.shape) if not is_sound(array) else ():
@@ -167,12 +167,12 @@ def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
 
 
 def _if_finite(value: Any) -> str:
-    """What is added to a number that is not sound, though it is finite."""
+    """Return the explanation for a number that is refused although it is finite."""
     return ", which is infinite in 32 bits" if np.isfinite(value) else ""
 
 
 def _kind(value: Any) -> str:
-    """A value in a few words."""
+    """Describe a value in a few words."""
     if value is None:
         return "None"
     if isinstance(value, tuple | list):

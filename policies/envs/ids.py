@@ -1,4 +1,4 @@
-"""What an env id means: an entry of Gymnasium's registry, or something in a module that was allowed.
+"""Look up env ids: each means an entry of Gymnasium's registry, or a class in a module that was allowed.
 
 The registry's entry is looked up here, and Gymnasium is never handed the id itself: it would import the module that an
 id such as `module:Env-v0` names, allowed or not.
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 
 def normalize_env_id(env_id: str) -> str:
-    """The registered id that a user's id means: `CartPole` is the newest `CartPole-v<n>`.
+    """Return the registered id that a user's id means: `CartPole` means the newest `CartPole-v<n>`.
 
     An id of the form `module:Name` keeps its module, so that other processes import it too.
 
     Raises:
-        EnvError: Not a string, empty, not registered, or in a module that is not allowed or does not have it.
+        EnvError: The id is not a string, is empty or not registered, or its module is not allowed or does not have it.
     """
     return find_env(env_id)[0]
 
 
 def find_env(env_id: str) -> tuple[str, EnvSpec]:
-    """The normalised id, and what Gymnasium makes the environment from.
+    """Return the normalised id, and the entry of Gymnasium's registry that the environment is made from.
 
     Args:
         env_id: A registered id, with its version or without; or `module:Name` with the name of one that the module
             registers, or of a subclass of `gymnasium.Env` in it.
 
     Raises:
-        EnvError: As `normalize_env_id`.
+        EnvError: In the same cases as `normalize_env_id`.
     """
     if not isinstance(env_id, str) or not env_id.strip():
         raise EnvError(
@@ -66,7 +66,7 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
 
 
 def module_of(env_id: str) -> str | None:
-    """The module that an id names; None for one of the registry alone."""
+    """Return the module that an id names, or None if it names none."""
     module, colon, _ = env_id.strip().partition(":")
     return module if colon else None
 
@@ -76,7 +76,7 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
     try:
         module = import_module_allowed(module_name)
     except SpecError as error:
-        raise EnvError(f"The env id {env_id!r} names a module, by its colon. {error.message}", error.hint) from error
+        raise EnvError(f"The env id {env_id!r} names a module before its colon. {error.message}", error.hint) from error
     found = _find_registered(name)
     if found is not None:
         return f"{module_name}:{found}", gym.registry[found]
@@ -101,11 +101,11 @@ def _find_registered(env_id: str) -> str | None:
     try:
         namespace, name, version = parse_env_id(env_id)
         newest = find_highest_version(namespace, name) if version is None else None
-    except gym.error.Error:  # of no form that an id can have
+    except gym.error.Error:  # the id is malformed
         return None
     return None if newest is None else get_env_id(namespace, name, newest)
 
 
 def _nearest_ids(env_id: str, known: Iterable[str]) -> str:
-    # Versions of one environment are equally near.
+    # Up to three, because the versions of one environment are equally near.
     return did_you_mean(env_id, known, at_most=3, cutoff=0.7)

@@ -4,8 +4,8 @@ Words: an *env id* names a registered environment (`CartPole-v1`); *env argument
 its constructor takes; a *sub-environment* is one of the copies that a vector environment steps at once.
 
 What an id means is decided in `policies.envs.ids`; Gymnasium is given what was found, never the id. The env arguments
-may hold the reserved keys of `policies.envs.wrappers`, so that whoever makes the environment of a policy observes what
-the policy did in training.
+may hold the reserved keys of `policies.envs.wrappers`, so that wherever a policy's environment is made, the policy
+observes what it did in training.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ __all__ = [
     "normalize_env_id",
 ]
 
-# In an env runner's `env_config` beside the env's arguments, never among them.
+# These stand in an env runner's `env_config` beside the env's arguments, never among them.
 FAILURE_PENALTY, ALLOWED_MODULES = "failure_penalty", "allowed_modules"
-# Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and what env runners are
-# told beside the env's arguments.
+# Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and the keys of env runners
+# from above.
 _RESERVED_ARGS = frozenset(
     {
         "id",
@@ -70,20 +70,20 @@ _MAKE_ARGS = frozenset({"max_episode_steps"})
 
 @dataclass(frozen=True)
 class EnvInfo:
-    """What is known of an environment before anything is trained on it."""
+    """Facts about an environment, found before anything is trained on it."""
 
     env_id: str
     env_args: dict[str, Any] = field(hash=False)
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
     threshold: float | None
-    """Mean episode return from which it counts as solved; None if the env defines none."""
+    """Mean episode return from which the env counts as solved; None if the env defines none."""
     max_episode_steps: int | None
     """Env steps after which an episode is truncated; None if it never is."""
     has_vector_entry_point: bool
     """Whether `make_vector_env` uses the env's own vectorised version."""
     failure: FailureRule | None = None
-    """When its episodes end by failure; None: never, or it is not known."""
+    """The rule by which its episodes end by failure; None if they never do, or it is not known."""
 
     @property
     def observes_images(self) -> bool:
@@ -97,7 +97,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
     Args:
         env_id: Gymnasium id.
         env_args: Keyword arguments of its constructor; None: none.
-        algorithm: Check the action space for this one; None: for any.
+        algorithm: The algorithm that the action space is checked for; None: any.
 
     Raises:
         EnvError: The id is not registered, an argument is wrong, the env cannot be made, its spaces are of a kind
@@ -134,7 +134,7 @@ def make_env(
     Args:
         env_id: Gymnasium id, or `module:Name`.
         env_args: Keyword arguments of its constructor, and reserved keys of `policies.envs.wrappers`; None: none.
-        render_mode: As Gymnasium's; None: no rendering.
+        render_mode: One of Gymnasium's render modes; None: no rendering.
 
     Raises:
         EnvError: The id is not registered, an argument is wrong, or the constructor failed.
@@ -165,16 +165,16 @@ def make_vector_env(
 
     Args:
         env_id: Gymnasium id, or `module:Name`.
-        env_args: As `make_env`.
+        env_args: The same as for `make_env`.
         num_envs: Number of sub-environments.
         failure_penalty: Reward of steps that end by failure, for training alone: the outermost wrapper is then a
             `FailurePenalty`. None: the env's own reward.
 
     Raises:
-        EnvError: As `make_env`; or there is a penalty, and the env has no failure.
+        EnvError: In the same cases as `make_env`; or there is a penalty, and the env has no failure.
     """
     env_id, spec, kwargs, wrappers = _find(env_id, env_args)
-    # Before the render mode joins them.
+    # Looked at before the render mode joins the arguments.
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
@@ -199,7 +199,7 @@ def make_vector_env(
 
 
 def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec, dict[str, Any], ObservationWrappers]:
-    """The normalised id, what the env is made from, its constructor's arguments, and the wrappers around it."""
+    """Return the normalised id, the registry entry, the constructor's arguments, and the wrappers for the env."""
     kwargs = copy.deepcopy(dict(env_args or {}))
     with calls.inside(Call.IMPORT):
         env_id, spec = find_env(env_id)
@@ -209,10 +209,10 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
 
 
 def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
-    """The render mode that gives pixels.
+    """Return the render mode that gives pixels.
 
     Raises:
-        EnvError: The env does not have it.
+        EnvError: The env does not have that mode.
     """
     draw_without_display()
     modes = (getattr(_creator(env_id, spec), "metadata", None) or {}).get("render_modes")
@@ -226,7 +226,7 @@ def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
 
 
 def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
-    """The env's class, or the function that makes it; None if the entry has none.
+    """Return the env's class, or the function that makes it; None if the registry entry has neither.
 
     Raises:
         EnvError: The env's module cannot be imported.
@@ -241,7 +241,7 @@ def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
 
 
 def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
-    """Refuse arguments that the constructor does not take, naming the nearest that it does."""
+    """Refuse arguments that the constructor does not take, and suggest the nearest one that it takes."""
     creator = _creator(env_id, spec)
     takes_any = creator is None
     known = set(_MAKE_ARGS)
@@ -274,7 +274,7 @@ def _check_limit(env_id: str, limit: Any) -> None:
 
 
 def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
-    """Whether the env has a vectorised version that accepts these arguments and its time limit, and resets as ours."""
+    """Whether the env has a vectorised version that takes these arguments and the time limit, and resets as ours."""
     # A vector entry point would leave out wrappers of the registry entry, and a time limit it does not take.
     if spec.vector_entry_point is None or spec.additional_wrappers:
         return False
@@ -285,7 +285,7 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
         entry_point = spec.vector_entry_point
         creator = entry_point if callable(entry_point) else load_env_creator(entry_point)
         inspect.signature(creator).bind(num_envs=1, **kwargs)
-        # A loop over envs resets as everybody here expects; the same name as a text is allowed too.
+        # A loop over envs resets in the next step, as is expected here; the mode may also be given as a string.
         mode = (getattr(creator, "metadata", None) or {}).get("autoreset_mode", gym.vector.AutoresetMode.NEXT_STEP)
         return bool(gym.vector.AutoresetMode(mode) is gym.vector.AutoresetMode.NEXT_STEP)
     except (ImportError, AttributeError, TypeError, ValueError):
@@ -295,7 +295,7 @@ def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
 def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:
     if not is_of_env(error):
         raise error
-    if isinstance(error, EnvError):  # a wrapper's, which says what is wrong
+    if isinstance(error, EnvError):  # raised by a wrapper, with a message of its own
         return error
     detail = said_by(error) or "no message"
     arguments = f" with arguments {dict(env_args)!r}" if env_args else ""

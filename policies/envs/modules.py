@@ -1,9 +1,9 @@
-"""Python modules of a user's own that may be imported by name: with environments, wrappers or RLModules in them.
+"""Decide which Python modules of a user's own may be imported: those with environments, wrappers or RLModules.
 
-Importing a module runs its code, so a name in a sweep file or in a policy file is never enough. Who runs the sweep
-allows a module: by `--allow-module`, by `allow_modules`, by passing a class of it to a Python call, or with the
-environment variable TUNE_JOBS_ALLOWED_MODULES (names with commas between them), which other processes inherit. A
-package that is allowed brings its submodules.
+Importing a module runs its code, so a name in a sweep file or in a policy file is never enough. The person who runs
+the sweep has to allow the module: by `--allow-module`, by `allow_modules`, by passing a class of it to a Python call,
+or with the environment variable TUNE_JOBS_ALLOWED_MODULES (names with commas between them), which other processes
+inherit. A package that is allowed includes its submodules.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from policies.errors import SpecError, said_by
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
 _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
-# Names of packages here that a user's own may have too; see tune_jobs/process/own_packages.py.
+# Names of packages of this project that a user's own packages may have too; see tune_jobs/process/own_packages.py.
 _SHARED = ("policies", "analysis")
 
 _allowed: set[str] = set()
 _allowed_in_block: ContextVar[set[str] | None] = ContextVar("allowed_in_block", default=None)
-"""Beside those, in an `allowed_again` block: of the thread that runs it, as others may run blocks of their own."""
+"""More modules, allowed in the `allowed_again` block that a thread runs; other threads may run blocks of their own."""
 
 
 @checked
@@ -43,11 +43,11 @@ def allow_modules(names: Iterable[str]) -> None:
         names: Dotted names, such as `my_envs` or `my_package.envs`.
 
     Raises:
-        SpecError: One of them is no module's name; none is allowed then.
+        SpecError: One of them is not the name of a module; then none is allowed.
     """
     wanted = tuple(names)
     for name in wanted:
-        # A file's name has the form of a submodule's; nobody calls one `py`.
+        # The name of a file looks like that of a submodule called `py`, which nobody has.
         if not isinstance(name, str) or _NAME.fullmatch(name) is None or name.endswith(".py"):
             raise SpecError(
                 f"{name!r} is not the name of a Python module, so it cannot be allowed.",
@@ -59,7 +59,7 @@ def allow_modules(names: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def allowed_again() -> Iterator[None]:
-    """Afterwards allow what is allowed now, and nothing that the block has: a sweep's modules are its own."""
+    """Undo at the end of the block what it allowed, so that the modules of a sweep are allowed for that sweep only."""
     token = _allowed_in_block.set(set(_allowed_in_block.get() or ()))
     try:
         yield
@@ -68,7 +68,7 @@ def allowed_again() -> Iterator[None]:
 
 
 def allowed_modules() -> tuple[str, ...]:
-    """The modules that are allowed in this process, sorted; those of the environment variable too."""
+    """Return the modules that are allowed in this process, sorted, including those of the environment variable."""
     inherited = (name.strip() for name in os.environ.get(ENVIRONMENT_VARIABLE, "").split(","))
     in_block = _allowed_in_block.get() or ()
     return tuple(sorted(_allowed.union(in_block, (name for name in inherited if name))))
@@ -80,9 +80,9 @@ def is_allowed(module: str) -> bool:
 
 
 def module_folders() -> list[str]:
-    """The folders on this process's path that hold the allowed modules, for other processes' paths.
+    """Return the folders on this process's path that hold the allowed modules, to be put on other processes' paths.
 
-    Those that this process has not imported are looked for, not imported.
+    Modules that this process has not imported are looked for, but not imported.
     """
     found = []
     for name in allowed_modules():
@@ -90,7 +90,7 @@ def module_folders() -> list[str]:
         if file is None:
             continue
         path = Path(file).absolute()
-        # Of a package, __file__ is its __init__.py.
+        # The __file__ of a package is its __init__.py.
         place = path.parent if path.name == "__init__.py" else path
         folder = str(place.parents[depth])
         if folder in {os.path.abspath(entry) for entry in sys.path}:  # noqa: PTH100 (sys.path holds strings)
@@ -99,9 +99,9 @@ def module_folders() -> list[str]:
 
 
 def _file_of(name: str) -> tuple[str | None, int]:
-    """The file (or the folder) of a module or of the package that it is in, and how many packages that is in."""
+    """Return the file or folder of a module or of a package around it, and how many packages that is in."""
     top = name.partition(".")[0]
-    # Of the module itself: two projects may share a package, as a user's own `policies` does with this one.
+    # The module itself comes first: two projects may share a package, as a user's own `policies` does with this one.
     module: Any = sys.modules.get(name) or (None if top in _SHARED else sys.modules.get(top))
     if module is not None:
         file = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
@@ -117,8 +117,8 @@ def _file_of(name: str) -> tuple[str | None, int]:
 def import_module_allowed(module: str) -> ModuleType:
     """Import a module, if it is allowed.
 
-    It is looked for in the current folder too, after all other places: the `tune-jobs` command does not have that
-    folder on its path, as a script does.
+    It is looked for in the current folder too, after all other places: a script has that folder on its path, but the
+    `tune-jobs` command does not.
 
     Raises:
         SpecError: The module is not allowed, is nowhere to be found, or raises an error.
@@ -131,7 +131,7 @@ def import_module_allowed(module: str) -> ModuleType:
         )
     here = os.getcwd()  # noqa: PTH109 (sys.path holds strings)
     if module in _SHARED and here not in sys.path:
-        # Found in any case, and asked for what the user's own has.
+        # The package itself is always found; whether the user's own has the module is seen next.
         sys.path.append(here)
     try:
         try:
@@ -146,7 +146,7 @@ def import_module_allowed(module: str) -> ModuleType:
         if not _is_part(error.name, module):
             raise _failed(module, error) from error
         raise SpecError(
-            f"The module {module!r} is allowed, but there is none: {error}.",
+            f"The module {module!r} is allowed, but it was not found: {error}.",
             "Run the command in the folder that holds it, or add that folder to PYTHONPATH, on every machine that "
             "runs trials.",
         ) from error
@@ -157,7 +157,7 @@ def import_module_allowed(module: str) -> ModuleType:
 
 
 def _is_part(missing: str | None, module: str) -> bool:
-    """Whether what is missing is the module itself or a package around it, not something that it imports."""
+    """Whether the missing module is this one or a package around it, and not something that it imports."""
     return missing is not None and (module == missing or module.startswith(f"{missing}."))
 
 
@@ -169,14 +169,14 @@ def _failed(module: str, error: BaseException) -> SpecError:
 
 
 def import_allowed(path: str) -> Any:
-    """What `module:Name` names, if the module is allowed.
+    """Import and return what `module:Name` names, if the module is allowed.
 
     Args:
         path: A module's dotted name, a colon, and the name of something in it, such as a class.
 
     Raises:
-        SpecError: The path is of another form, its module is not allowed or cannot be imported, or nothing in it has
-            that name.
+        SpecError: The path has another form, its module is not allowed or cannot be imported, or nothing in it has that
+            name.
     """
     module_name, _, name = path.partition(":")
     if _NAME.fullmatch(module_name) is None or not name.isidentifier():
@@ -192,11 +192,11 @@ def import_allowed(path: str) -> Any:
 
 
 def path_of(thing: type[Any], what: str) -> str:
-    """The `module:Name` under which other processes find a class; allows its module.
+    """Return the `module:Name` under which other processes find a class, and allow its module.
 
     Args:
-        thing: A class that a Python call was given.
-        what: What it is, for messages.
+        thing: A class that was passed to a Python call.
+        what: The role of the class, for messages.
 
     Raises:
         SpecError: It is defined in a script, a notebook or a function, where no other process finds it.

@@ -1,4 +1,4 @@
-"""Environments of other installed packages.
+"""Register the environments of other installed packages.
 
 A package with environments declares a function that registers them as an entry point of the group `gymnasium.envs`,
 under the name of their namespace, or `__root__` for none. Gymnasium called these functions until 1.0 and calls none
@@ -24,7 +24,7 @@ def load_env_plugins() -> tuple[str, ...]:
     """Let installed packages register their environments; only the first call does anything.
 
     Returns:
-        For each package that could not, a sentence that says why.
+        A sentence for each package that could not, which says why.
     """
     problems = []
     for entry_point in metadata.entry_points(group=GROUP):
@@ -32,7 +32,7 @@ def load_env_plugins() -> tuple[str, ...]:
         registration.current_namespace = None if entry_point.name == _NO_NAMESPACE else entry_point.name
         try:
             entry_point.load()()
-        except Exception as error:  # noqa: BLE001 (its own environments are missing then, and no others)
+        except Exception as error:  # noqa: BLE001 (then only its own environments are missing)
             package = entry_point.dist.name if entry_point.dist is not None else entry_point.value
             problems.append(
                 f"The package {package} could not register its own: {type(error).__name__}: {said_by(error)}."

@@ -1,6 +1,6 @@
-"""What to wrap an environment in whose spaces no algorithm here can take: Gymnasium's own wrappers, as an expression.
+"""Suggest a wrapper for an environment with unsupported spaces, as an expression of Gymnasium's own wrappers.
 
-The expressions are complete but for imports: of `gymnasium`, `numpy` and an env's own module. A test evaluates each.
+The expressions lack only the imports of `gymnasium`, `numpy` and an env's own module. A test evaluates each of them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _MAX_COMBINATIONS = 10_000
 
 
 def observation_hint(env_id: str, space: gym.Space[Any]) -> str:
-    """What makes vectors of float32, or images, of these observations."""
+    """Suggest what turns these observations into vectors of float32, or into images."""
     if not space.is_np_flattenable or 0 in (space.shape or ()):
         return f"{_HOW}, in a gymnasium.ObservationWrapper that makes a vector of float32 of an observation."
     env, dimensions = _make(env_id), len(space.shape or ()) if isinstance(space, gym.spaces.Box) else 0
@@ -35,7 +35,7 @@ def observation_hint(env_id: str, space: gym.Space[Any]) -> str:
 
 
 def action_hint(env_id: str, space: gym.Space[Any]) -> str:
-    """What makes Discrete or 1-D Box actions of these."""
+    """Suggest what turns these actions into Discrete or 1-D Box actions."""
     env = _make(env_id)
     sizes = _combinations(space)
     if sizes is not None and math.prod(sizes) <= _MAX_COMBINATIONS:
@@ -70,7 +70,7 @@ def _parts(space: gym.Space[Any]) -> list[gym.Space[Any]]:
 
 
 def _combinations(space: gym.Space[Any]) -> tuple[int, ...] | None:
-    """How many choices each number of an action has; None if it is not made of choices that are counted from 0."""
+    """Return how many choices each number of an action has; None if they are not choices counted from 0."""
     if isinstance(space, gym.spaces.MultiBinary):
         return (2,) * int(np.prod(space.shape))
     if isinstance(space, gym.spaces.MultiDiscrete) and not np.any(space.start):

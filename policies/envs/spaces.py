@@ -1,4 +1,4 @@
-"""Box and Discrete spaces as JSON objects, and the numbers that observations are held as."""
+"""Write Box and Discrete spaces as JSON objects and read them again, and choose the dtype of observations."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from policies.errors import MALFORMED, CheckpointError
 
 _MAX_SIZE = 10_000_000
-"""Numbers in an observation; 25 times those of four frames of an Atari screen."""
+"""The most numbers an observation may have: 25 times as many as four frames of an Atari screen."""
 
 
 def observation_dtype(space: gym.Space[Any]) -> type[np.uint8 | np.float32]:
-    """Of the arrays of observations, whatever the env's own: images stay bytes, a quarter of the memory."""
+    """Return the dtype that observations are stored in: images stay bytes, which take a quarter of the memory."""
     return np.uint8 if space.dtype == np.uint8 else np.float32
 
 
 def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
-    """A Box or Discrete space as a JSON object.
+    """Return a Box or Discrete space as a JSON object.
 
-    Infinite bounds become the strings "inf" and "-inf"; bounds that are all equal become one number, or an image's
-    would fill pages.
+    Infinite bounds become the strings "inf" and "-inf". Bounds that are all equal become one number, because the bounds
+    of an image would fill pages.
 
     Raises:
-        CheckpointError: A space of another kind.
+        CheckpointError: The space is of another kind.
     """
     if isinstance(space, gym.spaces.Box):
         return {
@@ -47,7 +47,7 @@ def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
 
 
 def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | gym.spaces.Discrete[Any]:
-    """The space that `describe_space` described.
+    """Return the space that `describe_space` described.
 
     Raises:
         CheckpointError: The description is incomplete or contradicts itself.
@@ -58,7 +58,7 @@ def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | g
         if description["type"] == "box":
             dtype = np.dtype(description["dtype"])
             shape = tuple(int(size) for size in description["shape"])
-            # Before there is an array of that size.
+            # Checked before an array of that size is made.
             if min(shape, default=0) < 0 or math.prod(shape) > _MAX_SIZE:
                 raise ValueError(f"its shape is {shape}")
             low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))

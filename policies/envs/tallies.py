@@ -1,7 +1,8 @@
-"""How far the trials of this process are, in memory shared with files: it outlives the process, however that ends.
+"""Count how far the trials of this process are, in files mapped into memory, which outlive the process.
 
-A *tally* counts the env steps and episodes of one trial. Whoever steps its environments adds to it at every step, so it
-also knows of the iteration in which an env hangs, raises an error or ends the process, of which nothing is written.
+A *tally* counts the env steps and episodes of one trial. The code that steps the trial's environments adds to it at
+every step. So it also counts the iteration in which an env hangs, raises an error or ends the process, for which no
+result is written.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ _ITERATIONS, _STEPS, _EPISODES, _TIME = range(4)
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a trial came."""
+    """How far a trial has come."""
 
     num_iterations: int
-    """Whole ones."""
+    """The number of whole episodes."""
     num_env_steps: int
     num_episodes: int
     time_s: float
 
 
 class Tally:
-    """Of one trial; made anew by each process that trains it.
+    """The tally of one trial; each process that trains the trial makes a new one.
 
     Args:
-        path: Its file. One that is there is replaced: a process that has it and is not gone yet writes into nothing.
-            Where it cannot be written, or its file system shares no memory with files, the tally is this process's own.
-        begun: Where the trial goes on from.
+        path: Its file. An older file is replaced, so an older process that has not ended yet does not write into this
+            tally. If the file cannot be written, or the file system cannot map it, the tally is kept in memory only.
+        begun: How far the trial is when the process begins.
     """
 
     def __init__(self, path: Path, begun: Reached) -> None:
@@ -53,31 +54,31 @@ class Tally:
         self.set(begun)
 
     def add(self, num_env_steps: int, num_episodes: int) -> None:
-        """Count what a step gave."""
+        """Add the env steps and episodes of a step."""
         cells = self._cells
         cells[_STEPS] += num_env_steps
         cells[_EPISODES] += num_episodes
         cells[_TIME] = time.perf_counter() - self._began
 
     def set(self, reached: Reached) -> None:
-        """Take what is known better, such as at an iteration's end."""
+        """Set the tally, where better numbers are known, such as at an iteration's end."""
         cells = self._cells
         cells[_ITERATIONS], cells[_STEPS] = reached.num_iterations, reached.num_env_steps
         cells[_EPISODES], cells[_TIME] = reached.num_episodes, reached.time_s
 
     @property
     def reached(self) -> Reached:
-        """What it says now."""
+        """How far the trial is now."""
         return _reached(*self._cells)
 
     def remove(self) -> None:
-        """Delete the file: what it says is written elsewhere."""
+        """Delete the file, once its numbers are written elsewhere."""
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
 
 
 def read_tally(path: Path) -> Reached | None:
-    """What a tally's file says; None: there is none, or it is none."""
+    """Read a tally's file; None if there is none, or it is not a tally."""
     try:
         return _reached(*struct.unpack(_FORMAT, read_regular(path, _SIZE)))
     except (OSError, struct.error, ValueError, OverflowError):
@@ -92,21 +93,21 @@ _tallies: dict[str, Tally] = {}
 
 
 def begin_tally(trial_id: str, path: Path, begun: Reached) -> Tally:
-    """Let those who step a trial's environments in this process count; see `Tally`."""
+    """Begin to count the steps of a trial that this process trains; see `Tally`."""
     tally = _tallies[trial_id] = Tally(path, begun)
     return tally
 
 
 def end_tally(trial_id: str) -> None:
-    """Count a trial no more."""
+    """Stop counting a trial."""
     _tallies.pop(trial_id, None)
 
 
 def tally_of(trial_id: str) -> Tally | None:
-    """Of a trial that this process trains."""
+    """Return the tally of a trial, or None if this process does not train it."""
     return _tallies.get(trial_id)
 
 
 def only_tally() -> Tally | None:
-    """Of the one trial that this process trains; None if there is none, or are several."""
+    """Return the tally of the only trial that this process trains; None if there are none or several."""
     return next(iter(_tallies.values())) if len(_tallies) == 1 else None

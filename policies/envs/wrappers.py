@@ -1,8 +1,8 @@
-"""Wrappers that change what is observed, and the one that changes what training is rewarded with.
+"""Wrappers that change observations, and one that changes the rewards of training.
 
-Frames and pixels belong to the environment: whoever acts in it, in training, evaluation or a video, observes the same.
+Frames and pixels belong to the environment: the observations are the same in training, evaluation and videos.
 So they travel in the env arguments, under the reserved keys `frame_stack` and `pixels`. The failure penalty belongs to
-training alone, and is never among them.
+training alone, and is never among the env arguments.
 
 Words: a *frame* is one observation; an *image* is of shape (rows, columns, channels).
 """
@@ -24,25 +24,25 @@ from policies.errors import EnvError
 
 FRAME_STACK, PIXELS = "frame_stack", "pixels"
 MAX_PIXELS = 64
-"""Rows and columns that `shrink_to_grey` makes at most."""
+"""The most rows and columns that `shrink_to_grey` makes."""
 
-# Share of red, green and blue in the brightness that is seen (ITU-R BT.601).
+# Shares of red, green and blue in the perceived brightness (ITU-R BT.601).
 _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 @dataclass(frozen=True)
 class ObservationWrappers:
-    """Which wrappers an environment gets around its time limit: pixels first, then frames."""
+    """The wrappers that an environment gets around its time limit: pixels first, then frames."""
 
     frame_stack: int = 1
     pixels: bool = False
 
     @classmethod
     def take_from(cls, env_args: dict[str, Any]) -> ObservationWrappers:
-        """Take the reserved keys out of an environment's arguments; what is left is its constructor's.
+        """Take the reserved keys out of an environment's arguments; the arguments of its constructor are left.
 
         Raises:
-            EnvError: A value is of the wrong kind.
+            EnvError: A value has the wrong type.
         """
         frames, pixels = env_args.pop(FRAME_STACK, 1), env_args.pop(PIXELS, False)
         if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
@@ -52,21 +52,21 @@ class ObservationWrappers:
         return cls(frames, pixels)
 
     def wrap(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-        """One environment with these wrappers; for pixels it must have been made to render."""
+        """Return an environment with these wrappers; for pixels, it must have been made with a render mode."""
         env = self.wrap_pixels(env)
         return StackFrames(env, self.frame_stack) if self.frame_stack > 1 else env
 
     def wrap_pixels(self, env: gym.Env[Any, Any]) -> Any:
-        """One environment with pixels, if they are wanted."""
+        """Return an environment that observes pixels, if they are wanted, else the environment itself."""
         return ObservePixels(env) if self.pixels else env
 
     def wrap_vector(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> gym.vector.VectorEnv[Any, Any, Any]:
-        """A vector environment, whose sub-environments have the pixels already, with stacked frames."""
+        """Return a vector environment with stacked frames; its sub-environments have the pixels already."""
         return StackFramesVector(env, self.frame_stack) if self.frame_stack > 1 else env
 
 
 def with_wrappers(env_args: Mapping[str, Any], *, frame_stack: int, pixels: bool) -> dict[str, Any]:
-    """Env arguments with the reserved keys of the wrappers that change something."""
+    """Return env arguments with the reserved keys of those wrappers that change something."""
     wrapped = dict(env_args)
     if frame_stack > 1:
         wrapped[FRAME_STACK] = frame_stack
@@ -76,7 +76,7 @@ def with_wrappers(env_args: Mapping[str, Any], *, frame_stack: int, pixels: bool
 
 
 def shrink_to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A small grey picture of a large coloured one: the mean brightness of square blocks.
+    """Return a small grey picture of a large coloured one, made of the mean brightness of square blocks.
 
     Blocks are the smallest that give at most `MAX_PIXELS` rows and columns; what is left over at the edges is cut off
     in equal parts. CartPole's (400, 600, 3) become (40, 60, 1).
@@ -90,7 +90,7 @@ def shrink_to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     size = max(1, math.ceil(max(picture.shape[:2]) / MAX_PIXELS))
     rows, columns = (max(1, length // size) for length in picture.shape[:2])
     top, left = (picture.shape[0] - rows * size) // 2, (picture.shape[1] - columns * size) // 2
-    if top < 0 or left < 0:  # a picture so narrow that not even one block fits
+    if top < 0 or left < 0:  # the picture is so narrow that not even one block fits
         return _grey(picture.mean(axis=(0, 1), keepdims=True))
     cut = picture[top : top + rows * size, left : left + columns * size]
     # Rows first, with whole lines in one addition: several times faster than one mean over both axes.
@@ -118,13 +118,13 @@ class ObservePixels(gym.ObservationWrapper[Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        # An environment renders only after a reset, and of its picture's size nothing else is known.
+        # An environment renders only after a reset, and nothing else tells the size of its pictures.
         env.reset(seed=0)
         image = self.observation(None)
         self.observation_space = gym.spaces.Box(0, 255, image.shape, np.uint8)
 
     def observation(self, observation: Any) -> NDArray[np.uint8]:
-        """The picture of this moment, whatever the environment's own observation."""
+        """Return the picture of this moment in place of the environment's own observation."""
         del observation
         picture: Any = self.env.render()
         if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] != 3:
@@ -148,12 +148,12 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
 
 
 class StackFrames(gym.Wrapper[Any, Any, Any, Any]):
-    """Observe the last frames at once, oldest first; before the first step they are all the reset's.
+    """Observe the last frames at once, oldest first; after a reset they are all the first observation.
 
     Vectors of n numbers are joined into one of shape (num_frames * n,), images along their channels.
 
     Raises:
-        EnvError: The observations are neither.
+        EnvError: The observations are neither vectors nor images.
     """
 
     def __init__(self, env: gym.Env[Any, Any], num_frames: int) -> None:
@@ -169,16 +169,16 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any]):
         return self._stack, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment; its observation takes the place of the oldest."""
+        """Step the environment; its observation replaces the oldest one."""
         frame, reward, terminated, truncated, info = self.env.step(action)
         self._stack = _push(self._stack, np.asarray(frame))
         return self._stack, reward, terminated, truncated, info
 
 
 class StackFramesVector(gym.vector.VectorWrapper):
-    """`StackFrames` of every sub-environment: observations of shape (num_envs, ..., num_frames * n).
+    """`StackFrames` for every sub-environment: observations have the shape (num_envs, ..., num_frames * n).
 
-    For vector environments that reset in the step after an episode's end, as `make_vector_env` makes them.
+    It is for vector environments that reset in the step after an episode's end, as `make_vector_env` makes them.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], num_frames: int) -> None:
@@ -200,7 +200,7 @@ class StackFramesVector(gym.vector.VectorWrapper):
         return self._stack, info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all; where this was only the reset after an episode's end, the stack begins anew."""
+        """Step all sub-environments; where the step only reset an ended episode, the stack begins anew."""
         frames, rewards, terminated, truncated, info = self.env.step(actions)
         stack = _push(self._stack, frames)
         if self._ended.any():
@@ -210,15 +210,15 @@ class StackFramesVector(gym.vector.VectorWrapper):
 
 
 def _push(stack: NDArray[Any], frames: NDArray[Any]) -> NDArray[Any]:
-    """A new array: whoever keeps the one before must not see it change."""
+    """Return the stack with new frames, as a new array, because callers may keep the old one."""
     return np.concatenate([stack[..., frames.shape[-1] :], frames], axis=-1)
 
 
 class FailurePenalty(gym.vector.VectorWrapper):
     """Replaces the reward of a step that ends an episode by failure; for training alone.
 
-    `unpenalized_rewards` are the environment's own rewards of the last step, of shape (num_envs,): returns that are
-    reported are made of these.
+    `unpenalized_rewards` are the environment's own rewards of the last step, shape (num_envs,). Reported returns are
+    their sums.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], rule: FailureRule, penalty: float) -> None:
@@ -230,7 +230,7 @@ class FailurePenalty(gym.vector.VectorWrapper):
         """Step all sub-environments."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         self.unpenalized_rewards = rewards
-        # Whole numbers of a vectorised version would cut off the penalty's fraction.
+        # A vectorised version may give whole numbers, in which the penalty would lose its decimals.
         dtype = np.result_type(rewards.dtype, np.float32)
         penalized = np.where(self.rule.failed(rewards, terminated), self.penalty, rewards).astype(dtype)
         return observations, penalized, terminated, truncated, info

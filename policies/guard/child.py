@@ -1,4 +1,4 @@
-"""What runs in the guard's child: jobs, each a function of JSON that returns JSON; see `guard`."""
+"""The program of the guard's child: it runs jobs, functions that take and return JSON; see `guard`."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ def main(parent: int, connection: int, page: int, dump: int) -> None:
     """Do jobs until the parent closes the connection, or ends.
 
     Args:
-        parent: Its process id.
-        connection: Descriptor of this end of the pipe to it.
-        page: Of the file that calls are told in.
-        dump: Of the file that the fault handler writes to.
+        parent: The parent's process id.
+        connection: Descriptor of this end of the pipe to the parent.
+        page: Descriptor of the file with the page that calls are written to (see `policies.envs.calls`).
+        dump: Descriptor of the file that the fault handler writes to.
     """
     _end_with(parent)
     faulthandler.enable(dump)
     faulthandler.register(signal.SIGUSR1, dump, all_threads=True)
-    # Standard output may be for one JSON document, and a log has room for what environments print.
+    # The parent's standard output may be reserved for one JSON document, so what environments print goes elsewhere.
     with contextlib.suppress(OSError):
         os.dup2(2, 1)
     told = calls.Page(page)
     calls.tell(told)
-    import policies.packed.envs.make  # noqa: F401 (every job needs this much, and the parent is busy yet)
+    import policies.packed.envs.make  # noqa: F401 (loaded early: every job needs it, and the parent is still busy)
 
-    # Then a KeyboardInterrupt that an env raises is told from one that came by a signal.
+    # After this, a KeyboardInterrupt that an env raises can be told from one that came by a signal.
     env_faults.note_signals()
     pipe = Connection(connection)
     while True:
@@ -60,7 +60,7 @@ def main(parent: int, connection: int, page: int, dump: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent ends, whatever it is in then."""
+    """End this process when its parent ends, whatever it is doing then."""
     if sys.platform == "linux":
         import ctypes
 
@@ -95,13 +95,13 @@ def _answer(asked: Mapping[str, Any], told: calls.Page) -> dict[str, Any]:
                 "kind": EnvFailedError.__name__,
                 "message": f"{arguments['env_id']} raised {type(error).__name__} in {told.last_raised.phrase}: "
                 f"{said_by(error)}.",
-                "hint": "Mend the env: what goes wrong in it must be an Exception.",
+                "hint": "Mend the env: what it raises must be an Exception.",
             }
         return {"error": said}
 
 
 def _see(asked: Mapping[str, Any]) -> None:
-    """Let this process find what the parent does."""
+    """Give this process the parent's folder, import path and allowed modules."""
     env_modules.allow_modules(asked["modules"])
     if os.getcwd() != asked["folders"][0]:  # noqa: PTH109
         os.chdir(asked["folders"][0])
@@ -113,7 +113,7 @@ def _see(asked: Mapping[str, Any]) -> None:
 
 
 def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str, Any]:
-    """See `policies.envs.make.check_env`."""
+    """Run `policies.envs.make.check_env` and return what it found as JSON."""
     from policies.envs.make import check_env as check
     from policies.envs.spaces import describe_space
 
@@ -130,14 +130,14 @@ def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str
 
 
 def check_seedable(env_id: str, env_args: dict[str, Any]) -> None:
-    """See `policies.packed.envs.make.check_seedable`."""
+    """Run `policies.packed.envs.make.check_seedable`."""
     from policies.packed.envs.make import check_seedable as check
 
     check(env_id, env_args)
 
 
 def measure_step(env_id: str, env_args: dict[str, Any]) -> dict[str, Any]:
-    """See `policies.packed.envs.make.measure_step`."""
+    """Run `policies.packed.envs.make.measure_step` and return what it measured."""
     from policies.packed.envs.make import measure_step as measure
 
     return vars(measure(env_id, env_args))
@@ -146,7 +146,7 @@ def measure_step(env_id: str, env_args: dict[str, Any]) -> dict[str, Any]:
 def evaluate_policy(
     env_id: str, env_args: dict[str, Any], policy: dict[str, str], seeds: Sequence[int], max_episode_steps: int | None
 ) -> dict[str, Any]:
-    """See `policies.acting.evaluate.evaluate_policy`."""
+    """Run `policies.acting.evaluate.evaluate_policy` with a saved policy and return the episodes."""
     from policies.acting.evaluate import evaluate_policy as evaluate
 
     return vars(
@@ -157,7 +157,7 @@ def evaluate_policy(
 
 
 def record_video(env_id: str, policy: dict[str, str], files: dict[str, str | None], **options: Any) -> dict[str, Any]:
-    """See `policies.acting.video.record_video`."""
+    """Run `policies.acting.video.record_video` with a saved policy and return the episodes."""
     from policies.acting.video import record_video as record
 
     return vars(record(_load(policy), env_id=env_id, **_paths(files), **options))
@@ -167,7 +167,7 @@ def record_comparison(
     env_id: str, left: dict[str, str], right: dict[str, str], files: dict[str, str], captions: Sequence[str],
     **options: Any,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """See `policies.acting.video.record_comparison`."""
+    """Run `policies.acting.video.record_comparison` with two saved policies and return their episodes."""
     from policies.acting.video import record_comparison as record
 
     one, other = captions

@@ -1,12 +1,12 @@
 """The guard: a child process in which environments run outside of trials.
 
-An environment is somebody's code: it may hang, and it may end its process. In a trial, that is the trial's failure. In
-the plan, the confirmation and the films it would be the end of the process that drives the sweep. So these are done in
-a child, which is waited for while its calls (see `calls`) make progress. It sees what the processes of trials see: Ray
-gives them the working directory and the main script's folder, and PYTHONPATH what allowed modules need beside it.
+An environment is a user's code: it may hang, and it may end its process. In a trial, that is a failure of the trial. In
+the plan, the confirmation and the videos, it would end the process that drives the sweep. So these run in a child
+process, which is waited for as long as its calls (see `calls`) make progress. The child has the same import path as the
+processes of trials: the working directory and the main script's folder, which Ray gives those, and PYTHONPATH.
 
-One child does the work of one call of the Python API or one command, from the plan to the films: its start costs less
-than half a second, and overlaps with whatever its parent does at that time.
+One child does the work of one call of the Python API or one command, from the plan to the videos. It starts in less
+than half a second, while its parent does other work.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from policies.files import absolute
 from policies.standard_streams import standard_streams
 
 CALL_TIMEOUT_S = 600.0
-"""How long one call may take, where no sweep says it."""
+"""How long one call may take, unless a sweep sets it."""
 _OWN_TIMEOUT_S = 600.0
-"""At least, for what is no user's code: an encoder that hangs, say."""
+"""The least time limit outside of a user's code, such as for an encoder that hangs."""
 _LOOK_S = 0.5
-"""Between two looks at the page, if nothing comes before."""
+"""The time between two looks at the page while no answer comes."""
 _PATIENCE_S = 5.0
-"""How long the child may take to end by itself."""
+"""How long the child may take to end by itself before it is killed."""
 _TRACEBACK_S = 1.0
 _MAX_FRAMES = 8
 _PACKAGE = Path(__file__).parents[1]
-# `-P`: nothing of the working directory can stand in for this package. The user's folders come later.
+# With `-P`, nothing in the working directory can hide this package. The user's folders are added later.
 _BOOTSTRAP = """\
 import sys
 sys.path.insert(0, {root!r})
@@ -56,23 +56,23 @@ main({parent}, {connection}, {page}, {dump})
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """What a child has to be started anew for, if it differs."""
+    """The surroundings that a child was started with; where they change, a new child is started."""
 
     folders: tuple[str, ...]
-    """At the front of the path: the working directory, and the main script's folder."""
+    """The folders at the front of the import path: the working directory and the main script's folder."""
     environment: tuple[str | None, ...]
 
     @classmethod
     def now(cls) -> _Surroundings:
         folders = [str(absolute(Path()))]
-        script = os.path.dirname(os.path.realpath(sys.argv[0]))  # noqa: PTH120 (as Ray finds it)
+        script = os.path.dirname(os.path.realpath(sys.argv[0]))  # noqa: PTH120 (the same way as Ray)
         if hasattr(sys.modules.get("__main__"), "__file__") and script in sys.path:
             folders.append(script)
         return cls(tuple(folders), tuple(os.environ.get(name) for name in ("PYTHONPATH", ENVIRONMENT_VARIABLE)))
 
 
 class _Child:
-    """A running child, and what is shared with it."""
+    """A running child, and the pipe and files that it shares with this process."""
 
     def __init__(self, surroundings: _Surroundings) -> None:
         self.surroundings = surroundings
@@ -96,7 +96,7 @@ class _Child:
                 [sys.executable, "-P", "-c", code],
                 stdin=subprocess.DEVNULL,
                 pass_fds=numbers,
-                # Ctrl-C in a terminal is for the parent, which ends the child.
+                # Ctrl-C in a terminal reaches only the parent, which then ends the child.
                 start_new_session=True,
             )
         except OSError as error:
@@ -109,19 +109,19 @@ class _Child:
 
     @property
     def was_lost(self) -> bool:
-        """Whether it has ended though nobody had asked it anything: by the system, where memory is scarce, say.
+        """Whether it ended between two jobs, for example because the system killed it when memory was scarce.
 
-        One that could not even begin has not, and is to say so.
+        It is False for a child that could not even begin, so that its error is reported.
         """
         code = self.process.poll()
         return code is not None and (self.has_worked or code < 0)
 
     def frames(self) -> list[str]:
-        """Where the user's code is or was, innermost first, as Python's fault handler wrote it."""
+        """Return the frames of the user's code, innermost first, as Python's fault handler wrote them."""
         self._dump.seek(0)
         said = self._dump.read().decode("utf-8", errors="replace")
         frames: list[str] = []
-        # Its main thread comes last; what is above it are others.
+        # The main thread's frames come last, after those of other threads.
         for line in said.rpartition("(most recent call first):")[2].splitlines():
             place = line.strip()
             if place.startswith(f'File "{_PACKAGE}'):
@@ -129,12 +129,12 @@ class _Child:
             if place.startswith("File "):
                 frames.append(place)
         if any("gymnasium" not in frame for frame in frames):
-            while "gymnasium" in frames[-1]:  # the wrappers that the call came through
+            while "gymnasium" in frames[-1]:  # Gymnasium's wrappers, which the call came through
                 frames.pop()
         return frames[:_MAX_FRAMES]
 
     def dump_frames(self) -> None:
-        """Let the fault handler write where it is; it needs no Python for that."""
+        """Let the fault handler write the child's frames, which works while its Python code hangs."""
         with contextlib.suppress(OSError):
             self.process.send_signal(signal.SIGUSR1)
         end = time.monotonic() + _TRACEBACK_S
@@ -149,7 +149,7 @@ class _Child:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(patience_s)
         finally:
-            # Also where somebody is out of patience. The group: what the env started too.
+            # Also where this process is interrupted while it waits. The group includes what the env started.
             with contextlib.suppress(OSError):
                 os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
@@ -160,14 +160,14 @@ class _Child:
 class EnvGuard:
     """Runs jobs in a child, one after another; a context manager.
 
-    The child is started by `start` or the first job, and again after one that hung or ended it.
+    The child is started by `start` or by the first job, and again after a job that hung or ended it.
     """
 
     def __init__(self) -> None:
         self._child: _Child | None = None
 
     def start(self) -> None:
-        """Start the child, if there is none, and do not wait for it."""
+        """Start the child, if there is none, without waiting for it."""
         if self._child is None:
             self._child = _Child(_Surroundings.now())
 
@@ -175,7 +175,7 @@ class EnvGuard:
         """End the child."""
         if self._child is not None:
             child, self._child = self._child, None
-            # Before its first job, there is nothing that it could leave behind.
+            # Before its first job, the child has nothing to clean up.
             child.close(patience_s=_PATIENCE_S if child.has_worked else 0.0)
 
     def __enter__(self) -> Self:
@@ -189,16 +189,16 @@ class EnvGuard:
 
         Args:
             job: A function of `policies.guard.child`.
-            env_id: Its environment.
+            env_id: The environment that the job is about.
             timeout_s: How long one call of the user's code may take; the job may take longer.
-            arguments: What else the function takes, as JSON.
+            arguments: The function's other arguments, as JSON.
 
         Returns:
-            What it returned, as JSON.
+            The function's result, as JSON.
 
         Raises:
             EnvFailedError: The environment hung, or ended the process.
-            TuneJobsError: Whatever of these the function raised.
+            TuneJobsError: The function raised it.
         """
         child = self._ready_child()
         asked = {
@@ -209,12 +209,12 @@ class EnvGuard:
             "arguments": {"env_id": env_id, **arguments},
         }
         try:
-            # A child that has ended is found by what does not come back.
+            # That the child has ended is noticed when its answer is read.
             with contextlib.suppress(OSError):
                 child.connection.send_bytes(json.dumps(asked).encode())
             answer = self._wait(child, env_id, timeout_s)
         except BaseException:
-            # Also where this process is interrupted: whatever the child does, nobody waits for it any more.
+            # Also where this process is interrupted: nothing waits for the child any more then.
             self._child = None
             child.close(patience_s=0.0)
             raise
@@ -224,7 +224,7 @@ class EnvGuard:
         return answer["result"]
 
     def _ready_child(self) -> _Child:
-        """A child that sees what this process would let it see now."""
+        """Return a child with this process's present surroundings; a new one is started if they have changed."""
         modules = set(allowed_modules())
         child = self._child
         if child is not None and (
@@ -237,7 +237,7 @@ class EnvGuard:
         return self._child
 
     def _wait(self, child: _Child, env_id: str, timeout_s: float) -> Any:
-        """Its answer, if it comes; time counts only while nothing is told."""
+        """Wait for the child's answer; the time limit begins anew with each sign of progress."""
         count, waited, before = child.page.count, 0.0, time.monotonic()
         while True:
             call = child.page.call
@@ -247,11 +247,11 @@ class EnvGuard:
                     return json.loads(child.connection.recv_bytes())
             except (EOFError, OSError):
                 raise _died(child, env_id) from None
-            # Where the env has processes of its own, these may hold the pipe open.
+            # Processes that the env has started may hold the pipe open after the child's end.
             if child.process.poll() is not None and not child.connection.poll():
                 raise _died(child, env_id)
             now = time.monotonic()
-            # However long this process itself was stopped, or did not get to run.
+            # Time in which this process itself was stopped, or did not get to run, does not count.
             waited, before = waited + min(now - before, 2 * _LOOK_S), now
             if child.page.count != count or child.page.call != call:
                 count, waited = child.page.count, 0.0
@@ -260,7 +260,7 @@ class EnvGuard:
 
 
 def _hung(child: _Child, env_id: str, limit: float) -> EnvFailedError:
-    # Before the fault handler is asked: its signal may wake what waits.
+    # Read before the fault handler is asked, because its signal may wake a call that waits.
     where = _where(child.page)
     child.dump_frames()
     return EnvFailedError(
@@ -304,8 +304,8 @@ def _signal_name(number: int) -> str:
 
 
 def _error(told: dict[str, str]) -> Exception:
-    """What the child raised."""
-    # Some kinds are defined beside what raises them.
+    """Return the error that the child raised."""
+    # This module defines an error class of its own, which has to be known here.
     import policies.acting.policy  # noqa: F401
 
     kinds = {kind.__name__: kind for kind in _kinds(TuneJobsError)}
@@ -329,7 +329,7 @@ _current: ContextVar[EnvGuard | None] = ContextVar("guard", default=None)
 
 @contextlib.contextmanager
 def guarding(*, start: bool = False) -> Iterator[EnvGuard]:
-    """The guard of the block: the one that is open around it, else a new one.
+    """Yield a guard for the block: the one that is open around it, else a new one.
 
     Args:
         start: Start its child at once, because it will be needed.

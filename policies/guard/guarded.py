@@ -1,7 +1,8 @@
-"""What is done with environments outside of trials, in the guard's child: as its namesakes, from the outside.
+"""Use environments outside of trials safely, by running each function in the guard's child process.
 
-The functions take, return and raise what those of `envs`, `packed.envs`, `evaluate` and `video` do, and raise
-`EnvFailedError` where the environment hangs or ends its process.
+The functions take, return and raise the same as the functions of the same names in `policies.envs`,
+`policies.packed.envs`, `policies.acting.evaluate` and `policies.acting.video`. In addition they raise `EnvFailedError`
+where the environment hangs or ends its process.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ def check_env(
     *,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> EnvInfo:
-    """See `policies.envs.make.check_env`.
+    """Run `policies.envs.make.check_env` in the guard's child.
 
     Args:
-        env_id: As there.
-        env_args: As there, as JSON.
-        algorithm: As there.
+        env_id: Gymnasium id.
+        env_args: Keyword arguments of the env's constructor, which JSON can hold; None: none.
+        algorithm: The algorithm that the action space is checked for; None: any.
         timeout_s: How long one call of the environment may take.
     """
     args = _as_json(env_id, env_args)
@@ -59,13 +60,13 @@ def check_env(
 
 
 def check_seedable(env_id: str, env_args: Mapping[str, Any] | None, *, timeout_s: float = CALL_TIMEOUT_S) -> None:
-    """See `policies.packed.envs.make.check_seedable`; the arguments are those of `check_env`."""
+    """Run `policies.packed.envs.make.check_seedable` in the guard's child; the arguments are those of `check_env`."""
     with guarding() as guard:
         guard.run("check_seedable", env_id, env_args=_as_json(env_id, env_args), timeout_s=timeout_s)
 
 
 def measure_step(env_id: str, env_args: Mapping[str, Any] | None, *, timeout_s: float = CALL_TIMEOUT_S) -> StepTime:
-    """See `policies.packed.envs.make.measure_step`; the arguments are those of `check_env`."""
+    """Run `policies.packed.envs.make.measure_step` in the guard's child; the arguments are those of `check_env`."""
     with guarding() as guard:
         told = guard.run("measure_step", env_id, env_args=_as_json(env_id, env_args), timeout_s=timeout_s)
     return StepTime(**told)
@@ -80,7 +81,10 @@ def evaluate_policy(
     max_episode_steps: int | None = None,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> Episodes:
-    """See `evaluate.evaluate_policy`; `timeout_s` is how long one call of the environment or policy may take."""
+    """Run `policies.acting.evaluate.evaluate_policy` in the guard's child.
+
+    `timeout_s` is how long one call of the environment or of the policy may take.
+    """
     with guarding() as guard, _saved(policy) as (saved,):
         told = guard.run(
             "evaluate_policy", env_id, env_args=_as_json(env_id, env_args), policy=saved,
@@ -102,7 +106,10 @@ def record_video(
     max_steps: int | None = None,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> Episodes:
-    """See `video.record_video`; `timeout_s` is how long one call of the environment or policy may take."""
+    """Run `policies.acting.video.record_video` in the guard's child.
+
+    `timeout_s` is how long one call of the environment or of the policy may take.
+    """
     filmed = [int(seeds)] if isinstance(seeds, int) else [int(seed) for seed in seeds]
     with guarding() as guard, _saved(policy) as (saved,), _staged({"mp4": mp4, "gif": gif}) as files:
         told = guard.run(
@@ -127,7 +134,10 @@ def record_comparison(
     max_steps: int | None = None,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> tuple[Episodes, Episodes]:
-    """See `video.record_comparison`; `timeout_s` is how long one call of the environment or policy may take."""
+    """Run `policies.acting.video.record_comparison` in the guard's child.
+
+    `timeout_s` is how long one call of the environment or of a policy may take.
+    """
     wanted: dict[str, Path | None] = {
         "left_mp4": left_mp4, "right_mp4": right_mp4, "right_gif": right_gif, "both_mp4": both_mp4,
     }  # fmt: skip
@@ -144,14 +154,14 @@ def _as_json(env_id: str, env_args: Mapping[str, Any] | None) -> dict[str, Any]:
         args: dict[str, Any] = json.loads(json.dumps(dict(env_args or {})))
     except (TypeError, ValueError) as error:
         raise EnvError(
-            f"The arguments of {env_id!r} are not such as a sweep file can hold: {error}.",
-            "Give numbers, texts, true, false, lists and mappings with texts as keys.",
+            f"The arguments of {env_id!r} cannot be written to a sweep file: {error}.",
+            "Give numbers, strings, true, false, lists and mappings with strings as keys.",
         ) from error
     return args
 
 
 def _told_better(env_id: str, error: EnvError) -> EnvError:
-    """The error, or what is behind it: an id that this process has registered, and no other does."""
+    """Return the error, or a better one if the env id is registered in this process but not in others."""
     if not error.message.startswith("No environment ") or env_id.strip() not in gym.registry:
         return error
     return EnvError(
@@ -167,7 +177,7 @@ def _episodes(told: Mapping[str, Any]) -> Episodes:
 
 @contextlib.contextmanager
 def _saved(*policies: Policy) -> Iterator[list[dict[str, str]]]:
-    """Policies in files, for as long as the block lasts."""
+    """Save policies to files that last as long as the block."""
     with tempfile.TemporaryDirectory(prefix="tune-jobs-policy-", ignore_cleanup_errors=True) as name:
         saved = []
         for number, policy in enumerate(policies):
@@ -198,7 +208,7 @@ def _portable(policy: Policy) -> PortablePolicy:
 
 @contextlib.contextmanager
 def _staged(files: Mapping[str, Path | None]) -> Iterator[dict[str, str | None]]:
-    """Other places for files, which come to theirs when the block ends well: half a film is left nowhere."""
+    """Yield temporary paths for files; they are moved to their own paths if the block ends without an error."""
     with tempfile.TemporaryDirectory(prefix="tune-jobs-film-", ignore_cleanup_errors=True) as name:
         staged = {key: None if path is None else Path(name, key + path.suffix) for key, path in files.items()}
         yield {key: None if path is None else str(path) for key, path in staged.items()}

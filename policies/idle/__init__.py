@@ -1,1 +1,1 @@
-"""Which hyperparameters can act: some change nothing, given the others and the length of a trial."""
+"""Find idle hyperparameters, which change nothing, given the others and the length of a trial."""

@@ -1,4 +1,4 @@
-"""When hyperparameters of DQN are idle; see `policies.idle.find`."""
+"""Rules for when hyperparameters of DQN are idle; see `policies.idle.find`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from policies.hyperparams import DQNHyperparams
 from policies.idle.rule import ALWAYS, Limits, Rule, Rules, equal_ends
 
 _LIMITS = ("env_steps_per_iteration", "train_freq", "num_envs")
-"""On which the env steps of a trial depend, since it ends with an iteration."""
+"""The hyperparameters that the env steps of a trial depend on, since a trial ends with a whole iteration."""
 
 
 def _first_update(h: DQNHyperparams) -> int:
-    """Env steps before which no update is made; it may be later."""
+    """Return a number of env steps before which no update is made; the first update may come later."""
     return max(h.learning_starts, h.train_batch_size)
 
 
@@ -36,7 +36,7 @@ NO_UPDATE = Rule(
     ("learning_starts", "train_batch_size", "updates_per_env_step", *_LIMITS),
     words=_why_no_update,
 )
-"""Nothing is learnt, whatever the hyperparameters."""
+"""The rule that a trial makes no update, so that hyperparameters of learning do nothing."""
 _NO_GAMMA = Rule("gamma is 0, and no value is bootstrapped from", lambda h, _: h.gamma == 0.0, ("gamma",))
 _NO_ADAM = Rule("optimizer is rmsprop", lambda h, _: h.optimizer != "adam", ("optimizer",))
 _NO_RMSPROP = Rule("optimizer is adam", lambda h, _: h.optimizer != "rmsprop", ("optimizer",))
@@ -56,14 +56,14 @@ _NO_TARGET_UPDATE = Rule(
 
 
 def _target_follows_updates(h: DQNHyperparams, limits: Limits) -> bool:
-    """Whether the target network is updated after each update, whatever exactly the interval."""
+    """Whether a target update follows each update, so that the exact interval does not matter."""
     if h.target_update_interval is None:
         return True
     if h.target_update_unit == "episode" or not limits.is_packed:  # RLlib's env runners may share a phase
         return False
     phase = math.ceil(h.train_freq / h.num_envs) * h.num_envs
     most = math.ceil(phase * h.updates_per_env_step)
-    # Several are spread over their phase, at env steps that are fractions, and rounded.
+    # Several updates are spread evenly over their phase, at fractional env steps, which are rounded.
     return h.target_update_interval <= (phase if most == 1 else phase / most - 1e-6)
 
 
@@ -79,7 +79,7 @@ _LR_READS = ("lr_final", "lr_decay_steps", "learning_starts", "train_batch_size"
 
 
 def _begins_late(h: DQNHyperparams, limits: Limits) -> bool:
-    # Episodes are not more than env steps.
+    # There are at most as many episodes as env steps.
     return h.epsilon_start >= limits.num_env_steps
 
 
@@ -88,7 +88,7 @@ def _is_geometric_from_below(h: DQNHyperparams, _: Limits) -> bool:
 
 
 def _ends_above(h: DQNHyperparams, limits: Limits) -> bool:
-    """Whether a geometric schedule does not come down to its final value in a trial."""
+    """Whether a geometric schedule does not reach its final value in a trial."""
     if h.epsilon_schedule != "geometric":
         return False
     share = max(0, limits.num_env_steps - h.epsilon_start) / h.epsilon_decay
@@ -133,7 +133,7 @@ DQN_RULES: dict[str, Rules] = {
     "gamma": (NO_UPDATE,),
     "grad_clip": (NO_UPDATE,),
     "num_envs": ALWAYS,
-    # These two are drawn by, so that their values change the random numbers even where nothing is learnt.
+    # These two decide how many random numbers are drawn, so they act even where nothing is learnt.
     "train_batch_size": ALWAYS,
     "updates_per_env_step": ALWAYS,
     "env_steps_per_iteration": ALWAYS,

@@ -1,11 +1,11 @@
-"""Which hyperparameters can act: some change nothing, given the others and the length of a trial.
+"""Find out which hyperparameters are idle: given the others and the length of a trial, they change nothing.
 
 Words: a hyperparameter *is idle* in a trial if another value of it would train the same policy. A `Rule` says when, and
 why. Most rules do not look at the value itself: without a KL penalty no `kl_target` acts. Others do (`of_value`): a
 replay memory that is never full trains as any larger one does, but not as a small one. `RULES` holds every
 hyperparameter; those without a rule always act.
 
-A rule is claimed only where it holds for sure: what depends on when episodes end, or on luck, acts.
+A rule applies only where it is certain: anything that depends on when episodes end, or on chance, counts as acting.
 """
 
 from __future__ import annotations
@@ -25,17 +25,19 @@ RULES: Mapping[str, Mapping[str, Rules]] = {
     "random": {"num_envs": ALWAYS, "env_steps_per_iteration": ALWAYS},
     "constant": {"num_envs": ALWAYS, "env_steps_per_iteration": ALWAYS, "action": ALWAYS},
 }
-"""By algorithm and hyperparameter: when it is idle."""
+"""For each algorithm and hyperparameter, the rules for when it is idle."""
 
 
 def idle_rule(algorithm: str, name: str, hyperparams: Any, limits: Limits) -> Rule | None:
-    """Why a hyperparameter is idle in a trial; None: it acts. Rules that do not look at its value come first.
+    """Return the rule by which a hyperparameter is idle in a trial, or None if it acts.
+
+    Rules that do not look at its value come first.
 
     Args:
         algorithm: A key of `RULES`.
-        name: Of the hyperparameter.
-        hyperparams: All of the trial's.
-        limits: Of the trial.
+        name: The hyperparameter's name.
+        hyperparams: All hyperparameters of the trial.
+        limits: The limits of the trial.
     """
     rules = sorted(RULES[algorithm][name], key=lambda rule: rule.of_value)
     return next((rule for rule in rules if rule.holds(hyperparams, limits)), None)

@@ -1,4 +1,4 @@
-"""When hyperparameters of PPO are idle; see `policies.idle.find`."""
+"""Rules for when hyperparameters of PPO are idle; see `policies.idle.find`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from policies.idle.rule import ALWAYS, Limits, Rule, Rules, equal_ends
 
 
 def _makes_one_update(h: PPOHyperparams, limits: Limits) -> bool:
-    # RLlib's batches have further rows: one at the end of each piece of an episode.
+    # RLlib's batches have more rows: one more at the end of each piece of an episode.
     is_whole = h.minibatch_size == h.train_batch_size and h.train_batch_size % h.num_envs == 0
     return limits.is_packed and h.num_epochs == 1 and is_whole
 
@@ -32,7 +32,7 @@ _ONE_ITERATION = Rule(
 
 
 def _start_of_schedule(decay: str, final: str) -> Rules:
-    """Of the value that a schedule of PPO starts from; its first batch is sampled before the first update."""
+    """Return the rules for the first value of a PPO schedule; the first batch is sampled before the first update."""
     why = f"{decay} is not more than train_batch_size, so {final} is reached before the first update"
     return (Rule(why, _is_over_at_first(decay, final), (decay, final, "train_batch_size")),)
 

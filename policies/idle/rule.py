@@ -1,4 +1,4 @@
-"""What it means that a hyperparameter is idle; see `policies.idle.find`."""
+"""The rules by which a hyperparameter is idle; see `policies.idle.find`."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Limits:
-    """What a trial is bound by, beside its hyperparameters."""
+    """The limits of a trial that its hyperparameters do not set."""
 
     num_env_steps: int
     """The most that it makes."""
     num_iterations: int
     """The most that it makes."""
     max_episode_steps: int | None
-    """Env steps after which an episode is cut; None: never."""
+    """Env steps after which an episode is truncated; None: never."""
     is_packed: bool
-    """Whether a pack trains it, whose batches are of one size always."""
+    """Whether a pack trains the trial; the batches of a pack always have the same size."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """When a hyperparameter is idle."""
+    """A condition under which a hyperparameter is idle."""
 
     why: str
-    """A clause; {steps} is the most env steps of a trial."""
+    """The reason, a clause; {steps} stands for the most env steps of a trial."""
     holds: Callable[[Any, Limits], bool]
-    """Of all hyperparameters and the limits."""
+    """Whether the rule holds, given all hyperparameters and the limits."""
     reads: tuple[str, ...]
     """The hyperparameters that `holds` looks at."""
     of_value: bool = False
-    """Whether one of them is the idle hyperparameter itself: then all values for which the rule holds act alike."""
+    """Whether `holds` looks at the idle hyperparameter itself: then all values for which it holds act alike."""
     words: Callable[[Any, Limits], str] | None = None
-    """Of hyperparameters for which it holds: `why`, with their values."""
+    """Makes the reason for hyperparameters for which the rule holds, with their values; None: `why` is the reason."""
 
     def reason(self, hyperparams: Any, limits: Limits) -> str:
-        """`why`, of hyperparameters for which it holds."""
+        """Return the reason, for hyperparameters for which the rule holds."""
         if self.words is not None:
             return self.words(hyperparams, limits)
         return self.why.format(steps=f"{limits.num_env_steps:,}")
@@ -48,5 +48,5 @@ ALWAYS: Rules = ()
 
 
 def equal_ends(start: str, final: str) -> Rule:
-    """Of what says how fast a value moves from start to final."""
+    """Return the rule for hyperparameters that say how a value moves from start to final: idle where both are equal."""
     return Rule(f"{final} is {start}", lambda h, _: getattr(h, start) == getattr(h, final), (start, final))

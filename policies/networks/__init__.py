@@ -1,4 +1,4 @@
-"""What networks are made of, and the RLModules of PPO and DQN, which a user's own may derive from."""
+"""Layers and parts of networks, and the RLModules of PPO and DQN, which a user's own RLModules may derive from."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CLASSES = ("DQNModule", "PPOModule")
 
 
 def __getattr__(name: str) -> Any:
-    # Not above: packs take layers and parts from here, without loading RLlib.
+    # Imported only here, because packs use layers and parts of this package without loading RLlib.
     if name not in _CLASSES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(_CLASSES)}")
     return getattr(import_module("policies.networks.rl_modules"), name)

@@ -1,4 +1,4 @@
-"""The share of random actions in DQN's exploration, as `DQNHyperparams` describe it."""
+"""Epsilon, the share of random actions in DQN's exploration, as `DQNHyperparams` describe it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class EpsilonSchedule:
 
     @classmethod
     def of(cls, hyperparams: DQNHyperparams) -> Self:
-        """The schedule that the hyperparameters describe."""
+        """Return the schedule that the hyperparameters describe."""
         return cls(
             kind=hyperparams.epsilon_schedule,
             unit=hyperparams.epsilon_unit,
@@ -34,11 +34,11 @@ class EpsilonSchedule:
         )
 
     def as_config(self) -> dict[str, Any]:
-        """As plain data, for an RLModule's `model_config`."""
+        """Return the schedule as plain data, for an RLModule's `model_config`."""
         return asdict(self)
 
     def at(self, num_units: float) -> float:
-        """Epsilon after so many env steps or episodes."""
+        """Return epsilon after a number of env steps or episodes."""
         decayed = max(0.0, num_units - self.start)
         if self.kind == "linear":
             return linear(self.initial, self.final, self.decay, decayed)

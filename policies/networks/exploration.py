@@ -11,11 +11,11 @@ from torch import Tensor
 from policies.networks.epsilon import EpsilonSchedule
 
 QF_PREDS = "qf_preds"
-"""RLlib's key of Q-values in the output of `compute_q_values`."""
+"""RLlib's key for Q-values in the output of `compute_q_values`."""
 
 
 class EpsilonGreedy:
-    """Mixin for a DQN RLModule: draws a random action with the probability its schedule gives, else the greedy one.
+    """Mixin for a DQN RLModule: acts randomly with the probability that its schedule gives, else greedily.
 
     `model_config["exploration"]` holds the schedule, as `EpsilonSchedule.as_config` gives it.
     """
@@ -25,18 +25,18 @@ class EpsilonGreedy:
 
     @property
     def exploration_schedule(self) -> EpsilonSchedule:
-        """The schedule of this module."""
+        """The epsilon schedule of this module."""
         if self._schedule is None:
             self._schedule = EpsilonSchedule(**self.model_config["exploration"])
         return self._schedule
 
     @property
     def epsilon_unit(self) -> str:
-        """What `t` counts: env_step or episode."""
+        """The unit that `t` counts: env_step or episode."""
         return self.exploration_schedule.unit
 
     def _forward_exploration(self, batch: dict[str, Tensor], t: float = 0.0, **_: Any) -> dict[str, Tensor]:
-        """Actions for a batch of observations.
+        """Return the actions for a batch of observations.
 
         Args:
             batch: Holds observations, shape (N, ...).

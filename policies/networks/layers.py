@@ -1,4 +1,4 @@
-"""The torch layers of our RLModules: encoders, their first weights, and running statistics of observations."""
+"""The torch layers of the RLModules: encoders, their initial weights, and running statistics of observations."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from policies.portable.file import Normalization
 OBSERVATION_CLIP = 10.0
 """Normalised observations are clipped to -/+ this."""
 VARIANCE_EPSILON = 1e-8
-"""Added to a variance before its root is divided by."""
+"""Added to a variance before observations are divided by its square root."""
 
 _ACTIVATIONS: dict[str, type[nn.Module] | None] = {
     "linear": None, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "elu": nn.ELU, "gelu": nn.GELU,
 }  # fmt: skip
-# Of the activations torch gives a gain for; the others are close to ReLU.
+# torch gives a gain for these activations; the others are close to ReLU and use its gain.
 _GAINS = {"linear": 1.0, "tanh": 5.0 / 3.0}
 
 
 class Encoder(nn.Module):
-    """Convolutions, if any, then dense layers; the activation after each.
+    """Convolutions, if any, then dense layers, with the activation after each.
 
     Args:
         observation_space: Shape (n,), or (height, width, channels) with convolutions.
@@ -40,10 +40,10 @@ class Encoder(nn.Module):
     Attributes:
         conv: The convolutions, or None.
         mlp: The dense layers.
-        num_features: Numbers an observation becomes.
+        num_features: How many numbers an observation becomes.
 
     Raises:
-        SpecError: Convolutions and observations do not go together.
+        SpecError: The convolutions do not fit the observations.
     """
 
     def __init__(
@@ -84,11 +84,11 @@ class Encoder(nn.Module):
         self.num_features = size
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Features, shape (B, num_features), of observations of shape (B, ...)."""
+        """Return the features, shape (B, num_features), of observations of shape (B, ...)."""
         if self.conv is not None:
-            # Environments give (height, width, channels), torch wants the channels first.
+            # Environments return (height, width, channels); torch wants the channels first.
             observations = self.conv(observations.permute(0, 3, 1, 2)).flatten(1)
-        # Not by calling the modules: what torch does around each call costs as much as a small layer.
+        # The modules are not called, because torch's overhead of a call costs as much as a small layer.
         features = observations
         for layer in self.mlp:
             features = layer.forward(features)
@@ -96,18 +96,18 @@ class Encoder(nn.Module):
 
 
 def hidden_gain(activation: str) -> float:
-    """The factor by which orthogonal weights make up for what an activation takes (He et al. 2015; torch's values)."""
+    """Return the gain of orthogonal weights that offsets an activation's shrinking (He et al. 2015; torch's values)."""
     return _GAINS.get(activation, math.sqrt(2.0))
 
 
 def initialize(module: nn.Module, initializer: str, gain: float) -> None:
-    """Set the first weights of all linear and convolutional layers in a module.
+    """Set the initial weights of all linear and convolutional layers in a module.
 
     Args:
-        module: Its other layers stay as they are.
+        module: The module; its other layers stay as they are.
         initializer: torch (nothing is done), he_uniform (uniform within -/+ sqrt(6 / inputs), He et al. 2015), or
             orthogonal (Saxe et al. 2014); biases become 0.
-        gain: Factor of orthogonal weights.
+        gain: The factor of orthogonal weights.
     """
     if initializer == "torch":
         return
@@ -122,11 +122,11 @@ def initialize(module: nn.Module, initializer: str, gain: float) -> None:
 
 
 class ObservationStatistics:
-    """Mixin for an RLModule: scales uint8 observations by 1/255 and, if asked to, normalises all.
+    """Mixin for an RLModule: scales uint8 observations by 1/255 and, if asked to, normalises observations.
 
     `setup` must call `add_statistics`, the forward passes `prepare`. With `model_config["normalize_observations"]` the
-    running mean, variance and count are buffers of the module, and so travel with its weights: to env runners, into
-    checkpoints and portable policies. Networks of one module, a target network too, see the same statistics.
+    running mean, variance and count are buffers of the module. So they go where its weights go: to env runners and into
+    checkpoints and portable policies. All networks of one module, also a target network, use the same statistics.
     """
 
     observation_space: gym.Space[Any]
@@ -145,11 +145,11 @@ class ObservationStatistics:
             shape = self.observation_space.shape or ()
             self.register_buffer("obs_mean", torch.zeros(shape))  # type: ignore[attr-defined]
             self.register_buffer("obs_var", torch.ones(shape))  # type: ignore[attr-defined]
-            # A whole number, or RLlib would turn it into one of 24 bits on its way through a checkpoint.
+            # A whole number, because RLlib's checkpoints would turn it into a float, which is exact to 24 bits only.
             self.register_buffer("obs_count", torch.zeros((), dtype=torch.int64))  # type: ignore[attr-defined]
 
     def prepare(self, observations: Tensor) -> Tensor:
-        """What the networks see of observations of shape (B, ...)."""
+        """Return observations, shape (B, ...), as the networks get them: scaled and, if asked to, normalised."""
         if self._observation_scale != 1.0:
             observations = observations.float() * self._observation_scale
         if self._normalizes:
@@ -159,12 +159,13 @@ class ObservationStatistics:
 
     @torch.no_grad()
     def update_observation_statistics(self, observations: Tensor | NDArray[Any]) -> None:
-        """Merge a batch into the statistics (Chan et al. 1979, the parallel variance); nothing if there are none.
+        """Merge a batch into the statistics (Chan et al. 1979, the parallel variance), if there are any.
 
-        For learners, after the updates of a phase: so a batch is trained with the statistics it was sampled with.
+        Learners call this after the updates of a phase, so that a batch is trained with the statistics it was sampled
+        with.
 
         Args:
-            observations: As the env gave them, shape (B, ...).
+            observations: As the env returned them, shape (B, ...).
         """
         num_new = len(observations)
         if not self._normalizes or num_new == 0:
@@ -177,18 +178,18 @@ class ObservationStatistics:
         squares = (
             self.obs_var.double() * count + ((batch - mean) ** 2).sum(dim=0) + delta**2 * (count * num_new / total)
         )
-        # In place: others hold on to these very tensors.
+        # In place, because others keep references to these tensors.
         self.obs_mean.copy_(self.obs_mean.double() + delta * (num_new / total))
         self.obs_var.copy_(squares / total)
         self.obs_count.fill_(total)
 
 
 def observation_scale(space: gym.Space[Any]) -> float:
-    """What observations are multiplied by, first of all: 1/255 for images of bytes."""
+    """Return the factor that observations are multiplied by first: 1/255 for images of bytes, else 1."""
     return 1.0 / 255.0 if space.dtype == np.uint8 else 1.0
 
 
 def normalization_of(mean: NDArray[Any], variance: NDArray[Any]) -> Normalization:
-    """The statistics of `ObservationStatistics` as a portable policy holds them."""
+    """Return the statistics of `ObservationStatistics` in the form of a portable policy."""
     std = np.sqrt(np.asarray(variance, dtype=np.float32) + np.float32(VARIANCE_EPSILON))
     return Normalization(np.array(mean, dtype=np.float32), std, OBSERVATION_CLIP)

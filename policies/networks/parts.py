@@ -1,6 +1,7 @@
-"""What the RLModules of PPO and DQN are made of: torch alone, so that packs build them without loading RLlib.
+"""The networks inside the RLModules of PPO and DQN; they need only torch, so packs build them without loading RLlib.
 
-Random numbers are drawn in the order of these functions; `policies.networks.rl_modules` builds its modules with them.
+`policies.networks.rl_modules` builds its modules with these functions, whose order decides which random numbers the
+initial weights get.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ _OUR_ACTIVATIONS = {theirs: ours for ours, theirs in RLLIB_ACTIVATIONS.items()}
 
 
 class PPONetworks(nn.Module):
-    """Encoders, policy head `pi` and value head `vf`.
+    """PPO's networks: encoders, the policy head `pi` and the value head `vf`.
 
     Args:
-        observation_space: Of the environment.
-        action_space: Of the environment.
-        config: As `model_config` gives it.
+        observation_space: The environment's.
+        action_space: The environment's.
+        config: A result of `model_config`.
         inference_only: Leave out the value function's own encoder.
 
     Raises:
-        SpecError: Convolutions and observations do not go together.
+        SpecError: The convolutions do not fit the observations.
     """
 
     def __init__(
@@ -56,15 +57,15 @@ class PPONetworks(nn.Module):
 
 
 class DQNNetworks(nn.Module):
-    """Encoder, head `af` of Q-values or advantages, and, if dueling, the value head `vf`.
+    """DQN's networks: an encoder, the head `af` for Q-values or advantages and, if dueling, the value head `vf`.
 
     Args:
-        observation_space: Of the environment.
-        action_space: Of the environment.
-        config: As `model_config` gives it.
+        observation_space: The environment's.
+        action_space: The environment's.
+        config: A result of `model_config`.
 
     Raises:
-        SpecError: Convolutions and observations do not go together.
+        SpecError: The convolutions do not fit the observations.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class DQNNetworks(nn.Module):
 
 
 def num_policy_outputs(action_space: gym.Space[Any]) -> int:
-    """Mean and log standard deviation of each component, or one logit an action."""
+    """Return the number of outputs: a mean and a log standard deviation per component, or one logit per action."""
     if isinstance(action_space, gym.spaces.Box):
         return 2 * math.prod(action_space.shape)
     assert isinstance(action_space, gym.spaces.Discrete)
@@ -88,10 +89,10 @@ def num_policy_outputs(action_space: gym.Space[Any]) -> int:
 
 
 def make_encoder(observation_space: gym.Space[Any], config: Mapping[str, Any]) -> Encoder:
-    """The encoder that a `model_config` describes.
+    """Return the encoder that a `model_config` describes.
 
     Raises:
-        SpecError: Convolutions and observations do not go together.
+        SpecError: The convolutions do not fit the observations.
     """
     activation = _OUR_ACTIVATIONS[config["fcnet_activation"]]
     return Encoder(observation_space, config["fcnet_hiddens"], activation, config["conv_filters"])
@@ -100,19 +101,19 @@ def make_encoder(observation_space: gym.Space[Any], config: Mapping[str, Any]) -
 def initialize_networks(
     config: Mapping[str, Any], *, hidden: list[nn.Module], heads: Sequence[tuple[nn.Module, float]]
 ) -> None:
-    """Set first weights as a `model_config` says; heads come with the gain of orthogonal weights."""
+    """Set initial weights as a `model_config` says; each head comes with its gain for orthogonal weights."""
     gain = hidden_gain(_OUR_ACTIVATIONS[config["fcnet_activation"]])
     for module, module_gain in [*((network, gain) for network in hidden), *heads]:
         initialize(module, config["initializer"], module_gain)
 
 
 def model_config(hyperparams: TrainedHyperparams) -> dict[str, Any]:
-    """What RLModules are built from, by RLlib's names where it has one: a user's may extend RLlib's default."""
+    """Return the settings that RLModules are built from, by RLlib's names, as a user's module may extend RLlib's."""
     filters = hyperparams.conv_filters
     config: dict[str, Any] = {
         "fcnet_hiddens": list(hyperparams.hidden_sizes),
         "fcnet_activation": RLLIB_ACTIVATIONS[hyperparams.activation],
-        # The heads are one linear layer each: the portable policy counts on it.
+        # The heads are one linear layer each: the portable policy relies on it.
         "head_fcnet_hiddens": [],
         "conv_filters": None if filters is None else [list(item) for item in filters],
         "conv_activation": RLLIB_ACTIVATIONS[hyperparams.activation],
@@ -130,6 +131,6 @@ def model_config(hyperparams: TrainedHyperparams) -> dict[str, Any]:
     if hyperparams.epsilon_schedule == "linear":
         start, initial = hyperparams.epsilon_start, hyperparams.epsilon_initial
         after = [start + hyperparams.epsilon_decay, hyperparams.epsilon_final]
-        # For subclasses of RLlib's module, which begins at 0 with the first value.
+        # For subclasses of RLlib's own module, whose schedule has to begin at 0 with the first value.
         config["epsilon"] = [[0, initial], *([[start, initial]] if start else []), after]
     return config

@@ -1,4 +1,4 @@
-"""The greedy part of an RLModule's weights as a portable network; needs no ray."""
+"""Turn the greedy part of an RLModule's weights into a portable network, without ray."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Weights = Mapping[str, NDArray[Any]]
 def network_from_weights(
     weights: Weights, hyperparams: TrainedHyperparams, observation_space: gym.Space[Any], action_space: gym.Space[Any]
 ) -> PolicyNetwork:
-    """The greedy part of the weights of one of our RLModules as a chain of layers.
+    """Return the greedy part of the weights of one of our RLModules as a chain of layers.
 
     Args:
-        weights: State of a `policies.networks.rl_modules` module, numpy.
-        hyperparams: What the module was built from.
+        weights: State of a `policies.networks.rl_modules` module, as NumPy arrays.
+        hyperparams: The hyperparameters that the module was built from.
         observation_space: The environment's.
         action_space: The environment's.
 
@@ -33,14 +33,14 @@ def network_from_weights(
         CheckpointError: The weights are not those of the network the hyperparameters describe.
     """
     if isinstance(hyperparams, PPOHyperparams):
-        # A shared encoder is called just that; separate ones are the actor's and the critic's.
+        # A shared encoder is called "encoder"; separate ones are the actor's and the critic's.
         encoder = "encoder.encoder" if hyperparams.vf_share_layers else "encoder.actor_encoder"
         head = "pi"
         kind: NetworkKind = "gaussian" if isinstance(action_space, gym.spaces.Box) else "categorical"
     else:
-        # DQN's first head gives Q-values, or advantages where it is dueling: both have the same greedy action.
+        # DQN's head gives Q-values, or advantages if it is dueling: the greedy action is the same for both.
         encoder, head, kind = "encoder", "af", "q_values"
-    # Layers with weights stand at every other place, the activations (none if linear) between them.
+    # Layers with weights are at every other index, with the activations (none if linear) between them.
     step = 1 if hyperparams.activation == "linear" else 2
     filters = hyperparams.conv_filters or ()
     conv = tuple(
@@ -64,7 +64,7 @@ def network_from_weights(
 
 
 def _check_sizes(network: PolicyNetwork, hyperparams: TrainedHyperparams, weights: Weights, encoder: str) -> None:
-    """Check that the weights are those of the network the hyperparameters describe, and of no larger one."""
+    """Check that the network of the weights is the one that the hyperparameters describe, and not a larger one."""
     num_layers = sum(name.startswith(f"{encoder}.") and name.endswith(".weight") for name in weights)
     filters = hyperparams.conv_filters or ()
     pairs = {
@@ -82,7 +82,7 @@ def _check_sizes(network: PolicyNetwork, hyperparams: TrainedHyperparams, weight
 
 
 def _tensors(weights: Weights, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weight and bias of a layer."""
+    """Return the weight and the bias of a layer."""
     return _tensor(weights, f"{name}.weight"), _tensor(weights, f"{name}.bias")
 
 
@@ -96,5 +96,5 @@ def _tensor(weights: Weights, name: str) -> NDArray[np.float32]:
 
 
 def normalization_in(weights: Weights) -> Normalization:
-    """The observation statistics among a module's weights."""
+    """Return the observation statistics that a module's weights include."""
     return normalization_of(_tensor(weights, "obs_mean"), _tensor(weights, "obs_var"))

@@ -1,10 +1,10 @@
-"""Hyperparameters -> the RLModules of PPO and DQN.
+"""The RLModules of PPO and DQN, built from hyperparameters.
 
-RLlib's default modules take a part of what `policies.hyperparams` describes; these extend them: first weights,
+RLlib's default modules support only a part of `policies.hyperparams`. The modules here add the rest: initial weights,
 convolutions without padding, normalised observations, DQN without a target network. Names of weights: an encoder's
 are `conv.N` and `mlp.N`; PPO's encoders are `encoder.actor_encoder` and `encoder.critic_encoder`, or `encoder.encoder`
-where they share one, its heads `pi` and `vf`; DQN has `encoder`, `af` (Q-values, or advantages), `vf` if dueling, and
-the same after `_target_`.
+if they are shared, and its heads `pi` and `vf`; DQN has `encoder`, `af` (Q-values, or advantages), `vf` if dueling, and
+the same names with `_target_` before them.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from policies.networks.parts import DQNNetworks, PPONetworks, model_config
 
 QF_PREDS, QF_NEXT_PREDS, QF_TARGET_NEXT_PREDS = "qf_preds", "qf_next_preds", "qf_target_next_preds"
 RL_MODULE_KEY = "rl_module"
-"""Where a module's `model_config` says which class of the user's own it is."""
+"""The key of `model_config` with the path of a user's own RLModule class."""
 
-_LOG_STD_CLIP = 20.0  # RLlib's own (log_std_clip_param of its DefaultModelConfig)
+_LOG_STD_CLIP = 20.0  # RLlib's default (log_std_clip_param of its DefaultModelConfig)
 
 Batch: TypeAlias = dict[str, Any]
 
 
 class ActionCatalog(Catalog):  # type: ignore[misc]
-    """RLlib's catalog, reduced to the distribution of actions: our modules build their networks themselves."""
+    """RLlib's catalog, reduced to the distribution of actions, because our modules build their networks themselves."""
 
     def _determine_components_hook(self) -> None:
         self._action_dist_class_fn = lambda framework: self._get_dist_cls_from_action_space(
@@ -47,7 +47,7 @@ class ActionCatalog(Catalog):  # type: ignore[misc]
 
 
 class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore[misc]
-    """Policy and value function, with encoders of their own or a shared one."""
+    """PPO's policy and value function, with two encoders or a shared one."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{**kwargs, "catalog_class": ActionCatalog})
@@ -64,7 +64,7 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
 
     @property
     def _actor(self) -> Encoder:
-        # No attribute: torch would list its weights twice.
+        # Not stored as an attribute, or torch would list its weights twice.
         return cast("Encoder", self.encoder[self._actor_name])
 
     def _forward(self, batch: Batch, **_: Any) -> Batch:
@@ -85,7 +85,7 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
         return torch.cat((mean, log_std.clamp(-_LOG_STD_CLIP, _LOG_STD_CLIP)), dim=-1)
 
     def compute_values(self, batch: Batch, embeddings: Tensor | None = None) -> Tensor:
-        """Values, shape (B,); `embeddings` are those of `forward_train`, if it was called on this batch."""
+        """Return the values, shape (B,); `embeddings` come from `forward_train`, if it was called with this batch."""
         if embeddings is None:
             encoder = self._actor if self._shares else self.encoder["critic_encoder"]
             embeddings = encoder(self.prepare(batch[Columns.OBS]))
@@ -94,7 +94,7 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
 
 
 class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule):  # type: ignore[misc]
-    """Q-network, dueling or not, with or without a target network."""
+    """DQN's Q-network, dueling or not, with or without a target network."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{**kwargs, "catalog_class": ActionCatalog})
@@ -106,19 +106,19 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
         self.uses_dueling = bool(config["dueling"])
         self.uses_double_q = bool(config["double_q"])
         self.uses_target_network = bool(config["target_network"])
-        self.num_atoms = 1  # RLlib's learner asks
+        self.num_atoms = 1  # read by RLlib's learner
         parts = DQNNetworks(self.observation_space, self.action_space, config)
         self.encoder, self.af, self.vf = parts.encoder, parts.af, parts.vf
 
     def make_target_networks(self) -> None:
-        """Copy the networks, weights and all; nothing where there is no target network."""
+        """Copy the networks with their weights, unless there is no target network."""
         if self.uses_target_network:
             self._target_encoder = make_target_network(self.encoder)
             self._target_af = make_target_network(self.af)
             self._target_vf = make_target_network(self.vf) if self.uses_dueling else None
 
     def get_target_network_pairs(self) -> list[tuple[nn.Module, nn.Module]]:
-        """(network, its target), for the target updates."""
+        """Return pairs of a network and its target network, for the target updates."""
         if not self.uses_target_network:
             return []
         networks: list[Any] = [self.encoder, self.af]
@@ -128,19 +128,19 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
         return list(zip(networks, targets, strict=True))
 
     def get_non_inference_attributes(self) -> list[str]:
-        """What acting does not need."""
+        """Return the names of the attributes that acting does not need."""
         return ["_target_encoder", "_target_af", "_target_vf"]
 
     def get_initial_state(self) -> Batch:
-        """Nothing: the networks are not recurrent."""
+        """Return an empty state, because the networks are not recurrent."""
         return {}
 
     def compute_q_values(self, batch: Batch) -> Batch:
-        """Q-values of the online network, shape (B, num_actions)."""
+        """Return the Q-values of the online network, shape (B, num_actions)."""
         return {QF_PREDS: _q_values(self.prepare(batch[Columns.OBS]), self.encoder, self.af, self.vf)}
 
     def forward_target(self, batch: Batch) -> Batch:
-        """Q-values of the target network, or of the online one where there is none, without gradient."""
+        """Return the Q-values of the target network, or of the online one if there is none, without gradient."""
         return {QF_PREDS: self._bootstrap(self.prepare(batch[Columns.OBS]))}
 
     def _forward_inference(self, batch: Batch, **_: Any) -> Batch:
@@ -150,7 +150,7 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
         next_observations = self.prepare(batch[Columns.NEXT_OBS])
         out = self.compute_q_values(batch)
         if self.uses_double_q:
-            # Only its best action is looked at, so it needs no gradient.
+            # Only the best action is used, so no gradient is needed.
             with torch.no_grad():
                 out[QF_NEXT_PREDS] = _q_values(next_observations, self.encoder, self.af, self.vf)
         out[QF_TARGET_NEXT_PREDS] = self._bootstrap(next_observations)
@@ -164,7 +164,7 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
 
 
 def _q_values(observations: Tensor, encoder: nn.Module, af: nn.Module, vf: nn.Module | None) -> Tensor:
-    """Q(s, a) = A(s, a), or V(s) + A(s, a) - mean A(s, .) if dueling (Wang et al. 2016, equation 9)."""
+    """Return Q(s, a) = A(s, a), or V(s) + A(s, a) - mean A(s, .) if dueling (Wang et al. 2016, equation 9)."""
     features = encoder.forward(observations)
     advantages: Tensor = af.forward(features)
     if vf is None:
@@ -177,15 +177,15 @@ def _q_values(observations: Tensor, encoder: nn.Module, af: nn.Module, vf: nn.Mo
 
 
 def module_spec(hyperparams: TrainedHyperparams, rl_module: str | None = None) -> RLModuleSpec:
-    """What RLlib builds the RLModule from.
+    """Return the specification that RLlib builds the RLModule from.
 
     Args:
         hyperparams: Validated hyperparameters; their type chooses PPO or DQN.
-        rl_module: `module:Class` of an RLModule of the user's own, in an allowed module; None: ours. It is given the
-            same `model_config`; what it makes of it is its own affair.
+        rl_module: `module:Class` of an RLModule of the user's own, in an allowed module; None: ours. The user's class
+            gets the same `model_config` and may use it as it likes.
 
     Raises:
-        SpecError: The class cannot be imported, or is none that the algorithm can train.
+        SpecError: The class cannot be imported, or the algorithm cannot train it.
     """
     config = model_config(hyperparams)
     if rl_module is None:
@@ -202,14 +202,14 @@ def _own_class(hyperparams: TrainedHyperparams, rl_module: str) -> type[RLModule
     for api in needed:
         if not issubclass(found, api):
             raise SpecError(
-                f"rl_module {rl_module!r} is no {api.__name__}, which the algorithm needs.",
+                f"rl_module {rl_module!r} is not a {api.__name__}, which the algorithm needs.",
                 "Derive it from policies.networks.PPOModule for PPO, or DQNModule for DQN.",
             )
     if isinstance(hyperparams, DQNHyperparams):
         if hyperparams.epsilon_schedule != "linear" and not issubclass(found, EpsilonGreedy):
             raise SpecError(
                 f"epsilon_schedule {hyperparams.epsilon_schedule} does not reach rl_module {rl_module!r}: RLlib's own "
-                "exploration has linear schedules alone.",
+                "exploration has linear schedules only.",
                 "Derive the class from policies.networks.DQNModule, or set epsilon_schedule: linear.",
             )
         if not hyperparams.target_network and not issubclass(found, DQNModule):
@@ -221,20 +221,20 @@ def _own_class(hyperparams: TrainedHyperparams, rl_module: str) -> type[RLModule
 
 
 def import_module_class(rl_module: str) -> type[RLModule]:
-    """The RLModule class of an import path, from an allowed module.
+    """Import an RLModule class from an allowed module.
 
     Args:
         rl_module: `module:Class`.
 
     Raises:
-        SpecError: Its module is not allowed, or it is no RLModule class.
+        SpecError: Its module is not allowed, or the path does not name an RLModule class.
     """
     from policies.envs.modules import import_allowed
 
     found = import_allowed(rl_module)
     if not (isinstance(found, type) and issubclass(found, RLModule)):
         raise SpecError(
-            f"rl_module {rl_module!r} is {found!r}, which is no RLModule class.",
+            f"rl_module {rl_module!r} is {found!r}, which is not an RLModule class.",
             "Give the import path of a class, such as my_package.networks:MyModule.",
         )
     return found

@@ -1,1 +1,1 @@
-"""Training of many trials at once in one process, with their weights stacked."""
+"""Train many trials at once in one process, with their weights stacked."""

@@ -1,6 +1,6 @@
-"""Greedy episodes of many policies at once.
+"""Play greedy episodes of many policies at once.
 
-Each policy gets the very episodes, to the last bit, that `Evaluator.run` gives it. In CartPole the episodes of all
+Each policy gets the same episodes, to the last bit, as `Evaluator.run` gives it. In CartPole the episodes of all
 policies are stepped in one object, and networks of equal layers are computed together.
 """
 
@@ -19,20 +19,20 @@ from policies.packed.envs.cartpole import CartPoleRows
 from policies.portable.forward import ForwardPass, ForwardPasses
 
 _MAX_ROWS = 4096
-"""Episodes at once; more would take memory and save nothing."""
+"""The most episodes played at once; more would take memory and save no time."""
 
 Result = Episodes | Exception
 
 
 def evaluate_many(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Result]:
-    """One greedy episode a seed, of each policy.
+    """Play one greedy episode for each seed and each policy.
 
     Args:
-        evaluator: Env and seeds.
-        policies: What acts.
+        evaluator: Gives the environment and the seeds.
+        policies: The policies that act.
 
     Returns:
-        For each policy what `evaluator.run` returns, or the error that it raises: `NonFiniteWeightsError` or
+        For each policy, what `evaluator.run` returns or the error that it raises: `NonFiniteWeightsError` or
         `EnvError`.
     """
     results: dict[int, Result] = {}
@@ -56,29 +56,29 @@ def evaluate_many(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Resu
 
 
 def _layout(evaluator: Evaluator, policy: Policy) -> tuple[Any, ...]:
-    """What policies that are computed together have in common; empty: this one has its episodes alone."""
-    # Exactly this class: one of somebody's own may act otherwise.
+    """Return what policies that are computed together have in common; empty for a policy that is computed alone."""
+    # Exactly this class, because a subclass may act in another way.
     if evaluator.cartpole_starts is None or type(policy) is not NetworkPolicy:
         return ()
     return ForwardPasses.layout(policy.portable.network)
 
 
 class _Group:
-    """Policies of one layout that still have running episodes."""
+    """Policies with one layout that still have running episodes."""
 
     def __init__(self, policies: dict[int, NetworkPolicy]) -> None:
         self.indexes = list(policies)
         self._forward = ForwardPasses([ForwardPass(policy.portable.network) for policy in policies.values()])
-        # All of them act in the same env, so what makes actions of outputs is the same.
+        # All of them act in the same env, so outputs become actions in the same way.
         one = next(iter(policies.values()))
         self._to_actions = action_function(one.portable, cast("ActionSpace", one.action_space))
 
     def act(self, observations: NDArray[np.float32], counts: NDArray[np.intp]) -> NDArray[Any]:
-        """Actions for the observations of each policy, `counts` of each."""
+        """Return actions for observations, of which policy i has `counts[i]`."""
         return self._to_actions(self._forward(observations, counts.tolist()))
 
     def keep(self, counts: NDArray[np.intp]) -> None:
-        """Leave out the policies whose count is 0."""
+        """Drop the policies whose count is 0."""
         if not counts.all():
             places = np.flatnonzero(counts).tolist()
             self.indexes = [self.indexes[place] for place in places]
@@ -86,7 +86,7 @@ class _Group:
 
 
 def _play_cartpoles(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Episodes]:
-    """The episodes of policies that are sorted by their layouts; all of them in one object.
+    """Play the episodes of policies that are sorted by their layouts, all of them in one object.
 
     Rows are the running episodes, those of the first policy first.
     """
@@ -100,7 +100,7 @@ def _play_cartpoles(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Ep
         by_layout.setdefault(_layout(evaluator, policy), {})[index] = policy
     groups = [_Group(members) for members in by_layout.values()]
     returns, lengths = np.zeros(len(policies) * num_seeds), np.zeros(len(policies) * num_seeds, dtype=np.int64)
-    episodes = np.arange(len(returns))  # of each row: policy * num_seeds + seed
+    episodes = np.arange(len(returns))  # the number of each row's episode: policy * num_seeds + seed
     counts = np.full(len(policies), num_seeds, dtype=np.intp)
     states = np.tile(starts, (len(policies), 1))
     cartpoles.put(states, np.zeros(len(states), dtype=np.int32))

@@ -1,4 +1,4 @@
-"""First weights of a member: those of the RLModule that RLlib would build for its hyperparameters."""
+"""Make new members; their initial weights are those that RLlib would give them."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def new_member(
     observation_space: gym.Space[Any],
     action_space: gym.Space[Any],
 ) -> Member[H]:
-    """A member that has not trained yet.
+    """Return a member that has not trained yet.
 
     Its weights are, to the last bit, those of `RLModuleSpec.build()` after `torch.manual_seed(seed)`: the same parts
     build both, and RLlib itself, which takes a second to load, is not needed.
 
     Args:
         member_id: Its trial's id.
-        hyperparams: Validated.
-        seed: The trial's: of the weights and of all that the member draws.
+        hyperparams: Validated hyperparameters.
+        seed: The trial's seed, for the weights and for all random numbers of the member.
         observation_space: The environment's.
         action_space: The environment's.
     """

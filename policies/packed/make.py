@@ -1,4 +1,4 @@
-"""The stack of an algorithm."""
+"""Make the stack of an algorithm."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from policies.packed.stack import AnyStack
 
 
 def make_stack(hyperparams: TrainedHyperparams, envs: PackedEnvs, device: str = "cpu") -> AnyStack:
-    """A stack without members, for such as have in common with these hyperparameters what `shared_of` gives."""
+    """Return a stack without members, for members that share the values of `shared_of` with these hyperparameters."""
     if isinstance(hyperparams, DQNHyperparams):
         from policies.packed.dqn.stack import DQNStack
 

@@ -1,7 +1,7 @@
-"""What a pack knows of each of its members, and how an RLModule's weights lie in a stack's rows.
+"""The members of a pack, and how an RLModule's weights are laid out in a stack's rows.
 
-Names of weights are those of `policies.networks.rl_modules`' modules, so that a member can leave for RLlib and come
-from it.
+Names of weights are those of `policies.networks.rl_modules`' modules, so that a member can be turned into
+an RLlib algorithm and back.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ H_co = TypeVar("H_co", bound=TrainedHyperparams, covariant=True)
 
 @dataclass(eq=False)
 class Member(Generic[H_co]):
-    """One trial of a pack: all that training it on needs, but for its running episodes and its replay memory.
+    """One trial of a pack: all its state except its running episodes and its replay memory.
 
     The weights and moments here are those of the last time its stack wrote them back.
     """
@@ -39,34 +39,34 @@ class Member(Generic[H_co]):
     hyperparams: H_co
     seed: int
     weights: Weights
-    """By the RLModule's names, target networks (`_target_...`) and observation statistics among them."""
+    """The weights by the RLModule's names, including target networks (`_target_...`) and observation statistics."""
     moments: dict[str, Weights] = field(default_factory=dict)
-    """The optimizer's, by torch's names (`exp_avg`) and the weights'; empty: none yet."""
+    """The optimizer's moments by torch's names (`exp_avg`), then by the weights' names; empty before the first step."""
     num_optimizer_steps: int = 0
     num_env_steps: int = 0
     num_episodes: int = 0
     num_iterations: int = 0
     num_updates: int = 0
     kl_coeff: float = 0.0
-    """PPO: weight of the KL penalty now."""
+    """PPO: the present weight of the KL penalty."""
     due: float = 0.0
-    """DQN: updates that are due but not made."""
+    """DQN: the number of updates that are due but not made."""
     target_updates_at: float = 0.0
     """DQN: env steps or episodes at the last target update."""
     num_target_updates: int = 0
     failure_penalty: float | None = None
-    """Of its environments: reward of steps that end by failure; None: their own."""
+    """Reward of env steps that end an episode by failure; None: the env's own reward."""
     rng: np.random.Generator = field(kw_only=True)
     """Draws actions, permutations and batches."""
 
 
 AnyMember = Member[TrainedHyperparams]
-"""Of PPO or DQN."""
+"""A member of PPO or DQN."""
 
 
 @dataclass(frozen=True)
 class MemberStats:
-    """What one iteration gave a member."""
+    """A member's results of one iteration."""
 
     num_env_steps: int
     episodes: tuple[tuple[float, int], ...]
@@ -76,7 +76,7 @@ class MemberStats:
 
 @dataclass(frozen=True)
 class Part:
-    """Some columns of a layer: one linear layer of the RLModule."""
+    """One linear layer of the RLModule: some columns of a layer of the stack."""
 
     name: str
     start: int
@@ -85,12 +85,12 @@ class Part:
 
 @dataclass(frozen=True)
 class NetworkLayout:
-    """Which linear layers of the RLModule make one network of a stack, from input to output."""
+    """The linear layers of the RLModule that make one network of a stack, from input to output."""
 
     layers: tuple[tuple[Part, ...], ...]
 
     def write(self, layers: Sequence[Tensor], weights: Mapping[str, NDArray[Any]], prefix: str = "") -> None:
-        """Put an RLModule's weights into the layers of one row, shape (inputs + 1, outputs) each."""
+        """Copy an RLModule's weights into the layers of one row, each of shape (inputs + 1, outputs)."""
         for parts, layer in zip(self.layers, layers, strict=True):
             for part in parts:
                 matrix = torch.from_numpy(np.ascontiguousarray(weights[f"{prefix}{part.name}.weight"].T))
@@ -98,7 +98,7 @@ class NetworkLayout:
                 layer[-1, part.start : part.stop] = torch.from_numpy(weights[f"{prefix}{part.name}.bias"])
 
     def read(self, layers: Sequence[Tensor], num_inputs: int, prefix: str = "") -> Weights:
-        """The inverse of `write`."""
+        """Return an RLModule's weights from the layers of one row; the inverse of `write`."""
         weights: Weights = {}
         for parts, layer in zip(self.layers, layers, strict=True):
             for part in parts:
@@ -110,15 +110,15 @@ class NetworkLayout:
 
 
 def network_layouts(hyperparams: TrainedHyperparams, num_outputs: int) -> tuple[NetworkLayout, ...]:
-    """The networks of one member.
+    """Return the layouts of one member's networks.
 
     Args:
-        hyperparams: Of the member.
-        num_outputs: PPO: what the policy's head gives; DQN: actions.
+        hyperparams: The member's.
+        num_outputs: PPO: the number of outputs of the policy's head; DQN: the number of actions.
 
     Returns:
-        PPO: policy and value function, or both in one if they share layers; DQN: the Q-network. Values are the last
-        output, of a value function by itself the first.
+        PPO: the policy and the value function, or both in one if they share layers; DQN: the Q-network. The value is
+        the last output, or the first in a network for the value function only.
     """
     value = Part("vf", num_outputs, num_outputs + 1)
     if isinstance(hyperparams, DQNHyperparams):
@@ -134,7 +134,7 @@ def network_layouts(hyperparams: TrainedHyperparams, num_outputs: int) -> tuple[
 
 
 def _layout(hyperparams: TrainedHyperparams, encoder: str, heads: list[Part]) -> NetworkLayout:
-    # Layers with weights stand at every other place, the activations (none if linear) between them.
+    # Layers with weights are at every other index, with the activations (none if linear) between them.
     step = 1 if hyperparams.activation == "linear" else 2
     hidden = [
         (Part(f"{encoder}.mlp.{number * step}", 0, size),) for number, size in enumerate(hyperparams.hidden_sizes)
@@ -143,18 +143,18 @@ def _layout(hyperparams: TrainedHyperparams, encoder: str, heads: list[Part]) ->
 
 
 def num_stack_outputs(hyperparams: TrainedHyperparams, num_outputs: int) -> int:
-    """Outputs of the networks of a stack: with one more for a value in the same network."""
+    """Return the number of outputs of a stack's networks: one more if the network also gives a value."""
     if isinstance(hyperparams, PPOHyperparams):
         return num_outputs + hyperparams.vf_share_layers
     return num_outputs + hyperparams.dueling
 
 
 MAX_GROUP = 8
-"""Networks of so many members fit a core's cache with their activations; larger groups are no faster."""
+"""The networks of this many members, with their activations, fit a core's cache; larger groups are no faster."""
 
 
 def size_class(num_units: int) -> int:
-    """The size up to which a hidden layer is padded: 8, 12, 16, 24, 32, 48, ...; at most a third is waste."""
+    """Return the size that a hidden layer is padded to: 8, 12, 16, 24, 32, 48, ...; at most a third is padding."""
     size = 8
     while size < num_units:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
@@ -164,12 +164,12 @@ def size_class(num_units: int) -> int:
 def group_members(
     members: Sequence[Member[H]], max_size: int = MAX_GROUP, also: Callable[[Member[H]], Any] = lambda _: 0
 ) -> list[list[Member[H]]]:
-    """Members whose networks are computed together: of the same activation and about the same sizes.
+    """Group the members whose networks are computed together: the same activation and about the same sizes.
 
     Args:
-        members: All of a stack.
-        max_size: Of a group.
-        also: What else the members of a group have in common; sortable.
+        members: All members of a stack.
+        max_size: The most members of a group.
+        also: Returns a sortable value that the members of a group must share as well.
     """
 
     def key(member: Member[H]) -> tuple[str, tuple[int, ...], Any]:

@@ -1,6 +1,6 @@
-"""Many small networks as one: their weights stacked along a first axis, so that one batched product serves them all.
+"""Compute many small networks at once: their weights are stacked, so that one batched product serves them all.
 
-Shapes: K networks, B rows a network, D numbers a row, L hidden layers, A outputs.
+Shapes: K networks, B rows per network, D numbers per row, L hidden layers, A outputs.
 
 The networks of a stack have the same activation and layer sizes. Smaller ones are padded with zeros, which is exact: a
 padded unit's input is 0 and every activation maps 0 to 0, so its output and the gradients of all padded weights are 0,
@@ -44,15 +44,15 @@ def _tanh_of_few(x: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Activation:
-    """One activation; `linear` has no functions."""
+    """The functions of one activation; `linear` has none."""
 
     forward: Callable[[Tensor], Tensor] | None = None
     backward: Callable[[Tensor, Tensor], Tensor] | None = None
-    """Gradient of the input, from that of the output and what the forward pass kept."""
+    """Computes the gradient of the input from the gradient of the output and what the forward pass kept."""
     keeps_input: bool = False
-    """Its derivative needs the input; else it follows from the output, which is computed in place."""
+    """Whether the derivative needs the input; otherwise it needs the output, which is computed in place."""
     of_few: Callable[[Floats], Floats] | None = None
-    """The forward pass of few rows in NumPy; None: in torch."""
+    """The forward pass of a few rows in NumPy; None: torch is used."""
 
 
 _ACTIVATIONS = {
@@ -66,17 +66,17 @@ _ACTIVATIONS = {
 
 
 class StackedNetworks:
-    """K networks of dense layers; the activation after each but the last.
+    """K networks of dense layers, with the activation after each layer but the last.
 
     Args:
-        num_networks: K.
-        sizes: Inputs, units of each hidden layer, outputs.
+        num_networks: The number of networks, K.
+        sizes: The number of inputs, the units of each hidden layer, and the number of outputs.
         activation: A name of `policies.activations.ACTIVATIONS`.
         device: Where the weights lie.
 
     Attributes:
         weights: All weights, shape (K, P); a layer's block is its matrix, then its bias as one more row.
-        gradients: Of the last `backward`, as the weights.
+        gradients: The gradients of the last `backward`, in the shape of the weights.
         layers: Views of the weights, shape (K, inputs + 1, outputs) each.
     """
 
@@ -101,13 +101,13 @@ class StackedNetworks:
         return views
 
     def views_of(self, flat: Tensor) -> list[Tensor]:
-        """A tensor of shape (K, P) layer by layer, as `layers`."""
+        """Return views of a tensor of shape (K, P), layer by layer, as in `layers`."""
         return self._views(flat)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Outputs, shape (K, B, A), of inputs with a last column of ones, shape (K, B, D + 1)."""
+        """Return the outputs, shape (K, B, A), for inputs with a last column of ones, shape (K, B, D + 1)."""
         self._kept = []
-        # The ones make the first bias a part of the product.
+        # The column of ones makes the first bias a part of the product.
         x = self._activate(x, torch.bmm(x, self.layers[0]))
         for layer in self.layers[1:-1]:
             x = self._activate(x, torch.baddbmm(layer[:, -1:], x, layer[:, :-1]))
@@ -121,7 +121,7 @@ class StackedNetworks:
         return out
 
     def evaluate(self, x: Tensor, start: int, stop: int) -> Tensor:
-        """Outputs of the networks start to stop alone; keeps nothing for a `backward`."""
+        """Return the outputs of only the networks from start to stop; nothing is kept for a `backward`."""
         x = torch.bmm(x, self.layers[0][start:stop])
         for layer in self.layers[1:]:
             x = x if self._function is None else self._function(x)
@@ -129,7 +129,7 @@ class StackedNetworks:
         return x
 
     def backward(self, gradient: Tensor) -> None:
-        """Set `gradients` from that of the outputs of the last `forward`, shape (K, B, A)."""
+        """Set `gradients` from the gradient of the outputs of the last `forward`, shape (K, B, A)."""
         x, _ = self._kept[-1]
         self._set_gradients(-1, x, gradient)
         for number in range(len(self.layers) - 2, -1, -1):
@@ -150,7 +150,7 @@ class StackedNetworks:
 
 
 def with_ones(x: Floats) -> Floats:
-    """Rows with a last column of ones: what `StackedNetworks.forward` takes."""
+    """Return rows with a last column of ones, as `StackedNetworks.forward` takes them."""
     out = np.empty((*x.shape[:-1], x.shape[-1] + 1), dtype=np.float32)
     out[..., :-1] = x
     out[..., -1] = 1.0
@@ -158,11 +158,11 @@ def with_ones(x: Floats) -> Floats:
 
 
 class ActingNetworks:
-    """The forward pass in NumPy, for the few rows of one env step: each call costs a third of torch's.
+    """The forward pass in NumPy, for the few rows of one env step: a call takes a third of torch's time.
 
     Args:
-        networks: Whose weights are taken, at each `refresh`.
-        num_acting: The first so many networks act.
+        networks: The networks whose weights are copied at each `refresh`.
+        num_acting: How many of the networks act, counted from the first.
     """
 
     def __init__(self, networks: StackedNetworks, num_acting: int) -> None:
@@ -171,14 +171,14 @@ class ActingNetworks:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take over the weights as they are now."""
+        """Copy the present weights."""
         self._layers = []
         for layer in self._networks.layers:
             values = layer[: self._num_acting].detach().cpu().numpy()
             self._layers.append((values[:, :-1], values[:, -1:]))
 
     def __call__(self, x: Floats) -> Floats:
-        """Outputs, shape (num_acting, B, A), of inputs of shape (num_acting, B, D)."""
+        """Return the outputs, shape (num_acting, B, A), for inputs of shape (num_acting, B, D)."""
         for matrix, bias in self._layers[:-1]:
             x = np.matmul(x, matrix)
             x += bias

@@ -1,8 +1,8 @@
 """Adam and RMSprop over stacked weights, each row with settings of its own.
 
-The formulas are torch.optim's, so that an optimizer's state goes over into RLlib's and back.
+The formulas are torch.optim's, so that an optimizer's state can be moved to RLlib's optimizer and back.
 
-Shapes: K rows (networks), P weights a row.
+Shapes: K rows (networks), P weights per row.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from torch import Tensor
 
 
 class StackedOptimizer(Protocol):
-    """Moves weights of shape (K, P)."""
+    """Updates weights of shape (K, P)."""
 
     lr: Tensor
-    """(K, 1); may be set at any time."""
+    """The learning rates, (K, 1); they may be set at any time."""
     state: dict[str, Tensor]
-    """Name -> moments, shape (K, P)."""
+    """The moments by name, each of shape (K, P)."""
     num_steps: Tensor
-    """Steps each row has made, (K, 1), float64."""
+    """The number of steps that each row has made, (K, 1), float64."""
 
     def begin(self, num_updates: int) -> None:
-        """Prepare for so many steps: what does not depend on gradients is computed once for all of them."""
+        """Prepare for `num_updates` steps: everything that does not depend on gradients is computed for all of them."""
         ...
 
     def step(self, gradients: Tensor) -> None:
-        """Move the weights by one step."""
+        """Update the weights by one step."""
         ...
 
 
@@ -36,11 +36,11 @@ class StackedAdam:
     """Adam (Kingma & Ba 2015, algorithm 1) as `torch.optim.Adam` computes it.
 
     Args:
-        weights: (K, P); moved in place.
-        lr: (K, 1).
-        beta1: Decay of the mean gradient, (K, 1), float64: of one near 1, 1 - beta is exact only there.
-        beta2: Decay of the squared gradient, as beta1.
-        epsilon: (K, 1).
+        weights: The weights, (K, P); they are updated in place.
+        lr: The learning rates, (K, 1).
+        beta1: Decay of the mean gradient, (K, 1), float64, because 1 - beta is inexact in float32 if beta is near 1.
+        beta2: Decay of the squared gradient, (K, 1), float64.
+        epsilon: Added to the denominator, (K, 1).
     """
 
     def __init__(self, weights: Tensor, lr: Tensor, beta1: Tensor, beta2: Tensor, epsilon: Tensor) -> None:
@@ -52,18 +52,18 @@ class StackedAdam:
         self._rates: list[tuple[Tensor, Tensor]] = []
 
     def begin(self, num_updates: int) -> None:
-        """See `StackedOptimizer`; the learning rate is that of now."""
+        """Compute the rates of the next `num_updates` steps, with the present learning rates."""
         counts = self.num_steps + torch.arange(num_updates, 0, -1, dtype=torch.float64, device=self.lr.device).view(
             -1, 1, 1
         )
         correction1, correction2 = 1 - self._beta1**counts, 1 - self._beta2**counts
         rates = (self.lr.double() / correction1).float()
         scales = correction2.rsqrt().float()
-        # Popped from the end: the first step is the last in the list.
+        # They are popped from the end of the list, so the first step comes last.
         self._rates = list(zip(rates.unbind(0), scales.unbind(0), strict=True))
 
     def step(self, gradients: Tensor) -> None:
-        """See `StackedOptimizer`."""
+        """Update the weights by one step of Adam."""
         if not self._rates:
             self.begin(1)
         rate, scale = self._rates.pop()
@@ -83,11 +83,11 @@ class StackedRMSprop:
     """RMSprop (Hinton 2012) as `torch.optim.RMSprop` computes it.
 
     Args:
-        weights: (K, P); moved in place.
-        lr: (K, 1).
+        weights: The weights, (K, P); they are updated in place.
+        lr: The learning rates, (K, 1).
         rho: Decay of the squared gradient, (K, 1), float64.
-        momentum: (K, 1).
-        epsilon: (K, 1).
+        momentum: The momentum, (K, 1).
+        epsilon: Added to the denominator, (K, 1).
     """
 
     def __init__(self, weights: Tensor, lr: Tensor, rho: Tensor, momentum: Tensor, epsilon: Tensor) -> None:
@@ -98,10 +98,10 @@ class StackedRMSprop:
         self.num_steps = torch.zeros_like(lr, dtype=torch.float64)
 
     def begin(self, num_updates: int) -> None:
-        """See `StackedOptimizer`: nothing."""
+        """Do nothing, because nothing is computed ahead."""
 
     def step(self, gradients: Tensor) -> None:
-        """See `StackedOptimizer`."""
+        """Update the weights by one step of RMSprop."""
         square, buffer = self.state["square_avg"], self.state["momentum_buffer"]
         square.mul_(self._rho)
         square += gradients * gradients * self._weight
@@ -117,15 +117,15 @@ def clip_by_global_norm(gradients: Tensor, limit: Tensor, networks_per_member: i
 
     Args:
         gradients: (networks_per_member * M, P): the first networks of all members, then the second.
-        limit: (M, 1); infinity: no clipping.
-        networks_per_member: Networks that count as one.
+        limit: The largest norms, (M, 1); infinity: no clipping.
+        networks_per_member: How many networks have one norm together.
 
     Returns:
         The norms before clipping, (M, 1).
     """
     norms: Tensor = torch.linalg.vector_norm(gradients.view(networks_per_member, -1, gradients.shape[1]), dim=2)
     norms = torch.linalg.vector_norm(norms, dim=0).unsqueeze(1)
-    # An unlimited member's is inf / inf.
+    # Without a limit the quotient is inf / inf.
     factors = torch.where(limit.isinf(), 1.0, (limit / torch.clamp(norms + 1e-6, min=limit)).clamp(max=1.0))
     gradients.mul_(factors.repeat(networks_per_member, 1))
     return norms

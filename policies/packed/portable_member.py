@@ -1,4 +1,4 @@
-"""A member of a pack as a portable policy."""
+"""Turn a member of a pack into a portable policy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def portable_policy(
     env_args: Mapping[str, Any],
     training: Mapping[str, Any],
 ) -> PortablePolicy:
-    """The greedy policy of a member, with its weights written back."""
+    """Return the greedy policy of a member whose weights were written back."""
     return PortablePolicy(
         network=network_from_weights(member.weights, member.hyperparams, observation_space, action_space),
         algorithm="ppo" if isinstance(member.hyperparams, PPOHyperparams) else "dqn",

@@ -1,6 +1,6 @@
-"""Rows of a stack <-> members: building stacked networks and optimizers from members, and writing them back.
+"""Build the stacked networks and optimizers from members, and write them back.
 
-Shapes: M members, n networks a member; row k * M + m is network k of member m.
+Shapes: M members, n networks per member; row k * M + m is network k of member m.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from policies.packed.optimizers import StackedOptimizer
 
 
 class StackedRows:
-    """The networks of some members, from the members' own weights.
+    """The stacked networks of some members, made from the members' own weights.
 
     Args:
-        members: With as many layers each, and one activation.
-        num_inputs: Numbers of an observation.
-        num_outputs: Of a policy's head, or actions.
+        members: Members with equally many layers and one activation.
+        num_inputs: Numbers per observation.
+        num_outputs: The number of outputs of a policy's head, or of actions.
         device: Where the weights lie.
-        prefix: Of the weights' names: that of the target networks, or none.
+        prefix: The prefix of the weights' names: that of the target networks, or none.
     """
 
     def __init__(
@@ -46,11 +46,11 @@ class StackedRows:
                 yield row, [layer[row] for layer in layers], member, layout
 
     def per_row(self, value: Callable[[AnyMember], float], dtype: torch.dtype = torch.float32) -> Tensor:
-        """A number of each member as a column over all rows, (n * M, 1)."""
+        """Return a number of each member as a column over all rows, (n * M, 1)."""
         return self.per_member(value, dtype).repeat(self.networks_per_member, 1)
 
     def per_member(self, value: Callable[[AnyMember], float], dtype: torch.dtype = torch.float32) -> Tensor:
-        """A number of each member, (M, 1)."""
+        """Return a number of each member as a column, (M, 1)."""
         values = [[value(member)] for member in self._members]
         return torch.tensor(values, dtype=dtype, device=self.networks.weights.device)
 
@@ -63,7 +63,7 @@ class StackedRows:
                 optimizer.num_steps[row] = member.num_optimizer_steps
 
     def write_back(self, optimizer: StackedOptimizer | None = None) -> None:
-        """Give the members their weights as they are now, and their optimizer's state."""
+        """Copy the present weights and the optimizer's state back to the members."""
         for _, layers, member, layout in self._rows(self.networks.layers):
             member.weights.update(layout.read(layers, self._num_inputs, self._prefix))
         if optimizer is None:

@@ -1,6 +1,6 @@
-"""What the stacks of PPO and DQN share: members, their rows of environments, their episodes and observations.
+"""Track episodes and prepare observations, for the stacks of both PPO and DQN.
 
-Shapes: M members, T vector steps, N sub-environments a member, S = M * N rows, D numbers an observation.
+Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, D numbers per observation.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ Floats = NDArray[np.float32]
 
 
 class EpisodeTracker:
-    """Returns and lengths of running episodes, row by row."""
+    """Tracks returns and lengths of running episodes, row by row."""
 
     def __init__(self) -> None:
         self._running: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
 
     def add(self, member_id: str, num_envs: int) -> None:
-        """A member's episodes begin."""
+        """Begin a member's episodes."""
         self._running[member_id] = (np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64))
 
     def remove(self, member_id: str) -> None:
-        """Its episodes will not end."""
+        """Forget a member's running episodes."""
         del self._running[member_id]
 
     def follow(
         self, member_ids: Sequence[str], rewards: Floats, ended: NDArray[np.bool_]
     ) -> list[tuple[tuple[float, int], ...]]:
-        """Take in a stretch of steps.
+        """Process some steps.
 
         Args:
-            member_ids: In the order of the rows.
-            rewards: The env's own, (T, S).
-            ended: (T, S).
+            member_ids: The members in the order of the rows.
+            rewards: The env's own rewards, (T, S).
+            ended: Whether each step ended its episode, (T, S).
 
         Returns:
-            For each member (return, env steps) of the episodes that ended, oldest first.
+            For each member, the return and the env steps of each episode that ended, oldest first.
         """
         num_steps, num_rows = ended.shape
         num_envs = num_rows // len(member_ids)
@@ -50,7 +50,7 @@ class EpisodeTracker:
         lengths = np.concatenate([self._running[name][1] for name in member_ids])
         sums = np.cumsum(rewards, axis=0, dtype=np.float64)
         found: list[list[tuple[int, int, float, int]]] = [[] for _ in member_ids]
-        # By row, then by time, so that an episode's beginning is the end before it in the list.
+        # Sorted by row, then by time: an episode begins after the end that is before it in the list.
         rows, steps = np.nonzero(ended.T)
         start_sum, start_step = np.zeros(num_rows), np.zeros(num_rows, dtype=np.int64)
         for row, step in zip(rows.tolist(), steps.tolist(), strict=True):
@@ -68,11 +68,11 @@ class EpisodeTracker:
 
 
 class Observations:
-    """What the networks see of observations: normalised by each member's own statistics, or as they are.
+    """Prepares observations for the networks: normalised by each member's own statistics, or unchanged.
 
     Args:
-        members: In the order of the rows.
-        num_envs: N.
+        members: The members in the order of the rows.
+        num_envs: Sub-environments per member, N.
         normalizes: Whether observations are normalised.
     """
 
@@ -87,7 +87,7 @@ class Observations:
         self._factor = (1.0 / np.sqrt(variance + np.float32(VARIANCE_EPSILON))).astype(np.float32)
 
     def prepare(self, observations: Floats) -> Floats:
-        """(S, D), or (T, S, D), as (M, N, D) or (T, M, N, D)."""
+        """Return prepared observations: (S, D) as (M, N, D), or (T, S, D) as (T, M, N, D)."""
         num_members = len(self._members)
         x: Floats = observations.reshape(*observations.shape[:-2], num_members, -1, observations.shape[-1])
         if not self._normalizes:
@@ -97,7 +97,7 @@ class Observations:
         return scaled
 
     def prepare_rows(self, rows: Floats, num_inputs: int) -> Floats:
-        """Rows of a replay memory, (M, B, columns), with their observations prepared in place."""
+        """Prepare the observations in rows of a replay memory, (M, B, columns), in place, and return the rows."""
         if self._normalizes:
             for first in (0, num_inputs + 1):
                 columns = rows[..., first : first + num_inputs]
@@ -107,11 +107,11 @@ class Observations:
         return rows
 
     def part(self, start: int, stop: int) -> Observations:
-        """Of the members start to stop alone."""
+        """Return the same for only the members from start to stop."""
         return Observations(self._members[start:stop], self._num_envs, normalizes=self._normalizes)
 
     def learn(self, observations: Floats) -> None:
-        """Add observations as the env gave them, (T, S, D), to each member's statistics."""
+        """Add observations as the env returned them, (T, S, D), to each member's statistics."""
         if not self._normalizes:
             return
         rows = observations.reshape(len(observations), len(self._members), -1, observations.shape[-1])
@@ -136,6 +136,6 @@ def merge_statistics(member: AnyMember, rows: Floats) -> None:
 
 
 def one_hot(actions: NDArray[np.int64], num_actions: int) -> Floats:
-    """Actions, (...), as (..., num_actions)."""
+    """Return whole numbers, (...), in one-hot form, (..., num_actions)."""
     out: Floats = (actions[..., None] == np.arange(num_actions)).astype(np.float32)
     return out

@@ -1,6 +1,6 @@
-"""What the members of a stack have in common, as types: a stack's program reads it here, and nowhere else.
+"""The hyperparameters that all members of a stack share, as types that a stack's program reads them from.
 
-All other hyperparameters may differ between members, and are read of each.
+All other hyperparameters may differ between members, and are read from each member.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 
 @dataclass(frozen=True)
 class Shared:
-    """Of PPO and of DQN; the fields are hyperparameters."""
+    """The shared hyperparameters of both PPO and DQN."""
 
     num_envs: int
     normalize_observations: bool
@@ -22,13 +22,13 @@ class Shared:
 
     @classmethod
     def of(cls, hyperparams: TrainedHyperparams) -> Self:
-        """Those of a member."""
+        """Return the shared ones of a member's hyperparameters."""
         return cls(**{field.name: getattr(hyperparams, field.name) for field in dataclasses.fields(cls)})
 
 
 @dataclass(frozen=True)
 class SharedByPPO(Shared):
-    """What shapes PPO's batches and updates."""
+    """The shared hyperparameters of PPO, which decide the sizes of batches and the steps of updates."""
 
     vf_share_layers: bool
     use_kl_loss: bool
@@ -38,7 +38,7 @@ class SharedByPPO(Shared):
 
 @dataclass(frozen=True)
 class SharedByDQN(Shared):
-    """What shapes DQN's phases, batches and updates."""
+    """The shared hyperparameters of DQN, which decide its phases, batches and updates."""
 
     env_steps_per_iteration: int
     train_freq: int
@@ -56,7 +56,7 @@ class SharedByDQN(Shared):
 
 
 def shared_of(hyperparams: TrainedHyperparams) -> SharedByPPO | SharedByDQN:
-    """What every other member of a stack has as this one does."""
+    """Return the hyperparameters that every other member of the same stack has to share with this one."""
     if isinstance(hyperparams, PPOHyperparams):
         return SharedByPPO.of(hyperparams)
     return SharedByDQN.of(hyperparams)

@@ -1,4 +1,4 @@
-"""What a stack is: members of a pack that share one tensor program, and how they come and go."""
+"""The base class of stacks: members of a pack that share one tensor program, and how they come and go."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Group(Protocol):
     """Members whose networks are computed together."""
 
     def write_back(self) -> None:
-        """Give the members their weights and moments as they are now."""
+        """Copy the present weights and moments back to the members."""
         ...
 
 
@@ -26,34 +26,34 @@ S = TypeVar("S", bound=Shared)
 
 
 class Stack(ABC, Generic[H, G, S]):
-    """Trains its members together. They may come and go between iterations; the others do not notice.
+    """Trains its members together. Members may come and go between iterations without any effect on the others.
 
-    They are equal in `Shared` and in the environment.
+    All members have the same environment and the same hyperparameters of `Shared`.
 
     Args:
-        shared: What all members have in common.
-        envs: Without members.
-        device: Of the updates.
+        shared: The hyperparameters that all members share.
+        envs: The environments, without members yet.
+        device: Where the updates are computed.
     """
 
     def __init__(self, shared: S, envs: PackedEnvs, device: str) -> None:
         self.envs, self._device = envs, device
         self.members: list[Member[H]] = []
-        """In the order of their rows."""
+        """The members in the order of their rows."""
         self._shared = shared
         self._groups: Sequence[G] = []
         self._episodes = EpisodeTracker()
-        # Stale: members came or went since the groups were made. Written: no group has learned since the members were
-        # given their weights; so it is while the groups are stale.
+        # Stale: members came or went since the groups were made. Written: no group has learned since its weights were
+        # copied back to the members, which is always so while the groups are stale.
         self._stale, self._is_written = False, True
         self._num_inputs = math.prod(envs.observation_space.shape or ())
 
     def add(self, member: Member[H], env_seed: int) -> None:
-        """A further member; its episodes begin.
+        """Add a member and begin its episodes.
 
         Raises:
-            EnvError: Its environments cannot be made or reset; it is no member then.
-            ValueError: Its hyperparameters are not those that the members share.
+            EnvError: Its environments cannot be made or reset; then it is not added.
+            ValueError: Its hyperparameters differ from those that the members share.
         """
         own = self._shared.of(member.hyperparams)
         if own != self._shared:
@@ -70,7 +70,7 @@ class Stack(ABC, Generic[H, G, S]):
         self._stale = True
 
     def remove(self, member_id: str) -> Member[H]:
-        """Take a member out, with its weights as they are now."""
+        """Remove a member and return it with its present weights."""
         member = self.member(member_id)
         self.members.remove(member)
         self.envs.remove(member_id)
@@ -80,7 +80,7 @@ class Stack(ABC, Generic[H, G, S]):
         return member
 
     def member(self, member_id: str) -> Member[H]:
-        """A member, with its weights as they are now."""
+        """Return a member with its present weights."""
         self._write_back()
         (member,) = (item for item in self.members if item.member_id == member_id)
         return member
@@ -93,17 +93,17 @@ class Stack(ABC, Generic[H, G, S]):
         self._is_written = True
 
     def _begin(self, member: Member[H]) -> None:
-        """Make room for what the algorithm keeps of a member beside its weights.
+        """Make room for what the algorithm keeps for a member besides its weights.
 
         Raises:
-            MemoryError: There is none; it is no member then.
+            MemoryError: There is not enough memory; then the member is not added.
         """
 
     def _forget(self, member_id: str) -> None:
-        """Drop what `_begin` made."""
+        """Free what `_begin` made."""
 
     def train_iteration(self) -> dict[str, MemberStats]:
-        """An iteration of every member from beginning to end."""
+        """Train every member for a whole iteration."""
         self.begin_iteration()
         return self.finish_iteration()
 
@@ -111,13 +111,13 @@ class Stack(ABC, Generic[H, G, S]):
     def begin_iteration(self) -> None:
         """Begin an iteration of every member.
 
-        On a GPU the updates may go on when this returns: time for another stack to sample.
+        On a GPU the updates may still run when this returns, so that another stack can sample meanwhile.
         """
 
     @abstractmethod
     def finish_iteration(self) -> dict[str, MemberStats]:
-        """End the iteration that was begun; what it gave, by id. Members in `PackedEnvs.errors` have failed."""
+        """End the iteration and return its results by member id. Members in `PackedEnvs.errors` have failed."""
 
 
 AnyStack = Stack[Any, Any, Any]
-"""Of one algorithm or the other."""
+"""A stack of either algorithm."""

@@ -1,4 +1,4 @@
-"""A member on disk: safetensors and JSON, nothing that is executed when it is read."""
+"""Write members to disk and read them, as safetensors and JSON, which execute nothing when they are read."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _COUNTERS = (
 _WEIGHTS = "weights"
 _STATISTICS = (OBS_MEAN, OBS_VAR, OBS_COUNT)
 _MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"})
-"""Of Adam and of RMSprop."""
+"""The names of the moments of Adam and of RMSprop."""
 _HINT = "Use another checkpoint of the trial; training cannot continue from this one."
 
 
 def save_member(member: AnyMember, folder: Path) -> None:
-    """Write a member into a folder, which is made.
+    """Write a member into a new folder.
 
     Args:
-        member: With its weights written back.
-        folder: Where `state.safetensors` and `state.json` will lie.
+        member: A member whose weights were written back.
+        folder: The folder for `state.safetensors` and `state.json`.
     """
     from safetensors.numpy import save
 
     folder.mkdir(parents=True, exist_ok=True)
-    # Not by ascontiguousarray, which makes one of a single number.
+    # ascontiguousarray would make an array of one element from a single number.
     tensors = {f"{_WEIGHTS}/{name}": np.asarray(value, order="C") for name, value in member.weights.items()}
     for moment, weights in member.moments.items():
         tensors |= {f"{moment}/{name}": np.asarray(value, order="C") for name, value in weights.items()}
@@ -58,8 +58,8 @@ def load_member(folder: Path, member_id: str) -> AnyMember:
     """Read a member.
 
     Args:
-        folder: What `save_member` wrote; callers check the manifest's hashes first.
-        member_id: Its name from now on.
+        folder: A folder that `save_member` wrote; callers check the manifest's hashes first.
+        member_id: The member's id from now on.
 
     Raises:
         CheckpointError: Something is missing or damaged, or was written by a newer version.
@@ -104,14 +104,14 @@ def _number(value: Any) -> Any:
 
 
 def check_shapes(member: AnyMember, expected: Weights) -> None:
-    """Check that a member's weights are those of the network its hyperparameters describe.
+    """Check that a member's weights have the shapes that its hyperparameters describe.
 
     Args:
-        member: As it was read.
+        member: A member that was read.
         expected: Weights of a new member with the same hyperparameters.
 
     Raises:
-        CheckpointError: They are not.
+        CheckpointError: A shape differs, or weights are missing.
     """
     for part, weights in {_WEIGHTS: member.weights, **member.moments}.items():
         for name, value in weights.items():

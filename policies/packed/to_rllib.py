@@ -1,4 +1,4 @@
-"""A member of a pack as an RLlib `Algorithm` that trains on, and as a portable policy."""
+"""Turn a member of a pack into an RLlib `Algorithm` that can continue training."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from policies.rllib.restore import check_weights
 
 
 def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num_gpus: float = 0.0) -> Algorithm:
-    """A checkpoint of the packed engine as an RLlib Algorithm that trains on from it.
+    """Restore a checkpoint of the packed engine as an RLlib Algorithm that can continue training.
 
-    Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's;
-    random numbers are others, and a replay memory is empty.
+    Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's.
+    Random numbers differ from those the pack would have drawn, and a replay memory is empty.
 
     Args:
         checkpoint: A checkpoint folder of a trial.
-        num_env_runners: As `build_algorithm_config`.
-        num_gpus: As `build_algorithm_config`.
+        num_env_runners: The same as for `build_algorithm_config`.
+        num_gpus: The same as for `build_algorithm_config`.
 
     Raises:
-        NotFoundError: There is none.
+        NotFoundError: There is no such checkpoint.
         CheckpointError: It is damaged, or the Algorithm does not hold the checkpoint's weights afterwards.
     """
     saved = read_policy(checkpoint)
@@ -53,17 +53,18 @@ def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num
 def to_algorithm(
     member: AnyMember, *, env_id: str, env_args: dict[str, Any], expected: PolicyNetwork | None = None, **settings: Any
 ) -> Algorithm:
-    """A member, with its weights written back, as an RLlib Algorithm.
+    """Return a member as an RLlib Algorithm.
 
     Args:
-        member: Of PPO or DQN.
+        member: A member of PPO or DQN whose weights were written back.
         env_id: Its environment.
-        env_args: Of the environment.
-        expected: The network it must act with.
+        env_args: The arguments of the environment.
+        expected: The network that the Algorithm has to act with.
         settings: Further arguments of `build_algorithm_config`.
 
     Raises:
-        CheckpointError: The weights are not those of the network the hyperparameters describe, or not the expected.
+        CheckpointError: The weights are not those of the network the hyperparameters describe, or not the expected
+            ones.
     """
     later, _ = random_streams.seeds_after(member.seed, member.num_iterations)
     seed = later % 2**31 if member.num_iterations else member.seed
@@ -80,7 +81,7 @@ def to_algorithm(
     except Exception as error:
         algorithm.stop()
         raise CheckpointError(
-            f"The state of {member.member_id} does not go into RLlib's networks: {error!r}.",
+            f"The state of {member.member_id} cannot be loaded into RLlib's networks: {error!r}.",
             "Use another checkpoint of the trial; training cannot continue from this one.",
         ) from error
     return algorithm
@@ -109,17 +110,17 @@ def _take_over(algorithm: Algorithm, member: AnyMember) -> None:
         learner.target_updates_at = member.target_updates_at
         learner.num_target_updates = member.num_target_updates
     else:
-        # A dict that makes its values when they are first asked for: there is none to loop over yet.
+        # This dict makes its values when they are first asked for, so there are none to loop over yet.
         learner.curr_kl_coeffs_per_module[DEFAULT_MODULE_ID].data.fill_(member.kl_coeff)
 
 
 def _count_env_steps(algorithm: Algorithm, num_env_steps: int) -> None:
-    """Have the Algorithm count env steps on from there, in the way that its algorithm counts them (RLlib 2.60)."""
+    """Have the Algorithm continue its count of env steps from this number, in RLlib 2.60's own way."""
     if isinstance(algorithm, ReplayDQN):
         key = (ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME)
         algorithm.metrics.log_value(key, num_env_steps, reduce="lifetime_sum")
         return
-    # What env runners report is merged, and nothing can be merged into what was logged: so as if one had reported it.
+    # Env runners' reports are merged, and nothing can be merged into a logged value, so this acts as such a report.
     reported = MetricsLogger(root=False)
     reported.log_value(NUM_ENV_STEPS_SAMPLED_LIFETIME, num_env_steps, reduce="lifetime_sum", with_throughput=True)
     algorithm.metrics.aggregate([reported.reduce()], key=ENV_RUNNER_RESULTS)

@@ -1,7 +1,7 @@
-"""Convolutions without padding: the sizes they give, and their results in NumPy.
+"""Compute convolutions without padding in NumPy, and the sizes of their outputs.
 
 Words: a *filter* is `(channels, kernel, stride)`: square kernels, the same stride in both directions. Images are
-(height, width, channels), as environments give them.
+(height, width, channels), as environments return them.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ Filter = tuple[int, int, int]
 
 
 def output_shape(image_shape: Sequence[int], filters: Sequence[Filter]) -> tuple[int, int, int]:
-    """The shape (height, width, channels) that a stack of convolutions makes of images.
+    """Return the shape (height, width, channels) of a stack of convolutions' output for images.
 
     Args:
         image_shape: (height, width, channels) of the observations.
         filters: `conv_filters` of the hyperparameters.
 
     Raises:
-        SpecError: The observations are no images, or become smaller than a kernel.
+        SpecError: The observations are not images, or become smaller than a kernel.
     """
     if len(image_shape) != 3:
         raise SpecError(
@@ -49,16 +49,16 @@ def output_shape(image_shape: Sequence[int], filters: Sequence[Filter]) -> tuple
 def convolve(
     images: NDArray[np.float32], matrix: NDArray[np.float32], bias: NDArray[np.float32], *, kernel: int, stride: int
 ) -> NDArray[np.float32]:
-    """One convolution, as one matrix product an image.
+    """Compute one convolution, as one matrix product per image.
 
-    A product of its own for each image, so that its result does not depend, in the last bit, on the others.
+    With a product for each image, an image's result does not depend on the other images, to the last bit.
 
     Args:
         images: Shape (num, height, width, channels).
         matrix: Shape (channels * kernel * kernel, out_channels); rows in the order channel, row, column.
         bias: Shape (out_channels,).
         kernel: Pixels along a side of the kernel.
-        stride: Pixels between two places of it.
+        stride: Pixels between two positions of the kernel.
 
     Returns:
         Shape (num, out_height, out_width, out_channels).

@@ -1,11 +1,11 @@
-"""The portable policy file: what it takes to act, without Ray, torch or pickle.
+"""Write and read the portable policy file: all that a policy needs to act, without Ray, torch or pickle.
 
 It is a pair of files side by side. `policy.safetensors` holds the weights; `policy.json` says what network
 they form (see `policies.portable.network`), which environment it acts in and how it was trained, and carries the
 SHA-256 of the weights.
 
-Formats: 1 had layers alone; 2 has all that `policies.portable.network` describes, and writes the bounds of a space as
-one number where they are all equal. Both are read.
+Formats: version 1 had only layers; version 2 has all that `policies.portable.network` describes, and writes the bounds
+of a space as one number where they are all equal. Both can be read.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ __all__ = [
 FORMAT_VERSION = 2
 READABLE_VERSIONS = (1, 2)
 _MAX_CHARS = 400
-"""Of what a message quotes."""
+"""The most characters of a problem that a message quotes."""
 
 ActionTransform = Literal["none", "unsquash", "by_component", "clip"]
 
 
 @dataclass(frozen=True, eq=False)
 class PortablePolicy:
-    """A network and all that is needed to let it act in its environment."""
+    """A network and all that it needs to act in its environment."""
 
     network: PolicyNetwork
     algorithm: str
     env_id: str
     env_args: dict[str, Any]
     observation_space: dict[str, Any]
-    """As `describe_space` gives it."""
+    """The space as `describe_space` describes it."""
     action_space: dict[str, Any]
     action_transform: ActionTransform = "none"
-    """What turns a Box action of the network into one of the env: see `policies.acting.policy`."""
+    """The name of how the network's Box actions become the env's; see `policies.acting.policy`."""
     training: dict[str, Any] = field(default_factory=dict)
-    """Where it comes from: trial id, iteration, hyperparameters, seed, ... Free, and not needed to act."""
+    """Free metadata on its training, such as trial id, iteration, hyperparameters and seed; not needed to act."""
 
 
 def save_policy(
@@ -78,13 +78,13 @@ def save_policy(
     """Write `<stem>.safetensors` and `<stem>.json` into a folder.
 
     Each file appears whole or not at all, the weights first, so an interrupted save never leaves a JSON file
-    without its weights; the hash in it tells if the weights beside it are those of another save.
+    without its weights. The hash in the JSON file shows whether the weights beside it come from another save.
 
     Args:
-        policy: What to write.
-        folder: Where.
-        stem: Name of the files, without their endings.
-        write: Writes a file; `write_plain` where the folder is not to be seen yet.
+        policy: The policy to write.
+        folder: The folder to write to.
+        stem: The name of the files without their suffixes.
+        write: Writes a file; `write_plain` if the folder is not visible to readers yet.
 
     Returns:
         The path of the JSON file.
@@ -116,7 +116,7 @@ def save_policy(
 
 
 def is_policy_folder(folder: Path) -> bool:
-    """Whether a folder holds a policy, by the name of its file; what is in it is not looked at."""
+    """Whether a folder holds a policy, judged by the name of its file; its content is not looked at."""
     return (folder / "policy.json").is_file()
 
 
@@ -128,7 +128,7 @@ def read_policy(path: Path) -> PortablePolicy:
 
     Raises:
         NotFoundError: One of the two files is not there.
-        CheckpointError: The files do not belong together, were altered, or are of another format.
+        CheckpointError: The files do not belong together, were altered, or have another format.
     """
     json_path, weights_path = _locate(Path(path))
     try:
@@ -217,7 +217,7 @@ def _check(policy: PortablePolicy, place: str) -> None:
     """Check that the network maps the observations to the actions.
 
     Raises:
-        CheckpointError: It does not, or a name is unknown.
+        CheckpointError: It does not map them, or a name is unknown.
     """
     observation_space = space_from_description(policy.observation_space)
     action_space = space_from_description(policy.action_space)
@@ -231,7 +231,7 @@ def _check(policy: PortablePolicy, place: str) -> None:
 
 
 def _jsonable(value: Any) -> Any:
-    """Metadata as JSON has it: NumPy scalars as numbers, tuples as lists, NaN and infinity as null."""
+    """Return metadata in JSON's types: NumPy scalars as numbers, tuples as lists, NaN and infinity as null."""
     if isinstance(value, Mapping):
         return {str(key): _jsonable(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""The forward pass of a portable network, in NumPy."""
+"""Compute the forward pass of a portable network in NumPy."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _IMAGES_AT_ONCE = 32  # a convolution needs several times the memory of its imag
 
 
 class ForwardPass:
-    """Observations -> outputs of a network.
+    """Computes a network's outputs from observations.
 
-    The result for an observation does not depend on what else is in its batch, to the last bit.
+    To the last bit, the result for an observation does not depend on what else is in its batch.
 
     Args:
-        network: One with layers.
+        network: A network with layers.
     """
 
     def __init__(self, network: PolicyNetwork) -> None:
@@ -34,18 +34,18 @@ class ForwardPass:
 
     @property
     def prepares(self) -> bool:
-        """Whether `prepare` does anything."""
+        """Whether `prepare` changes observations."""
         return self._scale is not None or self._normalize is not None
 
     def prepare(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Scaled and normalised observations."""
+        """Return scaled and normalised observations."""
         x = observations
         if self._scale is not None:
             x = x * self._scale
         return x if self._normalize is None else self._normalize(x)
 
     def __call__(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Outputs, shape (num, num_outputs), for observations of shape (num, ...)."""
+        """Return the outputs, shape (num, num_outputs), for observations of shape (num, ...)."""
         if self._conv and len(observations) > _IMAGES_AT_ONCE:
             parts = range(0, len(observations), _IMAGES_AT_ONCE)
             return np.concatenate([self(observations[first : first + _IMAGES_AT_ONCE]) for first in parts])
@@ -53,8 +53,8 @@ class ForwardPass:
         if self._conv:
             for conv in self._conv:
                 x = conv(x)
-            x = x.transpose(0, 3, 1, 2)  # channel by channel, as torch flattens
-        # One vector-matrix product an observation (a stack of 1-row matrices): a single product of the batch
+            x = x.transpose(0, 3, 1, 2)  # channels first, as torch flattens images
+        # One vector-matrix product per observation (a stack of 1-row matrices): a single product of the batch
         # takes other BLAS kernels at other batch sizes, whose results differ in the last bit. It costs no
         # more at these sizes.
         x = x[:, None, :] if x.ndim == 2 else x.reshape(len(x), 1, math.prod(x.shape[1:]))
@@ -64,10 +64,10 @@ class ForwardPass:
 
 
 class ForwardPasses:
-    """Several networks at once, each for observations of its own; the bits are those of a `ForwardPass` each.
+    """Computes several networks at once, each for its own observations, with the same bits as a `ForwardPass` each.
 
     Args:
-        passes: Of networks with layers and without convolutions, all of one `layout`.
+        passes: The forward passes of networks with layers and without convolutions, all of one `layout`.
     """
 
     def __init__(self, passes: Sequence[ForwardPass]) -> None:
@@ -75,23 +75,23 @@ class ForwardPasses:
         self._layers = [_Linears(linears) for linears in zip(*(one.layers for one in passes), strict=True)]
 
     def choose(self, places: Sequence[int]) -> ForwardPasses:
-        """Some of these networks alone."""
+        """Return the same for only some of these networks."""
         return ForwardPasses([self._passes[place] for place in places])
 
     @staticmethod
     def layout(network: PolicyNetwork) -> tuple[Any, ...]:
-        """What networks must have in common to be computed at once; empty if a network cannot be."""
+        """Return what networks must have in common to be computed at once; empty if this one cannot be."""
         if network.conv or not network.layers:
             return ()
         layers = tuple((layer.weight.shape, layer.activation) for layer in network.layers)
         return (network.scale != 1.0 or network.normalization is not None, layers)
 
     def __call__(self, observations: NDArray[np.float32], counts: Sequence[int]) -> NDArray[np.float32]:
-        """Outputs, shape (num, num_outputs).
+        """Return the outputs, shape (num, num_outputs).
 
         Args:
             observations: Shape (num, n): those for the first network, then those for the second, and so on.
-            counts: How many there are for each.
+            counts: The number of observations for each network.
         """
         bounds = list(itertools.pairwise(itertools.accumulate(counts, initial=0)))
         x = observations
@@ -114,7 +114,7 @@ class _Normalize:
 
 
 class _Conv:
-    """A convolution, its kernels turned once into the matrix that the product wants."""
+    """A convolution, whose kernels are turned once into the matrix that the product needs."""
 
     def __init__(self, layer: ConvLayer) -> None:
         self._kernel, self._stride = layer.weight.shape[2], layer.stride
@@ -128,7 +128,7 @@ class _Conv:
 
 
 class _Linear:
-    """A layer, its weights transposed once into the order that the product wants."""
+    """A layer, whose weights are transposed once into the order that the product needs."""
 
     def __init__(self, layer: Layer) -> None:
         self.matrix = np.ascontiguousarray(layer.weight.T, dtype=np.float32)
@@ -142,7 +142,7 @@ class _Linear:
 
 
 class _Linears:
-    """A layer of several networks."""
+    """The same layer of several networks."""
 
     def __init__(self, linears: Sequence[_Linear]) -> None:
         self._linears = linears
@@ -150,13 +150,13 @@ class _Linears:
 
     @functools.cached_property
     def _stack(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """All matrices and all biases, with a 1 for what they are multiplied by in between."""
+        """All matrices and all biases, stacked, with an axis of length 1 for a single row."""
         matrices, biases = ([getattr(linear, name) for linear in self._linears] for name in ("matrix", "bias"))
         return np.stack(matrices)[:, None], np.stack(biases)[:, None, None]
 
     def __call__(self, x: NDArray[np.float32], bounds: Sequence[tuple[int, int]]) -> NDArray[np.float32]:
         if len({last - first for first, last in bounds}) == 1:
-            # As many observations for each network: one call, of the same vector-matrix products.
+            # Each network has equally many observations: one call makes the same vector-matrix products.
             matrices, biases = self._stack
             y = np.matmul(x.reshape(len(bounds), -1, 1, x.shape[-1]), matrices)
             y += biases
@@ -190,8 +190,8 @@ def _elu(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    # The exact form, torch's default: x times the normal distribution function.
-    # math.erf number by number costs a few times the product of the layer; only SciPy has a faster one.
+    # torch's default, the exact form: x times the normal distribution function.
+    # math.erf, number by number, takes a few times as long as the layer's product; only SciPy has a faster one.
     cumulative = 0.5 * (1.0 + _erf(x / math.sqrt(2.0)).astype(np.float64))
     return np.asarray(x * cumulative, dtype=np.float32)
 

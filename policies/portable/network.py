@@ -1,14 +1,13 @@
-"""The network of a portable policy: its parts, their JSON and tensors, and whether they fit together.
+"""The network of a portable policy: its parts, how they are written and read, and whether they fit together.
 
 Words: a *layer* is a linear map followed by an activation; the *network* is the chain from observation to output:
-scale, normalization, convolutions, layers, each of them but the last optional. What the output means is the network's
-*kind*:
+scale, normalization, convolutions, layers; all but the layers are optional. The network's *kind* says what the output
+means:
 
-* `categorical` (PPO, Discrete actions): one logit an action; greedy: the largest.
+* `categorical` (PPO, Discrete actions): one logit per action; greedy: the largest.
 * `gaussian` (PPO, Box actions): mean and log standard deviation of each component; greedy: the mean.
-* `q_values` (DQN): one value an action; greedy: the largest. Of a dueling network the layers end in the
-  advantages: the state value is the same for all actions, so it never changes which one is greedy, and is
-  left out.
+* `q_values` (DQN): one value per action; greedy: the largest. The layers of a dueling network end in the advantages:
+  the state value is left out, because it is the same for all actions and never changes which one is greedy.
 * `random`, `constant` (the baselines): no layers; actions drawn uniformly, or always the same one.
 * `module`: no layers; the weights of an RLModule class of the user's own, which computes the actions itself.
 """
@@ -57,31 +56,31 @@ class ConvLayer:
     bias: NDArray[np.float32]
     """Shape (out_channels,)."""
     stride: int
-    """Pixels between two places of the kernel."""
+    """Pixels between two positions of the kernel."""
     activation: str = "linear"
     """A name of `policies.activations.ACTIVATIONS`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """`(x - mean) / std`, no further from 0 than `clip`."""
+    """Computes `(x - mean) / std`, clipped to -/+ `clip`."""
 
     mean: NDArray[np.float32]
-    """Of the shape of an observation."""
+    """The mean, in the shape of an observation."""
     std: NDArray[np.float32]
-    """Of the shape of an observation; > 0."""
+    """The standard deviation, in the shape of an observation; > 0."""
     clip: float
 
 
 @dataclass(frozen=True, eq=False)
 class ModuleWeights:
-    """What an RLModule of the user's own is built from again."""
+    """What an RLModule of the user's own is rebuilt from."""
 
     class_path: str
     """`module:Class`."""
     model_config: dict[str, Any]
     tensors: Tensors = field(default_factory=dict)
-    """Its state by name."""
+    """The module's state by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,19 +89,19 @@ class PolicyNetwork:
 
     kind: NetworkKind
     layers: tuple[Layer, ...]
-    """After images are flattened, channel by channel."""
+    """The layers; images are flattened before them, channel by channel."""
     action: int | tuple[float, ...] | None = None
-    """Of kind `constant` alone: what it does, one number for each component where actions are Box."""
+    """The action, only of kind `constant`; for Box actions, one number for each component."""
     conv: tuple[ConvLayer, ...] = ()
-    """Before the layers, for observations of shape (height, width, channels)."""
+    """The convolutions before the layers, for observations of shape (height, width, channels)."""
     normalization: Normalization | None = None
     scale: float = 1.0
-    """What observations are multiplied by, first of all."""
+    """The factor that observations are multiplied by first."""
     module: ModuleWeights | None = None
-    """Of kind `module` alone."""
+    """The user's own module, only of kind `module`."""
 
     def parts(self) -> dict[str, tuple[NDArray[Any], ...]]:
-        """All its numbers, by the place that a message names."""
+        """Return all arrays of the network, by the names that messages use for them."""
         parts: dict[str, tuple[NDArray[Any], ...]] = {}
         if self.normalization is not None:
             parts["the observation statistics"] = (self.normalization.mean, self.normalization.std)
@@ -117,8 +116,8 @@ class PolicyNetwork:
 
 
 def network_to_json(network: PolicyNetwork) -> tuple[dict[str, Any], Tensors]:
-    """A network as a JSON object and the tensors it names; parts that it does not have are left out."""
-    # Contiguous: safetensors writes the memory as it lies, so a transposed view would be written transposed.
+    """Return a network as a JSON object and the tensors that it names; missing parts are left out."""
+    # Made contiguous, because safetensors writes memory as it is, and would write a transposed view transposed.
     tensors: Tensors = {}
     description: dict[str, Any] = {
         "kind": network.kind,
@@ -149,12 +148,12 @@ def network_to_json(network: PolicyNetwork) -> tuple[dict[str, Any], Tensors]:
 
 
 def network_from_json(description: Mapping[str, Any], tensors: Tensors) -> PolicyNetwork:
-    """The network that `network_to_json` described; the tensors it takes are removed from `tensors`.
+    """Return the network that `network_to_json` described; the tensors it uses are removed from `tensors`.
 
     Raises:
         KeyError: A tensor or a field is missing.
-        TypeError: A field is of the wrong type.
-        ValueError: The same.
+        TypeError: A field has the wrong type.
+        ValueError: A field has a wrong value.
     """
     layers = tuple(
         Layer(tensors.pop(f"layers.{index}.weight"), tensors.pop(f"layers.{index}.bias"), str(activation))
@@ -174,7 +173,7 @@ def network_from_json(description: Mapping[str, Any], tensors: Tensors) -> Polic
         mean, std = tensors.pop("normalization.mean"), tensors.pop("normalization.std")
         normalization = Normalization(mean, std, clip=float(description["normalization"]["clip"]))
     if "module" in description:
-        # Sorted: safetensors gives them in another order each time.
+        # Sorted, because safetensors returns them in another order each time.
         names = sorted(name for name in tensors if name.startswith(_MODULE_PREFIX))
         module = ModuleWeights(
             class_path=str(description["module"]["class"]),
@@ -202,7 +201,7 @@ def _action_from_json(value: Any) -> int | tuple[float, ...] | None:
 
 
 def network_problem(network: PolicyNetwork, observation_space: gym.Space[Any], action_space: ActionSpace) -> str:
-    """Why a network does not map these observations to these actions; empty if it does."""
+    """Return why a network does not map these observations to these actions; empty if it does."""
     kind = network.kind
     if kind not in get_args(NetworkKind):
         return f"network kind {kind!r} is none of {', '.join(get_args(NetworkKind))}"
@@ -217,7 +216,7 @@ def network_problem(network: PolicyNetwork, observation_space: gym.Space[Any], a
 
 
 def _chain_problem(network: PolicyNetwork, shape: tuple[int, ...], action_space: ActionSpace) -> str:
-    """Why convolutions and layers do not lead from observations of a shape to the actions."""
+    """Return why convolutions and layers do not lead from observations of a shape to the actions."""
     if isinstance(action_space, gym.spaces.Box) is not (network.kind == "gaussian"):
         what = "box" if isinstance(action_space, gym.spaces.Box) else "discrete"
         return f"a network of kind {network.kind!r} gives no actions of type {what!r}"
@@ -230,7 +229,7 @@ def _chain_problem(network: PolicyNetwork, shape: tuple[int, ...], action_space:
 
 
 def conv_filters(conv: tuple[ConvLayer, ...]) -> list[tuple[int, int, int]]:
-    """(channels, kernel, stride) of each convolution."""
+    """Return the channels, the kernel size and the stride of each convolution."""
     return [(layer.weight.shape[0], layer.weight.shape[2], layer.stride) for layer in conv]
 
 
@@ -288,11 +287,11 @@ def _baseline_problem(network: PolicyNetwork, action_space: ActionSpace) -> str:
 
 
 def action_problem(action: int | tuple[float, ...] | None, space: ActionSpace) -> str:
-    """Why an action is none of a space; empty if it is one.
+    """Return why an action is not in a space; empty if it is.
 
     Args:
         action: An int for Discrete actions; one number for each component for Box actions.
-        space: Where actions are taken from.
+        space: The action space.
     """
     if isinstance(space, gym.spaces.Discrete):
         first, last = int(space.start), int(space.start) + int(space.n) - 1
@@ -304,7 +303,7 @@ def action_problem(action: int | tuple[float, ...] | None, space: ActionSpace) -
         shown = list(action) if isinstance(action, tuple) else action
         return f"{shown!r} is none of the actions, each of which is {numbers}"
     values = np.array(action, dtype=np.float64).reshape(space.shape)
-    # In the space's own precision, or its bounds themselves would seem to lie outside.
+    # Compared in the space's own precision, or its bounds themselves would seem to lie outside.
     if not space.contains(values.astype(space.dtype)):
         return f"{list(action)!r} is none of the actions, which lie in {space.low.tolist()} to {space.high.tolist()}"
     return ""

@@ -1,1 +1,1 @@
-"""Hyperparameters as RLlib configurations; sampling, learners, and checkpoints restored."""
+"""Configure RLlib from hyperparameters; sampling, learners, and restoring checkpoints."""

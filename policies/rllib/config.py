@@ -1,8 +1,8 @@
-"""Hyperparameters -> RLlib `AlgorithmConfig` on the new API stack (Ray 2.60).
+"""Turn hyperparameters into an RLlib `AlgorithmConfig` on the new API stack (Ray 2.60).
 
-Every field of `policies.hyperparams` is set here exactly once, on the setting that acts: several of RLlib's own names
-are accepted and do nothing (`DQNConfig.training(hiddens=...)`), or change others silently (`DefaultModelConfig` shares
-PPO's value layers).
+Every field of `policies.hyperparams` is set here exactly once, on the setting that has an effect: several of RLlib's
+own names are accepted and do nothing (`DQNConfig.training(hiddens=...)`), or change others silently
+(`DefaultModelConfig` shares PPO's value layers).
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def build_algorithm_config(
         env_id: A registered Gymnasium id.
         env_args: Keyword arguments of the environment.
         seed: Seed of weights, exploration and environments.
-        num_env_runners: Processes that sample beside the main one; 0: the main process samples.
-        num_gpus: GPUs of the learner; 0: the CPU.
-        failure_penalty: Reward of steps that end by failure, which the learner sees and returns do not; None: the
-            env's own.
+        num_env_runners: The number of processes that sample; 0: the main process samples.
+        num_gpus: GPUs of the learner; 0: it runs on the CPU.
+        failure_penalty: Reward of steps that end by failure, which the learner gets but returns leave out; None: the
+            env's own reward.
         rl_module: `module:Class` of an RLModule of the user's own, in an allowed module; None: ours.
     """
     config = _ppo(hyperparams) if isinstance(hyperparams, PPOHyperparams) else _dqn(hyperparams)
@@ -52,7 +52,7 @@ def build_algorithm_config(
     if failure_penalty is not None:
         env_config[FAILURE_PENALTY] = failure_penalty
     if modules := allowed_modules():
-        # Env runners of their own processes have not been told yet.
+        # Env runners in processes of their own do not have the allowed modules yet.
         env_config[ALLOWED_MODULES] = modules
     return (
         config.environment(env_id, env_config=env_config, disable_env_checking=True)
@@ -63,10 +63,10 @@ def build_algorithm_config(
         )
         .learners(num_learners=0, num_gpus_per_learner=num_gpus)
         .rl_module(rl_module_spec=module_spec(hyperparams, rl_module))
-        # A greedy evaluation of our own, on fixed seeds, takes the place of RLlib's.
+        # Trials evaluate greedily on fixed seeds themselves, in place of RLlib's evaluation.
         .evaluation(evaluation_interval=None)
-        # An environment that raises ends the trial with its error; RLlib's own restarts have no cap. An env runner
-        # that dies is an error too: PPO would go on without it, or without any, and not say so.
+        # An environment that raises an error ends the trial with it; RLlib would restart it without a limit. An env
+        # runner that dies is an error too: PPO would silently continue without it, or without any.
         .fault_tolerance(restart_failed_env_runners=False, restart_failed_sub_environments=False)
         # log_sys_usage starts a thread that takes 0.5 s to join at every `stop()`.
         .debugging(seed=seed, log_level="WARN", log_sys_usage=False)
@@ -74,7 +74,7 @@ def build_algorithm_config(
 
 
 def _schedule(value: float, final: float | None, num_env_steps: int | None) -> float | list[list[float]]:
-    """RLlib's form of `policies.schedules.linear`."""
+    """Return `policies.schedules.linear` in RLlib's form."""
     if final is None or num_env_steps is None:
         return value
     return [[0, value], [num_env_steps, final]]
@@ -113,7 +113,7 @@ def _dqn(hyperparams: DQNHyperparams) -> AlgorithmConfig:
         train_batch_size_per_learner=hyperparams.train_batch_size,
         double_q=hyperparams.double_q,
         dueling=hyperparams.dueling,
-        # Sampling makes the n-step sums: see policies/replay.py.
+        # The n-step sums are made when sampling: see policies/replay.py.
         n_step=1,
     )
     config.learners(learner_class=DQNLearner)

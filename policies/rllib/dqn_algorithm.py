@@ -1,8 +1,8 @@
-"""RLlib's DQN, whose iteration goes from env runner arrays over an array replay memory to `DQNLearner`.
+"""RLlib's DQN with a training step of its own: arrays of the env runners, an array replay memory, and `DQNLearner`.
 
-RLlib's own training step makes an episode object of each env step and samples its replay buffer in Python: 480 env
-steps/s on CartPole where this makes several thousand. The Algorithm, its env runners, learner group, checkpoints and
-results stay RLlib's.
+RLlib's own training step makes an episode object of each env step and samples its replay buffer in Python: it makes 480
+env steps/s on CartPole where this one makes several thousand. The Algorithm, its env runners, learner group,
+checkpoints and results stay RLlib's.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from ray.rllib.algorithms.dqn import DQN, DQNConfig
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, LEARNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
+from typing_extensions import override
 
 from policies.errors import CannotRunError
 from policies.hyperparams import DQNHyperparams
@@ -27,7 +28,7 @@ _COUNTERS = "tune_jobs_counters"
 
 
 class ReplayDQNConfig(DQNConfig):  # type: ignore[misc]
-    """RLlib's config, which carries our hyperparameters to learner and env runners."""
+    """RLlib's config, which also carries our hyperparameters to the learner and the env runners."""
 
     hyperparams: DQNHyperparams | None = None
 
@@ -39,7 +40,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
     """DQN with the variants of `DQNHyperparams`.
 
     Attributes:
-        replay: The replay memory. Not in checkpoints: `refill` it after a restore.
+        replay: The replay memory. It is not in checkpoints: `refill` it after a restore.
         num_env_steps: Env steps so far.
         num_episodes: Whole episodes so far.
         num_updates: Updates so far.
@@ -48,12 +49,12 @@ class ReplayDQN(DQN):  # type: ignore[misc]
     replay: ReplayBuffer
 
     @classmethod
+    @override
     def get_default_config(cls) -> ReplayDQNConfig:
-        """See RLlib."""
         return ReplayDQNConfig()
 
+    @override
     def setup(self, config: Any) -> None:
-        """See RLlib."""
         super().setup(config)
         self.num_env_steps = self.num_episodes = self.num_updates = 0
         # Updates that are due but not made: `updates_per_env_step` may be a fraction.
@@ -63,26 +64,26 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         self.seed_replay(self.config.seed or 0)
 
     def _create_local_replay_buffer_if_necessary(self, _config: Any) -> None:
-        """None of RLlib's."""
+        """Make no replay buffer of RLlib's."""
 
     def seed_replay(self, seed: int) -> None:
-        """Begin with an empty replay memory that draws from this seed."""
+        """Begin with an empty replay memory that draws its batches from this seed."""
         self.replay = make_replay(self.hyperparams, seed)
 
     @property
     def hyperparams(self) -> DQNHyperparams:
-        """Of the trial."""
+        """The trial's hyperparameters."""
         hyperparams: DQNHyperparams = self.config.hyperparams
         return hyperparams
 
     @property
     def learner(self) -> DQNLearner:
-        """The one learner, in this process."""
+        """The only learner, which is in this process."""
         learner: DQNLearner = self.learner_group._learner  # noqa: SLF001 - RLlib has no public way to the local one
         return learner
 
     def training_step(self) -> None:
-        """One iteration: `env_steps_per_iteration` env steps at least, and the updates due for them."""
+        """Make one iteration: at least `env_steps_per_iteration` env steps, and the updates that are due for them."""
         hyperparams = self.hyperparams
         start = self.num_env_steps
         stats: dict[str, float] = {}
@@ -93,7 +94,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
                     self._send_weights()
                 continue
             self._due += num_new_steps * hyperparams.updates_per_env_step
-            # 10 x 0.1 is a little less than 1 in binary.
+            # 10 x 0.1 is slightly less than 1 in binary.
             num_updates = math.floor(self._due + 1e-9)
             if num_updates:
                 self._due -= num_updates
@@ -113,7 +114,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
             self.metrics.log_dict(stats, key=(LEARNER_RESULTS, DEFAULT_MODULE_ID), window=1)
 
     def refill(self, num_env_steps: int) -> None:
-        """Sample so many env steps into the replay memory, without learning; they count as env steps."""
+        """Sample env steps into the replay memory without learning; they count as env steps."""
         goal = self.num_env_steps + num_env_steps
         while self.num_env_steps < goal:
             self._sample()
@@ -121,7 +122,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
             self._new_observations.clear()
 
     def _sample(self) -> int:
-        """Let the env runners explore for `train_freq` env steps; returns how many they made."""
+        """Let the env runners explore for `train_freq` env steps, and return how many they made."""
         num_runners = max(1, self.config.num_env_runners)
         share = math.ceil(self.hyperparams.train_freq / num_runners)
         steps, episodes = self.num_env_steps, self.num_episodes
@@ -135,8 +136,8 @@ class ReplayDQN(DQN):  # type: ignore[misc]
             samples = [explore(self.env_runner)]
         if len(samples) < num_runners:
             raise CannotRunError(
-                f"An env runner died: {len(samples)} of {num_runners} gave samples.",
-                "See the trial's log; the trial goes on from its latest checkpoint when it is retried.",
+                f"An env runner died: only {len(samples)} of {num_runners} returned samples.",
+                "Read the trial's log for the cause; a retry continues the trial from its latest checkpoint.",
             )
         for sample in samples:
             self.replay.add(sample.transitions)
@@ -146,7 +147,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         return self.num_env_steps - steps
 
     def _learn_statistics(self) -> bool:
-        """Merge what was observed since the last time into the statistics, if observations are normalised."""
+        """Merge the observations since the last call into the statistics, if observations are normalised."""
         new, self._new_observations = self._new_observations, []
         if self.hyperparams.normalize_observations:
             for observations in new:
@@ -154,7 +155,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         return self.hyperparams.normalize_observations
 
     def _send_weights(self) -> None:
-        """Give the env runners the learner's weights."""
+        """Send the learner's weights to the env runners."""
         if self.config.num_env_runners:
             self.env_runner_group.sync_weights(from_worker_or_learner_group=self.learner_group, inference_only=True)
             return
@@ -164,10 +165,10 @@ class ReplayDQN(DQN):  # type: ignore[misc]
             self._copies = [ours[name] for name in theirs], list(theirs.values())
         ours_now, theirs_now = self._copies
         with torch.no_grad():
-            torch._foreach_copy_(theirs_now, ours_now)  # RLlib's way goes over NumPy, ten times slower
+            torch._foreach_copy_(theirs_now, ours_now)  # RLlib's own way converts to NumPy and takes ten times as long
 
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """RLlib's state and our counters."""
+        """Return RLlib's state and our counters."""
         state: dict[str, Any] = super().get_state(*args, **kwargs)
         state[_COUNTERS] = {
             "num_env_steps": self.num_env_steps,
@@ -180,10 +181,10 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         return state
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """RLlib's state and our counters."""
+        """Set RLlib's state and our counters."""
         super().set_state(state)
         if _COUNTERS not in state:
-            return  # a component alone
+            return  # the state of a single component
         counters = state[_COUNTERS]
         self.num_env_steps, self.num_episodes = counters["num_env_steps"], counters["num_episodes"]
         self.num_updates, self._due = counters["num_updates"], counters["due"]

@@ -1,7 +1,8 @@
 """RLlib's DQN learner with the variants of `DQNHyperparams`, and a short path from replay memory to optimizer.
 
 RLlib's own `Learner.update` turns every batch into episodes and back, cuts it into minibatches and logs a dozen
-metrics: ten times the update of a small network. What is computed here is the same: `tests/ray/test_dqn_learner.py`.
+metrics, which takes ten times as long as the update of a small network. The results here are the same:
+`tests/ray/test_dqn_learner.py` compares them.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
 
     @property
     def hyperparams(self) -> DQNHyperparams:
-        """Of the trial."""
+        """The trial's hyperparameters."""
         hyperparams: DQNHyperparams = self.config.hyperparams
         return hyperparams
 
     def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:  # noqa: ARG002 - RLlib's signature
-        """Register Adam or RMSprop with all their arguments; RLlib knows Adam alone, and drops its epsilon (2.60)."""
+        """Register Adam or RMSprop with all their arguments; RLlib has only Adam, and drops its epsilon (2.60)."""
         params = self.get_parameters(self.module[module_id])
         hyperparams = self.hyperparams
         optimizer: torch.optim.Optimizer
@@ -54,7 +55,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
                 lr=hyperparams.lr,
                 betas=(hyperparams.adam_beta1, hyperparams.adam_beta2),
                 eps=hyperparams.optimizer_epsilon,
-                # One call for all tensors: on small networks half the time of the default.
+                # One call for all tensors takes half the time of the default on small networks.
                 fused=True,
             )
         else:
@@ -71,25 +72,25 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         )
 
     def lr_at(self, num_env_steps: float) -> float:
-        """The learning rate after so many env steps."""
+        """Return the learning rate after a number of env steps."""
         hyperparams = self.hyperparams
         return linear(hyperparams.lr, hyperparams.lr_final, hyperparams.lr_decay_steps, num_env_steps)
 
     def update_from_replay(
         self, replay: ReplayBuffer, num_updates: int, *, num_env_steps: int, num_new_steps: int, num_episodes: int
     ) -> dict[str, float]:
-        """One training phase.
+        """Make one training phase.
 
         Args:
-            replay: Where the batches are drawn, and where priorities go.
+            replay: The memory that batches are drawn from and whose priorities are set.
             num_updates: Updates to make.
             num_env_steps: Env steps of the trial so far.
-            num_new_steps: How many of them were made since the last phase: the updates are spread evenly over them, so
-                that `target_update_freq` means the same whatever `train_freq` is.
+            num_new_steps: Env steps since the last phase: the updates are spread evenly over them, so that
+                `target_update_freq` means the same whatever `train_freq` is.
             num_episodes: Whole episodes of the trial so far.
 
         Returns:
-            Numbers of the last update.
+            The metrics of the last update.
         """
         hyperparams = self.hyperparams
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
@@ -106,16 +107,16 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         return {name: float(value) for name, value in stats.items()} | {"lr": optimizer.param_groups[0]["lr"]}
 
     def update_from_transitions(self, rows: Transitions, optimizer: torch.optim.Optimizer) -> dict[str, Tensor | float]:
-        """One gradient step on one batch.
+        """Make one gradient step on one batch.
 
         Returns:
             `total_loss`, `qf_mean`, `gradient_norm` (if clipped) and `td_errors`, shape (B,).
         """
         module = self.module[DEFAULT_MODULE_ID]
         batch = self.to_batch(rows)
-        out = module._forward_train(batch)  # noqa: SLF001 - forward_train only adds a check that costs as much
+        out = module._forward_train(batch)  # noqa: SLF001 - forward_train only adds a check that takes as long
         loss, td_errors, q_selected = self.loss(batch, out)
-        # What `zero_grad` does, without its bookkeeping.
+        # The same as `zero_grad`, without its bookkeeping.
         params = [param for group in optimizer.param_groups for param in group["params"]]
         for param in params:
             param.grad = None
@@ -128,7 +129,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         return stats
 
     def to_batch(self, rows: Transitions) -> dict[str, Tensor]:
-        """Rows as tensors on the learner's device, by RLlib's names."""
+        """Return rows as tensors on the learner's device, by RLlib's names."""
         batch = {
             Columns.OBS: rows.obs,
             Columns.ACTIONS: rows.actions,
@@ -141,7 +142,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         return {name: torch.from_numpy(values).to(self._device) for name, values in batch.items()}
 
     def loss(self, batch: dict[str, Tensor], out: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """The loss, |TD errors| and Q(s, a), shapes (), (B,), (B,).
+        """Return the loss, |TD errors| and Q(s, a), of shapes (), (B,) and (B,).
 
         The target is r + discount * Q'(s', a'), where Q' is the target network (or the online one, where there is none)
         and a' the best action by Q' or, for double Q-learning, by the online network.
@@ -162,7 +163,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         return (batch[WEIGHTS] * function(q_selected, targets, reduction="none")).mean(), td_errors, q_selected
 
     def _update_target(self, num_env_steps: float, num_episodes: int) -> None:
-        """Move the target network, if it is time."""
+        """Update the target network, if it is due."""
         hyperparams = self.hyperparams
         if not hyperparams.target_network:
             return

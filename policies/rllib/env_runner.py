@@ -1,10 +1,9 @@
-"""An RLlib EnvRunner that collects arrays and builds episodes once a fragment.
+"""An RLlib EnvRunner that collects arrays and builds episodes once per fragment.
 
 RLlib's own `SingleAgentEnvRunner` runs two connector pipelines and appends to one Python episode object per
-sub-environment at every step; with small networks that is two thirds of a PPO iteration. The default pipelines do
-nothing to a Box observation but copy it, so this runner steps arrays and cuts them into `SingleAgentEpisode`s
-when the fragment is done. The episodes are those RLlib's runner would have returned: a test compares the two on equal
-seeds.
+sub-environment at every step; with small networks that is two thirds of a PPO iteration. The default pipelines only
+copy Box observations, so this runner steps arrays and cuts them into `SingleAgentEpisode`s when the fragment is done.
+The episodes are those that RLlib's runner would return: a test compares the two on equal seeds.
 
 Array shapes: T vector steps, N sub-environments.
 """
@@ -44,23 +43,23 @@ _REWARDS_SPACE = gym.spaces.Box(float("-inf"), float("inf"), (), np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What `ArrayEnvRunner.sample_transitions` gives."""
+    """The result of `ArrayEnvRunner.sample_transitions`."""
 
     transitions: Transitions
     observations: NDArray[Any]
-    """That were acted on, shape (B, ...): transitions of several steps come later than those."""
+    """The observations that were acted on, shape (B, ...); transitions of several steps are complete only later."""
     num_env_steps: int
     num_episodes: int
-    """Whole episodes that ended in it."""
+    """The number of episodes that ended."""
 
 
 def _returned(fragment: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    """The env's own rewards, of which returns are made: without the failure penalty that the learner sees."""
+    """Return the env's own rewards, whose sums are the returns, without the learner's failure penalty."""
     return fragment.get(_UNPENALIZED, fragment["rewards"])
 
 
 def _checked(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """A vector environment that says what it did wrong; a failure penalty stays outermost."""
+    """Return a vector environment whose values are checked; a failure penalty stays the outermost wrapper."""
     if not isinstance(env, FailurePenalty):
         return CheckedEnvs(env, env_id)
     env.env = CheckedEnvs(env.env, env_id)
@@ -68,7 +67,7 @@ def _checked(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> gym.vecto
 
 
 class _Stream:
-    """What one sub-environment carries from one fragment into the next: its running episode."""
+    """The running episode of one sub-environment, which continues from one fragment to the next."""
 
     def __init__(self) -> None:
         self.start()
@@ -78,12 +77,12 @@ class _Stream:
         self.episode_id = uuid.uuid4().hex
         self.num_steps = 0
         self.episode_return = 0.0
-        # The last rows of the chunk before, for RLlib's lookback buffers: column -> (lookback, ...).
+        # The last rows of the previous chunk, for RLlib's lookback buffers: column -> (lookback, ...).
         self.tail: dict[str, NDArray[Any]] = {}
 
 
 def _is_actor() -> bool:
-    """Whether this process is one that Ray started for an actor, and not a user's own."""
+    """Whether Ray started this process for an actor; otherwise it is a user's own."""
     return ray.is_initialized() and ray.get_runtime_context().get_actor_id() is not None
 
 
@@ -103,7 +102,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._just_ended: NDArray[np.bool_] | None = None
         self._n_step: NStep | None = None
         if kwargs.get("worker_index", 0) and _is_actor():
-            # It must not outlive the Ray that started this process, whatever its env does.
+            # This process must not outlive the Ray that started it, whatever its env does.
             end_with_parent()
         super().__init__(**kwargs)
 
@@ -113,9 +112,9 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         return finished
 
     def reseed(self, seed: int) -> None:
-        """Go on with other random numbers: new episodes from the next fragment on, and new exploration.
+        """Continue with other random numbers: new episodes from the next fragment on, and new exploration.
 
-        The main process seeds its own exploration; env runners of their own do here.
+        The main process seeds its own exploration; env runners in other processes seed theirs here.
         """
         self._seed_override = seed
         if self.worker_index:
@@ -129,7 +128,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         env_args = dict(self.config.env_config)
         if isinstance(self.config.env_config, EnvContext):
             env_args = dict(self.config.env_config.items())
-        # What build_algorithm_config tells beside the env's arguments.
+        # The settings that build_algorithm_config adds beside the env's arguments.
         allow_modules(env_args.pop(ALLOWED_MODULES, ()))
         penalty = env_args.pop(FAILURE_PENALTY, None)
         num_envs = self.config.num_envs_per_env_runner
@@ -156,7 +155,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         self._streams = [_Stream() for _ in range(self.num_envs)]
         if self._n_step is not None:
             self._n_step.forget()
-        # The chunks of episodes that will now never end.
+        # Drop the chunks of episodes that will never end now.
         self._ongoing_episodes_for_metrics.clear()
         self._needs_initial_reset = False
 
@@ -170,10 +169,10 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         force_reset: bool = False,
     ) -> list[SingleAgentEpisode]:
         if random_actions:
-            # PPO and DQN never ask for them.
+            # PPO and DQN never ask for random actions.
             raise ValueError("ArrayEnvRunner samples with the policy only, not with random actions")
         if num_timesteps is None:
-            # Whole episodes on request: not on any hot path here, and RLlib's own way resets the envs anyway.
+            # Whole episodes are asked for rarely, and RLlib's own way resets the envs anyway.
             episodes: list[SingleAgentEpisode] = super()._sample(num_episodes=num_episodes, explore=explore)
             return episodes
         if force_reset or self._needs_initial_reset or self._obs is None:
@@ -189,14 +188,14 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         return done + ongoing
 
     def sample_transitions(self, num_timesteps: int, *, num_env_steps: int, num_episodes: int) -> Sample:
-        """Explore for at least so many env steps and return what a replay memory takes, without episode objects.
+        """Explore for at least `num_timesteps` env steps and return transitions, without episode objects.
 
-        For DQN; the config must hold `hyperparams`.
+        This is for DQN; the config must hold `hyperparams`.
 
         Args:
             num_timesteps: Env steps to make.
-            num_env_steps: Env steps of the trial so far, over all env runners: what epsilon may depend on.
-            num_episodes: Whole episodes of the trial so far, over all env runners: the same.
+            num_env_steps: Env steps of the trial so far, over all env runners; epsilon may depend on them.
+            num_episodes: Whole episodes of the trial so far, over all env runners; epsilon may depend on them.
         """
         if self._needs_initial_reset or self._obs is None:
             self._reset_arrays()
@@ -207,7 +206,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         before = len(self.finished_episodes)
         self._follow_episodes(fragment)
         transitions = self._n_step.transitions(fragment)
-        is_whole = self.config.hyperparams.n_step == 1  # then the same array, sent once
+        is_whole = self.config.hyperparams.n_step == 1  # then it is the transitions' own array, sent once
         return Sample(
             transitions=transitions,
             observations=transitions.obs if is_whole else fragment["obs"][:-1][fragment["stepped"]],
@@ -216,7 +215,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         )
 
     def _follow_episodes(self, fragment: dict[str, NDArray[Any]]) -> None:
-        """Gather the returns of whole episodes, as `_cut` does for episode objects."""
+        """Collect the returns of whole episodes, as `_cut` does for episode objects."""
         stepped = fragment["stepped"]
         rewards = np.where(stepped, _returned(fragment), 0.0)
         ended = np.logical_or(fragment["terminated"], fragment["truncated"])
@@ -233,7 +232,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     def _collect(
         self, num_timesteps: int, *, explore: bool, num_env_steps: int = 0, num_episodes: int = 0
     ) -> dict[str, NDArray[Any]]:
-        """Step until at least num_timesteps env steps were made; returns columns of shape (T, N, ...).
+        """Step until at least `num_timesteps` env steps are made, and return columns of shape (T, N, ...).
 
         Args:
             num_timesteps: Env steps to make.
@@ -254,7 +253,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         num_steps = num_ended = 0
         with torch.no_grad():
             while num_steps < num_timesteps:
-                # The other env runners step and end episodes at about the same pace.
+                # The other env runners make steps and end episodes at about the same rate.
                 units = (
                     num_episodes + num_ended * num_runners if by_episode else num_env_steps + num_steps * num_runners
                 )
@@ -280,14 +279,14 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         return {key: np.stack(values) for key, values in rows.items()}
 
     def _as_seen(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """Observations in the precision that networks compute in, whatever the env's: replay memories hold them so."""
+        """Return observations in the precision that networks and replay memories use, whatever the env's is."""
         return np.asarray(observations, dtype=observation_dtype(self.env.single_observation_space))
 
     def _actions(self, obs: NDArray[Any], *, explore: bool, num_units: int) -> dict[str, NDArray[Any]]:
-        """One forward pass: actions and what RLlib's learner wants beside them, each of shape (N, ...)."""
+        """Make one forward pass and return the actions and what RLlib's learner needs with them, each (N, ...)."""
         batch = {Columns.OBS: torch.from_numpy(np.ascontiguousarray(obs)).to(self._device)}
-        # Not `forward_exploration`: it walks the module tree twice a step to switch between eval and train mode,
-        # and this runner's module stays in eval mode.
+        # `forward_exploration` would walk the module tree twice a step to switch between eval and train mode, but this
+        # runner's module stays in eval mode.
         module = self.module
         out = module._forward_exploration(batch, t=num_units) if explore else module._forward_inference(batch)  # noqa: SLF001
         if Columns.ACTIONS not in out:
@@ -300,7 +299,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         return {key: value.cpu().numpy() for key, value in out.items()}
 
     def _draw(self, out: dict[str, torch.Tensor], *, explore: bool) -> None:
-        """Draw actions from what a policy put out, or take the likeliest."""
+        """Draw actions from a policy's outputs, or take the likeliest."""
         which = "exploration" if explore else "inference"
         dist = getattr(self.module, f"get_{which}_action_dist_cls")().from_logits(out[Columns.ACTION_DIST_INPUTS])
         if not explore:
@@ -310,18 +309,18 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             out[Columns.ACTION_LOGP] = dist.logp(out[Columns.ACTIONS])
 
     def _for_env(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Actions as the env takes them; the stored ones stay as the policy drew them."""
+        """Return actions as the env takes them; the stored ones stay as the policy drew them."""
         if self._to_bounds is None:
             start = self.env.single_action_space.start
-            # The network's outputs count from 0; RLlib itself ignores a space that starts elsewhere.
+            # The network's outputs count from 0; RLlib itself ignores that a space may start elsewhere.
             return actions + start if start else actions
         return self._to_bounds(actions)
 
     def _try_env_step(self, actions: Any) -> Any:
-        """See RLlib, which calls this where whole episodes are asked for; `_collect` steps by itself.
+        """Correct RLlib's actions and step the env; RLlib calls this where whole episodes are asked for.
 
-        RLlib's own pipeline, which these actions come from, sends a Discrete action without the space's start, and an
-        action of a Box as it is if a bound is infinite or its precision uncommon.
+        RLlib's own pipeline, which these actions come from, ignores the start of a Discrete space, and sends an action
+        of a Box unchanged if a bound is infinite or its precision uncommon.
         """
         is_done = self._to_bounds is not None and self._to_bounds.stretches_all
         if not is_done or self.env.single_action_space.dtype not in (np.float32, np.float64):
@@ -329,7 +328,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         return super()._try_env_step(actions)
 
     def _cut(self, fragment: dict[str, NDArray[Any]]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
-        """Cut (T, N) columns into episode chunks: the finished ones in order of their end, then the running ones."""
+        """Cut (T, N) columns into episode chunks: the ended ones in order of their end, then the running ones."""
         done: list[tuple[int, int, SingleAgentEpisode, tuple[float, int]]] = []
         ongoing: list[SingleAgentEpisode] = []
         length = len(fragment["stepped"])
@@ -355,7 +354,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     def _chunk(
         self, fragment: dict[str, NDArray[Any]], stream: _Stream, index: int, start: int, stop: int
     ) -> SingleAgentEpisode:
-        """Steps [start, stop) of one sub-environment as an episode chunk, with the lookback of the chunk before."""
+        """Return the steps [start, stop) of one sub-environment as an episode chunk, with the last chunk's lookback."""
         columns = {
             key: values[start : stop + (key == "obs"), index]
             for key, values in fragment.items()

@@ -1,4 +1,4 @@
-"""Names of before the modules moved into packages, which checkpoints of the rllib engine are pickled with."""
+"""Provide the old names of modules, which older checkpoints of the rllib engine are pickled with."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-# In pickles of sweeps up to format 2. `policies.networks` is a package now, which has its two classes still.
+# Names in pickles of sweeps up to format 2. `policies.networks` is a package now, which still has the two classes.
 _MOVED = {
     "policies.dqn_algorithm": "policies.rllib.dqn_algorithm",
     "policies.dqn_learner": "policies.rllib.dqn_learner",
@@ -21,7 +21,7 @@ _MOVED = {
 
 
 class _Moved(ModuleType):
-    """A module by its old name: what it had, and what a user's own module of this name has."""
+    """A module under its old name: it has what it had then, and what a user's own module of this name has."""
 
     def __init__(self, name: str, theirs: ModuleType | None) -> None:
         super().__init__(name)
@@ -34,7 +34,7 @@ class _Moved(ModuleType):
 
 @contextlib.contextmanager
 def old_names() -> Iterator[None]:
-    """Let what is unpickled in the block name modules as they were called before."""
+    """Let pickles that are loaded in the block use the old names of modules."""
     before = {name: sys.modules.get(name) for name in _MOVED}
     sys.modules.update({name: _Moved(name, theirs) for name, theirs in before.items()})
     try:

@@ -1,4 +1,4 @@
-"""RLlib's PPO learner, with schedules that hold from the first update on and observation statistics."""
+"""RLlib's PPO learner, with schedules that act from the first update on, and with observation statistics."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _KL_COEFFS = "kl_coeffs"
 
 
 class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
-    """An update phase at t env steps uses the learning rate and entropy weight that their schedules give at t.
+    """A PPO learner whose update phase at t env steps uses the learning rate and entropy weight of t.
 
-    RLlib moves both after a phase, for the next one, and saves only the learning rate: its entropy weight starts at
-    the schedule's first value again after a restore, and its KL weight at the config's (2.60). Here the schedules move
+    RLlib sets both after a phase, for the next one, and saves only the learning rate: after a restore, its entropy
+    weight starts at the schedule's first value again, and its KL weight at the config's (2.60). Here both are set
     before each phase, and the KL weight is part of the learner's state.
 
     Gradients and outputs that are not finite are errors: see `policies.rllib.ruined`.
 
-    Modules that normalise observations get those of the phase after its updates: a batch is trained with the
-    statistics it was sampled with, so that PPO's ratio begins at 1.
+    Modules that normalise observations add a phase's observations to their statistics after its updates: a batch is
+    trained with the statistics it was sampled with, so that PPO's ratio begins at 1.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -32,7 +32,7 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         self._new_observations: dict[str, Tensor] = {}
 
     def compute_loss_for_module(self, *, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Any]) -> Any:
-        """RLlib's loss.
+        """Return RLlib's loss.
 
         Raises:
             NonFiniteWeightsError: The policy's outputs are not finite.
@@ -45,7 +45,7 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
             raise
 
     def compute_gradients(self, loss_per_module: dict[str, Any], **kwargs: Any) -> dict[Any, Tensor]:
-        """RLlib's gradients.
+        """Return RLlib's gradients.
 
         Raises:
             NonFiniteWeightsError: One is NaN or infinite.
@@ -55,7 +55,7 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         return gradients
 
     def before_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
-        """Move the schedules to the env steps sampled so far, those of this phase's batch among them."""
+        """Set the scheduled values for the env steps sampled so far, including this phase's batch."""
         super().before_gradient_based_update(timesteps=timesteps)
         num_env_steps = timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
         for optimizer, schedule in self._optimizer_lr_schedules.items():
@@ -71,7 +71,7 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         self._new_observations.clear()
 
     def get_state(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """The learner's state, with each module's KL weight and the one it began with."""
+        """Return the learner's state, with each module's KL weight and the one it began with."""
         state: dict[str, Any] = super().get_state(*args, **kwargs)
         state[_KL_COEFFS] = {
             module_id: (self._first_kl_coeff(module_id), float(value))
@@ -80,7 +80,7 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         return state
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take over a state of `get_state`; not a KL weight that began elsewhere, where a search has moved kl_coeff."""
+        """Set a state of `get_state`, but not its KL weight if a search has changed kl_coeff since."""
         super().set_state(state)
         for module_id, (first, value) in state.get(_KL_COEFFS, {}).items():
             if first == self._first_kl_coeff(module_id):
@@ -93,6 +93,6 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         batch = super()._make_batch_if_necessary(training_data)
         for module_id, columns in batch.policy_batches.items():
             if hasattr(self.module[module_id].unwrapped(), "update_observation_statistics"):
-                # RLlib adds a row to each episode chunk, for the value after its end; it is no step.
+                # RLlib adds a row to each episode chunk, for the value after its end; that row is not a step.
                 self._new_observations[module_id] = columns[Columns.OBS][columns[Columns.LOSS_MASK]]
         return batch

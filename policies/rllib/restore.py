@@ -1,7 +1,7 @@
-"""RLlib's weights as a portable policy, and an RLlib checkpoint as an `Algorithm` that trains on.
+"""Turn RLlib's weights into a portable policy, and restore RLlib checkpoints as an `Algorithm`.
 
-A restore succeeds with the very weights that were saved, or raises: RLlib's own `from_checkpoint` only warns when a
-module class cannot be imported or a key is missing, and goes on with fresh weights.
+A restore succeeds with exactly the weights that were saved, or raises an error. RLlib's own `from_checkpoint` only
+warns when a module class cannot be imported or a key is missing, and continues with fresh weights.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _RESTORE_HINT = "Use another checkpoint of the trial; training cannot continue f
 
 
 def _module_network(algorithm: Algorithm, class_path: str) -> PolicyNetwork:
-    """What a module of the user's own is built from again, with the weights that acting needs."""
+    """Return what a module of the user's own is rebuilt from, with the weights that acting needs."""
     module = _modules(algorithm)["learner"]
     weights = ModuleWeights(class_path, dict(module.model_config), module.get_state(inference_only=True))
     return PolicyNetwork(kind="module", layers=(), module=weights)
@@ -48,7 +48,7 @@ def portable_policy(
     env_args: dict[str, Any],
     training: dict[str, Any] | None = None,
 ) -> PortablePolicy:
-    """The greedy policy of a running Algorithm, with all that is needed to act without RLlib.
+    """Return the greedy policy of a running Algorithm, with all that it needs to act without RLlib.
 
     Raises:
         CheckpointError: Its network is not the one the hyperparameters describe.
@@ -73,13 +73,13 @@ def portable_policy(
 
 
 def learner_weights(algorithm: Algorithm) -> dict[str, NDArray[Any]]:
-    """The learner's weights of the one RLModule, as numpy arrays."""
+    """Return the learner's weights of its only RLModule, as NumPy arrays."""
     weights: dict[str, NDArray[Any]] = algorithm.learner_group.get_weights()[DEFAULT_MODULE_ID]
     return weights
 
 
 def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = None) -> Algorithm:
-    """Restore an RLlib checkpoint as an `Algorithm` that can train on.
+    """Restore an RLlib checkpoint as an `Algorithm` that can continue training.
 
     RLlib's checkpoints are pickles: restore only what you trust. Callers check the manifest's hashes first.
 
@@ -91,7 +91,7 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
         CheckpointError: RLlib cannot restore it, or the weights are not the expected ones.
     """
     if expected is not None and expected.module is not None:
-        # Before RLlib imports it: it would go on with another class where this one is missing.
+        # Imported before RLlib does: RLlib would use another class if this one is missing.
         import_module_class(expected.module.class_path)
     try:
         with old_names():
@@ -109,13 +109,13 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
 
 
 def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: PolicyNetwork) -> None:
-    """Give a new Algorithm the state of a checkpoint, and let its own settings act on it.
+    """Give a new Algorithm the state of a checkpoint, but keep the Algorithm's own settings.
 
     Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's.
-    Learning rate, betas and the like are the Algorithm's: RLlib's optimizer state brings the old ones along (2.60).
+    Learning rate, betas and the like stay the Algorithm's, although RLlib's optimizer state has the old ones (2.60).
 
     Args:
-        algorithm: Just built, with networks of the same shapes. It is stopped if this fails.
+        algorithm: A new one, with networks of the same shapes. It is stopped if this fails.
         rllib_checkpoint: The folder RLlib's `save_to_path` wrote; a pickle, as in `restore_algorithm`.
         expected: The network that was saved beside it.
 
@@ -140,13 +140,13 @@ def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: Poli
 
 
 def _optimizer_groups(algorithm: Algorithm) -> list[dict[str, Any]]:
-    """The optimizer's groups of parameters, each with its settings; as in torch."""
+    """Return the optimizer's parameter groups, each with its settings, as in torch."""
     learner = algorithm.learner_group._learner  # noqa: SLF001 - RLlib has no public way to the local one
     return [group for _, item in learner.get_optimizers_for_module(DEFAULT_MODULE_ID) for group in item.param_groups]
 
 
 def _modules(algorithm: Algorithm) -> dict[str, Any]:
-    """The RLModules of this process: the one that learns, and the one that acts, if it is here."""
+    """Return the RLModules of this process: the learner's, and the env runner's if it is here."""
     modules = {"learner": algorithm.learner_group._learner.module[DEFAULT_MODULE_ID]}  # noqa: SLF001
     runner = algorithm.env_runner
     if runner is not None and runner.module is not None:
@@ -165,7 +165,7 @@ def _check_module_classes(algorithm: Algorithm) -> None:
 
 
 def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
-    """Check that an Algorithm's learner and its env runner hold a network's very weights.
+    """Check that an Algorithm's learner and its env runner have exactly a network's weights.
 
     Raises:
         CheckpointError: They differ.

@@ -1,7 +1,7 @@
-"""Networks whose training went wrong: NaN and infinity in weights, outputs and gradients, said where they are found.
+"""Raise errors for NaN and infinity in outputs and gradients, by which training has ruined a network.
 
-Rewards and observations are finite wherever these are looked for (`policies.envs.checked`), so it is the training that
-made them. RLlib's learner sets such gradients to 0 and goes on (2.60): a trial that learns nothing any more, silently.
+Rewards and observations were checked to be finite before (`policies.envs.checked`), so the training is the cause.
+RLlib's learner sets such gradients to 0 and continues (2.60): the trial would silently learn nothing any more.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ def check_gradients(gradients: Iterable[Tensor | None], module: nn.Module) -> No
     """Refuse gradients that are not finite.
 
     Args:
-        gradients: Of one update.
-        module: The network that they are of.
+        gradients: The gradients of one update.
+        module: The network that they belong to.
 
     Raises:
         NonFiniteWeightsError: One is NaN or infinite.
     """
     known = [gradient for gradient in gradients if gradient is not None]
-    # The norm of a tensor is finite if all in it is; one number for each is looked at.
+    # The norm of a tensor is finite if all its numbers are, so only one number per tensor is checked.
     if known and not bool(torch.isfinite(torch.stack(torch._foreach_norm(known))).all()):  # noqa: SLF001 (as RLlib's own clipping)
         raise _error("The gradients of an update are NaN or infinite", module)
 
 
 def check_outputs(outputs: Tensor, module: nn.Module) -> None:
-    """Refuse what no action can be drawn from.
+    """Refuse outputs from which no action can be drawn.
 
     Args:
-        outputs: Of a policy.
-        module: The network that they are of.
+        outputs: The outputs of a policy.
+        module: The network that they belong to.
 
     Raises:
         NonFiniteWeightsError: One is NaN or infinite.

@@ -115,7 +115,7 @@ def test_what_is_no_modules_name_cannot_be_allowed(own, name):
 @pytest.mark.parametrize(
     ("path", "words", "hint"),
     [
-        ("own_nowhere:A", "'own_nowhere' is allowed, but there is none", "PYTHONPATH"),
+        ("own_nowhere:A", "'own_nowhere' is allowed, but it was not found", "PYTHONPATH"),
         ("own_broken:A", "ModuleNotFoundError.*own_missing_dependency", "import own_broken"),
         ("own_raising:A", "ZeroDivisionError: at import", "import own_raising"),
         ("own_walks:Wlak", "has nothing called 'Wlak'", "name"),

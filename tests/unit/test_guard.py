@@ -140,7 +140,7 @@ def test_an_env_that_only_this_process_registered_is_refused_as_trials_would():
 
 
 def test_arguments_that_no_file_holds_are_refused():
-    with pytest.raises(EnvError, match="not such as a sweep file can hold"):
+    with pytest.raises(EnvError, match="cannot be written to a sweep file"):
         guarded.check_env(HOSTILE, {"how": object()})
 
 

@@ -1,1 +1,1 @@
-"""DQN of many members at once."""
+"""Train DQN for many members at once."""

@@ -1,6 +1,6 @@
 """Members of a pack whose DQN networks are computed together: acting, and the updates of a training phase.
 
-Shapes: M members, N sub-environments a member, B rows a batch, D numbers an observation, A actions.
+Shapes: M members, N sub-environments per member, B rows per batch, D numbers per observation, A actions.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ class DQNGroup:
 
     Args:
         members: The members.
-        shared: What they have in common.
-        num_inputs: Numbers of an observation.
-        num_actions: A.
-        replay: Where their batches are drawn.
+        shared: The hyperparameters that the members share.
+        num_inputs: Numbers per observation, D.
+        num_actions: The number of actions, A.
+        replay: The replay memory that batches are drawn from.
         device: Where the updates are computed; acting is on the CPU.
 
     Attributes:
-        positions: Of the members in their stack.
-        learns: Whether updates of theirs are due.
+        positions: The members' positions in their stack.
+        learns: Whether updates of the members are due.
     """
 
     def __init__(
@@ -96,19 +96,19 @@ class DQNGroup:
         )
 
     def act(self, observations: Floats) -> Floats:
-        """Q-values or advantages, (M, N, A), of observations as the networks see them, (M, N, D)."""
+        """Return Q-values or advantages, (M, N, A), for prepared observations, (M, N, D)."""
         return self._acting(observations)[..., : self._num_actions]
 
     def learn(self, numbers: NDArray[np.float64], num_new_steps: int, *, wants_stats: bool) -> list[dict[str, float]]:
         """Make the updates of one training phase.
 
         Args:
-            numbers: Uniform in [0, 1), what the batches are drawn with, (updates, M, B).
+            numbers: Random numbers, uniform in [0, 1), that the batches are drawn with, (updates, M, B).
             num_new_steps: Env steps of each member since the last phase.
-            wants_stats: Whether to compute the numbers of the last update.
+            wants_stats: Whether to compute the metrics of the last update.
 
         Returns:
-            For each member, numbers of the last update; empty if they are not wanted.
+            For each member, the metrics of the last update; empty if they are not wanted.
         """
         if self._has_schedule:
             self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
@@ -162,7 +162,7 @@ class DQNGroup:
         return dqn.best_next_values(q_values(self._targets), online)
 
     def _update_targets(self, num_steps_after: float) -> None:
-        """Move the target networks whose time it is; so many env steps of the phase come after this update."""
+        """Update the target networks that are due; `num_steps_after` env steps of the phase follow this update."""
         if self._targets is None:
             return
         due = []
@@ -193,15 +193,15 @@ class DQNGroup:
         stats = [{name: values[index] for name, values in columns.items()} for index in range(len(self.members))]
         if norms is not None:
             for found, norm, item in zip(stats, norms[:, 0].tolist(), self._hyperparams, strict=True):
-                if item.grad_clip is not None:  # the others' is computed beside it
+                if item.grad_clip is not None:  # computed for all, reported where it is clipped
                     found["gradient_norm"] = norm
         return [{name: value for name, value in found.items() if math.isfinite(value)} for found in stats]
 
     def write_back(self) -> None:
-        """Give the members their weights and moments as they are now."""
+        """Copy the present weights and moments back to the members."""
         self._rows.write_back(self._optimizer)
         for member, item in zip(self.members, self._hyperparams, strict=True):
-            if not item.rmsprop_momentum:  # the buffer is the last step itself, and nothing depends on it
+            if not item.rmsprop_momentum:  # without momentum, nothing depends on the buffer
                 member.moments.pop("momentum_buffer", None)
         if self._targets is not None:
             self._targets.write_back()

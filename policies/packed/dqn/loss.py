@@ -1,4 +1,4 @@
-"""DQN's loss of many members at once, and its gradient.
+"""Compute DQN's loss and its gradient for many members at once.
 
 Sources: Mnih et al. 2015; van Hasselt et al. 2016 (double Q-learning); Wang et al. 2016, equation 9 (dueling).
 
@@ -17,10 +17,10 @@ from policies.packed.shared import SharedByDQN
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """What one update's forward passes give."""
+    """The results of one update's forward passes."""
 
     gradient: Tensor
-    """Of each member's loss with respect to the network's outputs, (M, B, outputs)."""
+    """The gradient of each member's loss with respect to the network's outputs, (M, B, outputs)."""
     td_errors: Tensor
     """Q(s, a) minus its target, (M, B)."""
     q_selected: Tensor
@@ -28,7 +28,7 @@ class Loss:
 
 
 def q_values(outputs: Tensor, num_actions: int) -> Tensor:
-    """Q, (M, B, A), of a network's outputs: Q-values, or advantages and a value if dueling."""
+    """Return Q, (M, B, A), from a network's outputs: Q-values, or advantages and a value if dueling."""
     if outputs.shape[-1] == num_actions:
         return outputs
     advantages = outputs[..., :num_actions]
@@ -36,7 +36,7 @@ def q_values(outputs: Tensor, num_actions: int) -> Tensor:
 
 
 def best_next_values(target_q: Tensor, online_q: Tensor | None) -> Tensor:
-    """Q' of the best next action, (M, B): the best by Q' itself or, for double Q-learning, by the online network."""
+    """Return Q' of the best next action, (M, B), chosen by Q' or, in double Q-learning, by the online network."""
     if online_q is None:
         return target_q.amax(dim=-1)
     return target_q.gather(-1, online_q.argmax(dim=-1, keepdim=True)).squeeze(-1)
@@ -45,14 +45,14 @@ def best_next_values(target_q: Tensor, online_q: Tensor | None) -> Tensor:
 def loss_gradient(
     outputs: Tensor, actions: Tensor, targets: Tensor, weights: Tensor | None, shared: SharedByDQN
 ) -> Loss:
-    """The gradient of each member's mean loss.
+    """Return the gradient of each member's mean loss.
 
     Args:
-        outputs: Of the online network for the observations, (M, B, outputs).
-        actions: (M, B), whole numbers.
-        targets: (M, B).
+        outputs: The online network's outputs for the observations, (M, B, outputs).
+        actions: The actions as whole numbers, (M, B).
+        targets: The targets of Q, (M, B).
         weights: Importance weights, (M, B); None: all 1.
-        shared: By the members.
+        shared: The hyperparameters that the members share.
     """
     num_actions = outputs.shape[-1] - shared.dueling
     index = actions.unsqueeze(-1)
@@ -64,7 +64,7 @@ def loss_gradient(
     slope = (slope / td_errors.shape[1]).unsqueeze(-1)
     gradient = torch.zeros_like(outputs)
     if shared.dueling:
-        # Q = V + A - mean A: every advantage has a part in the mean.
+        # Q = V + A - mean A: the mean depends on every advantage.
         gradient[..., :num_actions] = slope / -num_actions
         gradient[..., num_actions:] = slope
         gradient[..., :num_actions].scatter_add_(-1, index, slope)
@@ -74,7 +74,7 @@ def loss_gradient(
 
 
 def mean_loss(td_errors: Tensor, weights: Tensor | None, shared: SharedByDQN) -> Tensor:
-    """Each member's loss, (M,)."""
+    """Return each member's mean loss, (M,)."""
     if shared.td_loss == "huber":
         small = td_errors.abs()
         rows = torch.where(small <= 1.0, 0.5 * td_errors**2, small - 0.5)

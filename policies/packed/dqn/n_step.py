@@ -1,4 +1,4 @@
-"""Steps of a pack's environments -> rows of its replay memory."""
+"""Turn steps of a pack's environments into rows of its replay memory."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Floats = NDArray[np.float32]
 
 
 class StackedNStep:
-    """Makes transitions of every member's steps.
+    """Makes n-step transitions from every member's steps.
 
     Args:
         num_envs: Sub-environments of each member.
-        num_inputs: Numbers of an observation.
-        n_step: Steps of reward before bootstrapping; of all members.
+        num_inputs: Numbers per observation.
+        n_step: Steps of reward before bootstrapping; the same for all members.
     """
 
     def __init__(self, num_envs: int, num_inputs: int, n_step: int) -> None:
@@ -29,24 +29,24 @@ class StackedNStep:
         self._waiting: dict[str, NStep] = {}
 
     def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
-        """Its episodes begin."""
+        """Add a member, whose episodes begin."""
         self._gamma[member_id] = hyperparams.gamma
         self._waiting[member_id] = NStep(self._num_envs, self._n_step, hyperparams.gamma)
 
     def remove_member(self, member_id: str) -> None:
-        """What waits for further rewards will not get them."""
+        """Remove a member, and drop its transitions that still wait for rewards."""
         del self._gamma[member_id], self._waiting[member_id]
 
     def rows(
         self, member_ids: Sequence[str], observations: Floats, actions: NDArray[np.int64], step: Step
     ) -> Floats | list[Floats]:
-        """The rows that are complete after a vector step.
+        """Return the rows that are complete after a vector step.
 
         Args:
-            member_ids: In the order of the rows of the other arguments.
-            observations: That the actions answered, (S, D).
-            actions: (S,).
-            step: What they led to.
+            member_ids: The members, in the order of the rows of the other arguments.
+            observations: The observations that were acted on, (S, D).
+            actions: The actions, (S,).
+            step: The step that the actions led to.
 
         Returns:
             (M, N, columns); or, where n_step is more than 1, one array of (K, columns) for each member.
@@ -70,7 +70,7 @@ class StackedNStep:
         for index, name in enumerate(member_ids):
             own = slice(index * self._num_envs, (index + 1) * self._num_envs)
             columns = {
-                # Two rows: what was acted on, and what came of it before any reset.
+                # The observations that were acted on, and those that the step led to, before any reset.
                 "obs": np.stack([observations[own], step.final_observations[own]]),
                 "actions": actions[None, own],
                 "rewards": step.rewards[None, own],

@@ -1,10 +1,11 @@
 """Replay memories of many members in one array, so that one gather serves them all.
 
-The same memories as `policies.replay`'s, whose words hold here too. Shapes: M members (of a call), K new transitions,
-B rows a batch, D numbers an observation. A member's rows are its *slot*, which it keeps until it leaves.
+They are the memories of `policies.replay`, where the words are explained. Shapes: M members (of a call), K new
+transitions, B rows per batch, D numbers per observation. A member's rows are its *slot*, which it keeps until
+it leaves.
 
-Columns of a row: observation, 1, next observation, 1, action, reward, discount; the ones are for the first bias of
-`StackedNetworks`.
+Columns of a row: observation, 1, next observation, 1, action, reward, discount; the ones are multiplied by the
+first bias of `StackedNetworks`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.shared import SharedByDQN
@@ -27,22 +29,22 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A batch of each of M members."""
+    """A batch for each of M members."""
 
     rows: Floats
-    """(M, B, columns)."""
+    """The transitions, (M, B, columns)."""
     weights: Floats | None = None
     """Importance weights, (M, B); None: all 1."""
     indices: Indices | None = None
-    """Where the rows lie in the members' slots, (M, B), to set their priorities."""
+    """The rows' indices in the members' slots, (M, B), by which their priorities are set."""
 
 
 class StackedReplay:
-    """Rings of transitions, drawn from uniformly and with replacement, or the newest alone.
+    """Rings of transitions; batches are drawn uniformly and with replacement, or are the newest transitions.
 
     Args:
-        shared: By all members.
-        num_inputs: D.
+        shared: The hyperparameters that all members share.
+        num_inputs: Numbers per observation, D.
     """
 
     def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
@@ -67,7 +69,7 @@ class StackedReplay:
         num_now, capacity_now = self._rows.shape[:2]
         if num_slots <= num_now and capacity <= capacity_now:
             return
-        # Never touched where nothing is written: the memory is the operating system's until then.
+        # Left uninitialised: the operating system provides memory only for the rows that are written.
         larger = np.empty((max(num_slots, num_now), max(capacity, capacity_now), self.num_columns), dtype=np.float32)
         for slot in self._slots.values():
             larger[slot, : self._size[slot]] = self._rows[slot, : self._size[slot]]
@@ -82,19 +84,19 @@ class StackedReplay:
         del self._slots[member_id]
 
     def slots(self, member_ids: Sequence[str]) -> Indices:
-        """Where members lie, (M,)."""
+        """Return the members' slots, (M,)."""
         return np.array([self._slots[name] for name in member_ids], dtype=np.int64)
 
     def sizes(self, slots: Indices) -> Indices:
-        """Transitions of each, (M,)."""
+        """Return the number of transitions in each slot, (M,)."""
         return self._size[slots]
 
     def add(self, slots: Indices, rows: Floats) -> None:
-        """Append as many rows to each of some slots; of more than fit, the newest stay.
+        """Append K rows to each of some slots; if more are given than fit, the newest stay.
 
         Args:
-            slots: (M,).
-            rows: (M, K, columns), oldest first.
+            slots: The slots, (M,).
+            rows: The new rows, (M, K, columns), oldest first.
         """
         num_new = rows.shape[1]
         places = (self._next[slots, None] + np.arange(num_new)) % self._capacity[slots, None]
@@ -119,11 +121,11 @@ class StackedReplay:
         self._size[slots] = np.minimum(self._capacity[slots], self._size[slots] + num_new)
 
     def draw(self, slots: Indices, numbers: NDArray[np.float64]) -> Drawn:
-        """A batch of each of some members.
+        """Return a batch for each of some members.
 
         Args:
-            slots: (M,).
-            numbers: Uniform in [0, 1), (M, B); not looked at where the newest are taken.
+            slots: The members' slots, (M,).
+            numbers: Random numbers, uniform in [0, 1), (M, B); not used where the newest transitions are taken.
         """
         if self._newest_only:
             places = (self._next[slots, None] - numbers.shape[1] + np.arange(numbers.shape[1])) % self._capacity[
@@ -140,11 +142,11 @@ class StackedReplay:
         return rows
 
     def set_priorities(self, slots: Indices, indices: Indices, td_errors: Floats) -> None:
-        """Nothing: all rows are alike."""
+        """Do nothing, because all rows are equally likely."""
 
 
 class StackedPrioritizedReplay(StackedReplay):
-    """Drawn from in proportion to |TD error|^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
+    """Draws in proportion to |TD error|^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
 
     def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
         super().__init__(shared, num_inputs)
@@ -154,8 +156,8 @@ class StackedPrioritizedReplay(StackedReplay):
         self._alpha: NDArray[np.float64] = np.zeros(0)
         self._beta: NDArray[np.float64] = np.zeros(0)
 
+    @override
     def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
-        """See `StackedReplay.add_member`."""
         super().add_member(member_id, hyperparams)
         self._grow_trees()
         slot = self._slots[member_id]
@@ -175,15 +177,15 @@ class StackedPrioritizedReplay(StackedReplay):
             setattr(self, name, values)
 
     def _first(self, slots: Indices) -> Indices:
-        """Where the leaves of slots begin, (M, 1)."""
+        """Return where the leaves of slots begin, (M, 1)."""
         return slots[:, None] * self._priorities.num_leaves
 
     def _advance(self, slots: Indices, places: Indices) -> None:
         super()._advance(slots, places)
         self._priorities.set(self._first(slots) + places, np.broadcast_to(self._highest[slots, None], places.shape))
 
+    @override
     def draw(self, slots: Indices, numbers: NDArray[np.float64]) -> Drawn:
-        """See `StackedReplay.draw`; the priorities set between two draws act on the next."""
         totals = self._priorities.totals[slots][:, None]
         first = self._first(slots)
         found = self._priorities.find(np.broadcast_to(slots[:, None], numbers.shape), numbers * totals)
@@ -202,7 +204,7 @@ class StackedPrioritizedReplay(StackedReplay):
 
 
 def make_stacked_replay(shared: SharedByDQN, num_inputs: int) -> StackedReplay:
-    """The memories that the hyperparameters name, without members."""
+    """Return the replay memory that the hyperparameters name, without members."""
     if shared.replay == "prioritized":
         return StackedPrioritizedReplay(shared, num_inputs)
     return StackedReplay(shared, num_inputs)

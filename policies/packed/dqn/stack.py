@@ -1,9 +1,9 @@
-"""DQN of the members of a pack that share a tensor program: one vector of environments, batched updates.
+"""Train DQN for the members of a pack that share a tensor program: one vector of environments, batched updates.
 
-What an iteration does is what `policies.rllib.dqn_algorithm` does for one trial: phases of sampling, each followed by
-the updates that are due.
+An iteration does what `policies.rllib.dqn_algorithm` does for one trial: phases of sampling, each followed by the
+updates that are due.
 
-Shapes: M members, T vector steps, N sub-environments a member, S = M * N rows, B rows a batch, D numbers an
+Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, B rows per batch, D numbers per
 observation.
 """
 
@@ -16,6 +16,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from policies.hyperparams import DQNHyperparams
 from policies.networks.epsilon import EpsilonSchedule
@@ -37,18 +38,18 @@ _NUMBERS_AT_ONCE = 65_536
 
 @dataclass(eq=False)
 class _Draws:
-    """What the members' actions and batches of some phases are drawn with."""
+    """The random numbers for the members' actions and batches in some phases."""
 
     explores: Floats
-    """Uniform in [0, 1), (T, M, N): a random action where it is below epsilon."""
+    """Uniform in [0, 1), (T, M, N); below epsilon, the action is random."""
     actions: NDArray[np.int64]
     """The random actions, (T, M, N)."""
     batches: NDArray[np.float64]
-    """Uniform in [0, 1), (phases, updates of a phase at most, M, B)."""
+    """Uniform in [0, 1), (phases, most updates of a phase, M, B)."""
 
 
 class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
-    """See `Stack`."""
+    """Trains the DQN members of a pack together; see `Stack`."""
 
     def __init__(self, shared: SharedByDQN, envs: PackedEnvs, device: str = "cpu") -> None:
         super().__init__(shared, envs, device)
@@ -64,23 +65,23 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         self._num_actions = int(cast("gym.spaces.Discrete[Any]", envs.action_space).n)
 
     def _begin(self, member: Member[DQNHyperparams]) -> None:
-        """Make room for its transitions."""
+        """Make room for the member's transitions."""
         hyperparams = member.hyperparams
         self._replay.add_member(member.member_id, hyperparams)
         self._n_step.add_member(member.member_id, hyperparams)
         if member.num_updates and self._shared.replay != "none":
-            # Its memory is empty again. It gets as much as it had when learning began, without learning meanwhile.
+            # Its memory is empty again. It is filled to where it was when learning began; until then nothing is learnt.
             num_steps = max(self._shared.learning_starts, self._shared.train_batch_size)
             self._refilled_at[member.member_id] = member.num_env_steps + num_steps
 
     def _forget(self, member_id: str) -> None:
-        """Drop its transitions."""
+        """Drop the member's transitions."""
         self._replay.remove_member(member_id)
         self._n_step.remove_member(member_id)
         self._refilled_at.pop(member_id, None)
 
     def _regroup(self) -> None:
-        """Make the groups anew: of members that learn at the same time, whatever their place among the rows."""
+        """Make the groups anew, from members that learn at the same time, whatever their position among the rows."""
         self._write_back()
         groups = group_members(
             self.members,
@@ -100,7 +101,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
             self._groups.append(group)
 
     def _arrange(self) -> None:
-        """Put members that are computed together side by side; between iterations alone."""
+        """Put members that are computed together side by side; called only between iterations."""
         self._write_back()
         self.members = [member for group in group_members(self.members) for member in group]
         self._ids = [member.member_id for member in self.members]
@@ -120,17 +121,17 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         return member.num_env_steps >= self._shared.learning_starts and bool(size >= self._shared.train_batch_size)
 
     def _num_updates(self, member: Member[DQNHyperparams]) -> int:
-        """Updates of a member in a training phase now; 10 x 0.1 is a little less than 1 in binary."""
+        """Return the number of updates that are due; it allows for rounding, as 10 x 0.1 is less than 1 in binary."""
         return math.floor(member.due + self._updates_per_phase + 1e-9)
 
     def _is_mixed(self, group: DQNGroup) -> bool:
-        """Whether updates are due to some members of a group and not to others: sums of fractions drift apart."""
+        """Whether updates are due for only some members of a group, because sums of fractions drift apart."""
         if not group.learns:
             return any(map(self._learns, group.members))
         return len(set(map(self._num_updates, group.members))) > 1
 
     def begin_iteration(self) -> None:
-        """See `Stack.begin_iteration`: all of it, since sampling waits for the updates of every phase."""
+        """Do the whole iteration, since sampling waits for the updates of every phase."""
         if self._stale:
             self._arrange()
         shared = self._shared
@@ -149,7 +150,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
                     step = self._sample(draws, (phase - start) * steps_per_phase + number)
                     rewards.append(step.own_rewards)
                     ended.append(step.terminated | step.truncated)
-                # Updates may be rarer than phases: the numbers of the last that is made are wanted.
+                # Updates may be rarer than phases: the metrics of the last update made are wanted.
                 is_late = (num_phases - phase - 1) * updates_per_phase <= 1.0
                 self._learn(draws, phase - start, new_steps, stats if is_late else None)
         episodes = self._episodes.follow(self._ids, np.stack(rewards), np.stack(ended))
@@ -160,12 +161,12 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
             for member, found in zip(self.members, episodes, strict=True)
         }
 
+    @override
     def finish_iteration(self) -> dict[str, MemberStats]:
-        """See `Stack.finish_iteration`."""
         return self._stats
 
     def _draw(self, num_phases: int, steps_per_phase: int, updates_per_phase: float) -> _Draws:
-        """Each member's numbers for some phases, in an order that does not depend on the members beside it."""
+        """Draw each member's numbers for some phases, in an order that does not depend on the other members."""
         num_members, num_envs = len(self.members), self.envs.num_envs
         num_steps = num_phases * steps_per_phase
         shared = self._shared
@@ -183,7 +184,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         return draws
 
     def _sample(self, draws: _Draws, number: int) -> Step:
-        """One vector step, with its transitions put into the replay memory."""
+        """Make one vector step and put its transitions into the replay memory."""
         num_members, num_envs = len(self.members), self.envs.num_envs
         observations = self.envs.observations
         seen = self._observations.prepare(observations)
@@ -214,7 +215,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         return step
 
     def _learn(self, draws: _Draws, phase: int, new_steps: int, stats: dict[str, dict[str, float]] | None) -> None:
-        """The training phase of every member that learns."""
+        """Run the training phase of every member that learns."""
         if any(map(self._is_mixed, self._groups)):
             self._regroup()
         for group in self._groups:
@@ -233,7 +234,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         self._learn_statistics()
 
     def _learn_statistics(self) -> None:
-        """Merge what was observed in the phase into the statistics, if observations are normalised."""
+        """Merge the observations of the phase into the statistics, if observations are normalised."""
         if not self._shared.normalize_observations:
             return
         rows = np.stack(self._unlearned).reshape(len(self._unlearned), len(self.members), -1, self._num_inputs)

@@ -1,4 +1,4 @@
-"""CartPole for all members of a pack in one object: Gymnasium's own vectorised version, with resets of its own.
+"""Step CartPole for all members of a pack in one object: Gymnasium's own vectorised version with other resets.
 
 That version draws the start states of all sub-environments from one generator, and resets a sub-environment in the
 step after its episode's end. Here each member draws from a generator of its own, and where an episode has ended the
@@ -29,22 +29,22 @@ class CartPoleRows:
     """Cart-poles whose number changes; they never reset by themselves.
 
     Args:
-        env: Whose physics and time limit they have; it belongs to them from here on.
+        env: Gives the physics and the time limit; it belongs to this object from here on.
     """
 
     def __init__(self, env: CartPoleVectorEnv) -> None:
         self._env: Any = env
-        # Its steps check all actions for being 0 or 1, of as many sub-environments as it was made for. Here their
-        # number changes, and the actions are a network's choices out of two.
+        # The env's step checks that the actions are 0 or 1, for the number of sub-environments it was made with. Here
+        # that number changes, and the actions are a network's choices, which are always 0 or 1.
         env.action_space = _AnyActions()
         self.put(np.zeros((0, 4)), np.zeros(0, dtype=np.int32))
 
     @classmethod
     def make(cls, env_id: str, env_args: Mapping[str, Any] | None) -> CartPoleRows | None:
-        """None: the env is not CartPole, or has wrappers that the vectorised version does not have.
+        """Return cart-poles, or None if the env is not CartPole or has wrappers that its vectorised version lacks.
 
         Raises:
-            EnvError: As `policies.envs.make.make_env`.
+            EnvError: In the same cases as `policies.envs.make.make_env`.
         """
         scalar = make_env(env_id, env_args)
         scalar.close()  # type: ignore[no-untyped-call]
@@ -55,47 +55,47 @@ class CartPoleRows:
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """Of one cart-pole."""
+        """The observation space of one cart-pole."""
         return self._env.single_observation_space  # type: ignore[no-any-return]
 
     @property
     def states(self) -> NDArray[np.float64]:
-        """Position, velocity, angle and angular velocity of each, shape (num, 4)."""
+        """The position, velocity, angle and angular velocity of each cart-pole, shape (num, 4)."""
         return self._env.state.T  # type: ignore[no-any-return]
 
     @property
     def lengths(self) -> NDArray[np.int32]:
-        """Steps of the running episode of each, shape (num,)."""
+        """The number of steps of each running episode, shape (num,)."""
         return self._env.steps  # type: ignore[no-any-return]
 
     def put(self, states: NDArray[np.float64], lengths: NDArray[np.int32]) -> None:
-        """Go on with these cart-poles, in any number, in place of those before.
+        """Replace the cart-poles by others, in any number.
 
         Args:
-            states: Shape (num, 4).
-            lengths: Shape (num,).
+            states: Their states, shape (num, 4).
+            lengths: The steps of their running episodes, shape (num,).
         """
         self._env.state = np.array(states.T, dtype=np.float64, order="C")
         self._env.steps = np.array(lengths, dtype=np.int32)
         self._no_resets = np.zeros(len(lengths), dtype=np.bool_)
 
     def draw_starts(self, generator: np.random.Generator, *shape: int) -> NDArray[np.float64]:
-        """Start states, of shape (*shape, 4)."""
+        """Draw start states, shape (*shape, 4)."""
         return generator.uniform(self._env.low, self._env.high, (*shape, 4))
 
     def restart(self, rows: Rows, states: NDArray[np.float64]) -> None:
-        """Begin new episodes at some rows, from these states, of shape (len(rows), 4)."""
+        """Begin new episodes at some rows from these states, shape (len(rows), 4)."""
         self._env.state[:, rows] = states.T
         self._env.steps[rows] = 0
 
     def step(self, actions: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32], _Flags, _Flags, _Flags]:
-        """Step all.
+        """Step all cart-poles.
 
         Returns:
-            Observations, of shape (num, 4), rewards, terminated, truncated, and whether one of the two.
+            Observations, shape (num, 4), rewards, terminated, truncated, and whether the episode has ended either way.
         """
         env = self._env
-        # It would reset what it believes to have ended in the step before.
+        # Otherwise the env would reset the sub-environments whose episodes ended in the step before.
         env.prev_done = self._no_resets
         observations, rewards, terminated, truncated, _ = env.step(actions)
         return np.ascontiguousarray(observations), rewards, terminated, truncated, env.prev_done
@@ -106,7 +106,7 @@ class CartPoleRows:
 
 
 class _AnyActions(gym.spaces.MultiDiscrete):
-    """The actions of any number of cart-poles, unchecked."""
+    """An action space that accepts the actions of any number of cart-poles without a check."""
 
     def __init__(self) -> None:
         super().__init__([2])
@@ -117,7 +117,7 @@ class _AnyActions(gym.spaces.MultiDiscrete):
 
 
 class CartPoleEnvs:
-    """`PackedEnvs` of CartPole.
+    """The sub-environments of a pack that trains on CartPole; implements `PackedEnvs`.
 
     Args:
         env_id: Gymnasium id.
@@ -148,9 +148,9 @@ class CartPoleEnvs:
         self._penalty = Penalty.find(env_id, env_args, failure_penalty)
         self._members = MemberRows(num_envs)
         self._generators: dict[str, np.random.Generator] = {}
-        # Start state of the next episode of each row, if its running one ends in that step: (steps ahead, rows, 4).
+        # The start state of each row's next episode if its running one ends in that step: (steps ahead, rows, 4).
         self._starts: NDArray[np.float64] = np.zeros((0, 0, 4))
-        self._at = 0  # the step of these that comes next
+        self._at = 0  # the index of the next step
 
     @property
     def member_ids(self) -> tuple[str, ...]:
@@ -158,7 +158,7 @@ class CartPoleEnvs:
         return self._members.ids
 
     def add(self, member_id: str, seed: int) -> None:
-        """See `PackedEnvs.add`."""
+        """Add a member after all others, with its start states drawn from its seed."""
         self._members.add(member_id)
         generator = self._generators[member_id] = random_streams.seeded(seed)
         rows = self._rows
@@ -171,12 +171,12 @@ class CartPoleEnvs:
         self.observations = np.concatenate([self.observations, states.astype(np.float32)])
 
     def remove(self, member_id: str) -> None:
-        """See `PackedEnvs.remove`."""
+        """Remove a member; the rows after it move up."""
         self._choose(self._members.remove(member_id))
         del self._generators[member_id]
 
     def arrange(self, member_ids: Sequence[str]) -> None:
-        """See `PackedEnvs.arrange`."""
+        """Put the members into this order; their running episodes go on."""
         self._choose(self._members.arrange(member_ids))
 
     def _choose(self, rows: Rows) -> None:
@@ -185,9 +185,9 @@ class CartPoleEnvs:
         self.observations = self.observations[rows]
 
     def begin(self, num_steps: int) -> None:
-        """See `PackedEnvs.begin`.
+        """Draw the start states of the next `num_steps` steps.
 
-        What was drawn ahead and not used is used first: a member's numbers do not depend on how long the stretches are.
+        Numbers drawn ahead but not used are used first, so that a member's numbers do not depend on `num_steps`.
         """
         left = self._starts[self._at :]
         missing = num_steps - len(left)
@@ -201,7 +201,7 @@ class CartPoleEnvs:
         self._starts, self._at = starts, 0
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """See `PackedEnvs.step`."""
+        """Step every row; where an episode ends, the next one begins."""
         if self._at == len(self._starts):
             self.begin(1)
         observations, own_rewards, terminated, truncated, ended = self._rows.step(actions)
@@ -219,5 +219,5 @@ class CartPoleEnvs:
         return Step(observations, final_observations, rewards, own_rewards, terminated, truncated)
 
     def close(self) -> None:
-        """See `PackedEnvs.close`."""
+        """Close the environment."""
         self._rows.close()

@@ -1,11 +1,11 @@
-"""Environments of many trials at once.
+"""Make and check the environments of a pack: those of many trials at once.
 
 Words: a *pack* trains several trials in one process; each of them is a *member*, named by its trial id. A *row* is one
 sub-environment: member m of a pack owns the rows m * N to (m + 1) * N, where N is the number of each member's
 sub-environments. M is the number of members.
 
-Where an episode ends, the next one begins in the same step: every step is a transition, none of them only resets. What
-a member gets depends on its seed and its actions alone, to the last bit, and not on the members beside it.
+Where an episode ends, the next one begins in the same step: every step is a transition, and none only resets. To the
+last bit, a member's observations and rewards depend only on its seed and its actions, not on the members beside it.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from policies.errors import EnvError
 from policies.packed.envs.vector import EnvKind, PackedEnvs
 
 _SLOW_STEP_US = 1000.0
-"""From here on a step is worth a message to another process."""
+"""Microseconds from which a step is long enough to be made in another process, which costs a message."""
 _TIMED_STEPS = 200
 _TIMED_S = 0.15
-_CUT = 20  # the reset without a seed must be repeatable too, also of envs with long episodes
+_CUT = 20  # so that the reset without a seed is checked too, also for envs with long episodes
 
 
 @dataclass(frozen=True)
 class StepTime:
-    """What was measured of an environment."""
+    """How long an environment's steps take."""
 
     us: float | None
-    """Microseconds of one env step, the resets after episodes' ends with it; None: it has raised before."""
+    """Microseconds per env step, including resets after episodes' ends; None: the env raised an error before."""
     is_vectorised: bool = False
     """Whether one object steps all of a pack's environments at once."""
 
@@ -50,9 +50,9 @@ class EnvChoice:
 
     kind: EnvKind
     step_us: float | None
-    """See `StepTime.us`."""
+    """Microseconds per env step; see `StepTime.us`."""
     why: str
-    """A phrase for the plan."""
+    """The reason, as a phrase for the plan."""
 
 
 def make_packed_envs(
@@ -64,16 +64,16 @@ def make_packed_envs(
     kind: EnvKind,
     num_processes: int = 0,
 ) -> PackedEnvs:
-    """Environments for a pack that has no members yet.
+    """Make the environments of a pack that has no members yet.
 
     Args:
         env_id: Gymnasium id, or `module:Name`.
-        env_args: As `policies.envs.make.make_env` takes them.
+        env_args: The same as for `policies.envs.make.make_env`.
         num_envs: Sub-environments of each member.
         failure_penalty: Reward of steps that end by failure, for training alone; None: the env's own reward.
-        kind: `vectorised`: CartPole alone, all members in one object. `scalar`: any environment, one sub-environment
-            after the other. `processes`: as scalar, in child processes.
-        num_processes: Of the kind `processes`: how many, at least 1.
+        kind: `vectorised`: only CartPole, all members in one object. `scalar`: any environment, one sub-environment
+            after the other. `processes`: the same, in child processes.
+        num_processes: The number of child processes of the kind `processes`, at least 1.
 
     Raises:
         EnvError: The environment cannot be made, is not one of that kind, or there is a penalty and it has no failure.
@@ -102,12 +102,12 @@ def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
 
 
 def choose_kind(step: StepTime, *, spare_cpus: int, why_none: str = "no CPU is idle") -> EnvChoice:
-    """How to step an environment for a pack: all at once if it can be, in processes if it is slow and CPUs are idle.
+    """Choose how to step a pack's environments: all at once if possible, in processes if slow and CPUs are idle.
 
     Args:
-        step: As `measure_step` found it.
+        step: The result of `measure_step`.
         spare_cpus: CPUs that nothing else would use.
-        why_none: Why there are none, if so.
+        why_none: The reason why there are none, for the case that there are none.
     """
     if step.is_vectorised:
         return EnvChoice("vectorised", step.us, "one object steps them all at once")
@@ -125,8 +125,8 @@ def choose_kind(step: StepTime, *, spare_cpus: int, why_none: str = "no CPU is i
 def check_seedable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
     """Refuse an environment whose steps do not follow from the seed of its first reset and its actions.
 
-    In a pack, a trial could not be repeated then: what it gets would depend on the trials beside it. An env that raises
-    is left to the trial that it happens to.
+    In a pack, a trial could not be repeated then: its observations would depend on the trials beside it. An env that
+    raises an error here is not refused; the error is left to the trials.
 
     Raises:
         EnvError: The environment cannot be made, or its observations, rewards or ends differ from one time to the next.
@@ -166,7 +166,7 @@ def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> floa
 
 
 def _scalar_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float | None:
-    """Of steps with random actions; the first, which may load things, counts only where it is the only one."""
+    """Return the time of a step with random actions; the first, which may load files, counts only if it is alone."""
     moments = [time.perf_counter() for _ in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
     if len(moments) == 2:
         return 1e6 * (moments[1] - moments[0])
@@ -174,7 +174,7 @@ def _scalar_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float | 
 
 
 class _Seen(NamedTuple):
-    """What an environment gave."""
+    """The values that one step or reset of an environment returned."""
 
     num_steps: int
     observation: Any
@@ -188,14 +188,14 @@ class _Seen(NamedTuple):
 def _trace(
     env_id: str, env_args: Mapping[str, Any] | None, seed: int, *, seconds: float = math.inf, cut: int | None = None
 ) -> Iterator[_Seen]:
-    """What an environment gives to random actions, equal ones for equal seeds, until it raises an error.
+    """Step an environment with random actions, equal ones for equal seeds, until it raises an error.
 
     Args:
-        env_id: As `policies.envs.make.make_env`.
-        env_args: The same.
-        seed: Of the first reset, and of the actions.
-        seconds: No further step after these.
-        cut: Steps after which an episode that still runs is left for the next; None: no such cut.
+        env_id: The same as for `policies.envs.make.make_env`.
+        env_args: The same as for `policies.envs.make.make_env`.
+        seed: The seed of the first reset and of the actions.
+        seconds: No step is begun after this time.
+        cut: Steps after which an episode is cut off and the next begins; None: none is cut off.
     """
     env = make_env(env_id, env_args)
     space = copy.deepcopy(env.action_space)  # the env may draw from its own
@@ -203,7 +203,7 @@ def _trace(
     actions = [space.sample() for _ in range(_TIMED_STEPS)]
     actions = [action.item() if isinstance(action, np.generic) else action for action in actions]
     deadline = time.perf_counter() + seconds
-    # Whatever it raises is the business of the trial that it happens to.
+    # An error of the env is reported by the trial that it happens in.
     with contextlib.suppress(Exception), contextlib.closing(env):
         yield _Seen(0, np.array(env.reset(seed=seed)[0]))
         for num_steps, action in enumerate(actions, start=1):
@@ -217,7 +217,7 @@ def _trace(
 
 
 def _beside_another(env_id: str, env_args: Mapping[str, Any] | None, num: int) -> list[_Seen]:
-    """The same as from an environment alone, but with another one, of another seed, that steps in between."""
+    """Trace an environment while another one, with another seed, is stepped in between."""
     ours, other = (_trace(env_id, env_args, seed, cut=_CUT) for seed in (0, 1))
     seen = []
     for _, one in zip(range(num), ours, strict=False):
@@ -227,7 +227,7 @@ def _beside_another(env_id: str, env_args: Mapping[str, Any] | None, num: int) -
 
 
 def _difference(one: Sequence[_Seen], another: Sequence[_Seen]) -> str | None:
-    """The first difference of two traces in words; None if there is none."""
+    """Describe the first difference between two traces; None if they are equal."""
     for left, right in zip(one, another, strict=False):
         when = f"after {left.num_steps} step{'' if left.num_steps == 1 else 's'}" if left.num_steps else "at first"
         for name in _Seen._fields[1:]:

@@ -23,7 +23,7 @@ class Penalty:
 
     @classmethod
     def find(cls, env_id: str, env_args: Mapping[str, Any] | None, reward: float | None) -> Penalty | None:
-        """The penalty, with the rule that the environment has; None without one.
+        """Return the penalty with the environment's failure rule, or None if no penalty is given.
 
         Raises:
             EnvError: There is a penalty, and the env has no failure.
@@ -36,5 +36,5 @@ class Penalty:
         return cls(env.rule, env.penalty)
 
     def apply(self, rewards: NDArray[np.float32], terminated: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """What the learner sees of the env's own rewards: a new array."""
+        """Return the rewards that the learner gets, as a new array."""
         return np.where(self.rule.failed(rewards, terminated), np.float32(self.reward), rewards)

@@ -1,4 +1,4 @@
-"""Sub-environments in a process of their own, asked through a pipe."""
+"""Step sub-environments in a process of their own, which is asked through a pipe."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ class ProcessHost:
             target=entry(serve), args=(theirs, env_id, dict(env_args or {}), allowed_modules(), _parent()), daemon=True
         )
         self._process.start()
-        # Or a pipe whose process has ended would not seem to be closed.
+        # Otherwise the pipe would stay open here after the process has ended.
         theirs.close()
 
     @property
     def pid(self) -> int | None:
-        """Of the process."""
+        """The id of the process."""
         return self._process.pid
 
     def send(self, method: str, *args: Any) -> None:
-        """See `Host.send`."""
+        """Ask the process to call a method of `SubEnvs`."""
         try:
             self._connection.send((method, args))
         except OSError as error:
             raise self._died() from error
 
     def receive(self) -> Any:
-        """See `Host.receive`."""
+        """Wait for the result of the last call and return it, or raise its error."""
         try:
             answer = self._connection.recv()
         except (EOFError, OSError) as error:
@@ -63,7 +63,7 @@ class ProcessHost:
         return answer
 
     def close(self) -> None:
-        """See `Host.close`; a process that does not end is killed."""
+        """Close all sub-environments and end the process; one that does not end is killed."""
         with contextlib.suppress(OSError):
             self._connection.send(None)
         self._process.join(_PATIENCE_S)
@@ -81,22 +81,22 @@ class ProcessHost:
                 how = f"was killed by {signal.Signals(-code).name}"
         return HostDiedError(
             f"A process that stepped environments of {self._env_id} {how}.",
-            "Look for what the env says in its log, and at this machine's memory.",
+            "Look for errors of the env in the trial's log, and check this machine's free memory.",
         )
 
 
 def _parent() -> tuple[int, bool]:
-    """This process, and whether this thread lives as long as it does."""
+    """Return this process's id, and whether this thread is the main one, which lives as long as the process."""
     return os.getpid(), threading.current_thread() is threading.main_thread()
 
 
 def serve(
     connection: Connection, env_id: str, env_args: dict[str, Any], modules: tuple[str, ...], parent: tuple[int, bool]
 ) -> None:
-    """Answer a `ProcessHost` until it closes, or its process ends: then this one ends too, even inside a step."""
+    """Answer a `ProcessHost` until it closes; if its process ends, this one ends too, even inside a step."""
     pid, by_kernel = parent
     end_with_parent(parent=pid, by_kernel=by_kernel)
-    # Ctrl-C in a terminal reaches this process too; when it ends is the other's to say.
+    # Ctrl-C in a terminal reaches this process too, but the parent decides when it ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     note_signals()
     allow_modules(modules)
@@ -119,7 +119,7 @@ def serve(
 
 
 def _note_causes(answer: Any) -> None:
-    """Write the causes of the errors in an answer into notes: pickled, an exception has no other any more."""
+    """Add the causes of the errors in an answer as notes, because pickling an exception loses its causes."""
     errors = [answer] if isinstance(answer, EnvError) else getattr(answer, "errors", {}).values()
     for error in errors:
         if error.__cause__ is not None:

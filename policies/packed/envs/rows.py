@@ -1,4 +1,4 @@
-"""Which rows belong to which member of a pack."""
+"""Keep track of which rows belong to which member of a pack."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Rows = NDArray[np.intp]
 class MemberRows:
     """The members in the order of their rows, each with the same number of rows.
 
-    What changes the order returns the old rows in their new order: `array[rows]` is the array after it.
+    Methods that change the order return the old rows in their new order: `array[rows]` is an array in the new order.
 
     Args:
         num_envs: Rows of each member.
@@ -28,21 +28,21 @@ class MemberRows:
         return len(self.ids) * self.num_envs
 
     def of(self, member_id: str) -> slice:
-        """A member's rows."""
+        """Return a member's rows."""
         first = self.ids.index(member_id) * self.num_envs
         return slice(first, first + self.num_envs)
 
     def check_new(self, member_id: str) -> None:
-        """Refuse a member that is there.
+        """Refuse a member that is in the pack already.
 
         Raises:
-            ValueError: It is a member already.
+            ValueError: It is in the pack.
         """
         if member_id in self.ids:
             raise ValueError(f"{member_id!r} is a member already; the members are {', '.join(self.ids)}")
 
     def add(self, member_id: str) -> None:
-        """A further member, after all others."""
+        """Add a member after all others."""
         self.check_new(member_id)
         self.ids += (member_id,)
 

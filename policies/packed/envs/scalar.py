@@ -1,4 +1,4 @@
-"""Any environment for all members of a pack: scalar sub-environments, in this process or in others."""
+"""Step any environment for all members of a pack: scalar sub-environments, in this process or in others."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from policies.packed.envs.rows import MemberRows, Rows
 from policies.packed.envs.sub_envs import HereHost, Host, HostDiedError, SubStep
 from policies.packed.envs.vector import Step
 
-_NUM_SEEDS = 2**32  # Gymnasium takes larger ones, but many an env does not
+_NUM_SEEDS = 2**32  # Gymnasium takes larger seeds, but many environments do not
 
 
 @dataclass(eq=False)
 class _Part:
-    """A host, and which sub-environments it has, in its own order."""
+    """A host and its sub-environments, in the host's order."""
 
     host: Host
     owners: list[tuple[str, int]] = field(default_factory=list)
-    """Member, and place among the member's sub-environments."""
+    """For each sub-environment, its member and its index among the member's sub-environments."""
     rows: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    """Of each of them."""
+    """The row of each sub-environment."""
     alone_for: str | None = None
-    """The only member that it is for; None: for any."""
+    """The only member that the host is for; None: any."""
 
 
 class ScalarEnvs:
-    """`PackedEnvs` of any environment.
+    """The sub-environments of a pack that trains on any environment; implements `PackedEnvs`.
 
     Sub-environment i of a member is reset from seed + i at first, and without a seed after that. With processes, a
-    member's sub-environments are spread over them evenly. When a process dies, those that had one in it fail; if they
-    are added again, each gets a process of its own, so that one whose env kills its process takes no others with it.
+    member's sub-environments are spread over them evenly. When a process dies, the members that had one in it fail.
+    If they are added again, each gets a process of its own, so that one whose env kills its process harms no other.
 
     Args:
         env_id: Gymnasium id.
@@ -86,7 +86,7 @@ class ScalarEnvs:
         return self._members.ids
 
     def add(self, member_id: str, seed: int) -> None:
-        """See `PackedEnvs.add`."""
+        """Add a member after all others, with its sub-environments reset with its seed."""
         self._members.check_new(member_id)
         shares = self._share_out(member_id)
         parts = [part for part, _ in shares]
@@ -113,7 +113,7 @@ class ScalarEnvs:
         self._find_rows()
 
     def remove(self, member_id: str) -> None:
-        """See `PackedEnvs.remove`."""
+        """Close a member's sub-environments; the rows after it move up."""
         self._drop(member_id)
         self.observations = self.observations[self._members.remove(member_id)]
         self.errors.pop(member_id, None)
@@ -121,15 +121,15 @@ class ScalarEnvs:
         self._find_rows()
 
     def arrange(self, member_ids: Sequence[str]) -> None:
-        """See `PackedEnvs.arrange`."""
+        """Put the members into this order; their running episodes go on."""
         self.observations = self.observations[self._members.arrange(member_ids)]
         self._find_rows()
 
     def begin(self, num_steps: int) -> None:
-        """See `PackedEnvs.begin`: nothing is drawn ahead here."""
+        """Do nothing, because nothing is drawn ahead here."""
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """See `PackedEnvs.step`."""
+        """Step every row; members whose env raises an error fail."""
         to_env = self._for_env(actions)
         num = len(self._members)
         finals = self._zeros(num)
@@ -138,7 +138,7 @@ class ScalarEnvs:
         firsts: dict[int, NDArray[Any]] = {}
         failed: dict[str, EnvError] = {}
         parts = [part for part in self._parts if part.owners]
-        # As they are now: members that fail in this step take their rows with them.
+        # Copied, because members that fail in this step lose their rows.
         all_rows = [part.rows for part in parts]
         answers: list[SubStep | EnvError] = self._ask(parts, "step", [(to_env[rows],) for rows in all_rows])
         for rows, answer in zip(all_rows, answers, strict=True):
@@ -166,7 +166,7 @@ class ScalarEnvs:
         return Step(observations, finals, seen, rewards, terminated, truncated)
 
     def close(self) -> None:
-        """See `PackedEnvs.close`."""
+        """Close all sub-environments and end their processes."""
         for part in self._parts:
             part.host.close()
         self._parts = []
@@ -183,7 +183,7 @@ class ScalarEnvs:
     # -- hosts
 
     def _share_out(self, member_id: str) -> list[tuple[_Part, list[int]]]:
-        """Where a new member's sub-environments go: hosts, and the places that each gets."""
+        """Choose hosts for a new member's sub-environments, and which of them each host gets."""
         if member_id in self._suspects:
             part = _Part(self._make_host(), alone_for=member_id)
             self._parts.append(part)
@@ -208,7 +208,7 @@ class ScalarEnvs:
             part.rows = np.array(rows, dtype=np.intp)
 
     def _ask(self, parts: Sequence[_Part], method: str, args: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Call a method of several hosts; an `EnvError` in place of what one returns that raised it."""
+        """Call a method of several hosts and return their results; where a host raised an `EnvError`, the error."""
         answers: list[Any] = [None] * len(parts)
         for index, part in enumerate(parts):
             try:
@@ -221,7 +221,7 @@ class ScalarEnvs:
                     answers[index] = part.host.receive()
                 except EnvError as error:
                     answers[index] = error
-        # Only now: what follows asks hosts for more.
+        # Only after all answers, because handling a failure asks hosts again.
         for part, answer in zip(parts, answers, strict=True):
             if isinstance(answer, HostDiedError) and part in self._parts:
                 part.host.close()
@@ -232,7 +232,7 @@ class ScalarEnvs:
         return answers
 
     def _fail(self, member_ids: Collection[str], error: EnvError) -> None:
-        """Members that cannot go on: they stay until they are removed, but have no sub-environments any more."""
+        """Mark members as failed: they stay until they are removed, but have no sub-environments any more."""
         self.observations = self.observations.copy()
         for member_id in member_ids:
             self.errors.setdefault(member_id, error)

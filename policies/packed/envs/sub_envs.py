@@ -1,4 +1,4 @@
-"""Sub-environments that are stepped one after the other, and where they live: here, or in a process of their own."""
+"""Sub-environments that are stepped one after the other, in this process or in one of their own."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from policies.errors import EnvError
 
 
 class HostDiedError(EnvError):
-    """A process of sub-environments has ended."""
+    """A process that steps sub-environments has ended."""
 
 
 class Host(Protocol):
-    """Where some sub-environments live.
+    """Runs some sub-environments, in this process or in another.
 
     Calls are sent to all hosts first and received from them afterwards, so that processes work at the same time.
     """
 
     def send(self, method: str, *args: Any) -> None:
-        """Ask for a method of `SubEnvs`.
+        """Ask the host to call a method of `SubEnvs`.
 
         Raises:
             HostDiedError: The process has ended.
         """
 
     def receive(self) -> Any:
-        """What the method that was asked for last returned.
+        """Return the result of the method that was asked for last.
 
         Raises:
             HostDiedError: The process has ended.
@@ -48,16 +48,16 @@ class Host(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SubStep:
-    """What a step of a host's sub-environments gave, in the order in which they were added."""
+    """The results of a step of a host's sub-environments, in the order in which they were added."""
 
     final_observations: NDArray[Any]
     first_observations: dict[int, NDArray[Any]]
-    """Where an episode ended: the first of the next one, by place."""
+    """Where an episode ended, the next episode's first observation, by the sub-environment's index."""
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     errors: dict[str, EnvError]
-    """Members one of whose sub-environments raised; what else is here of these means nothing."""
+    """Errors of members whose sub-environments raised one; the other values of these members mean nothing."""
 
 
 @dataclass(eq=False)
@@ -65,11 +65,11 @@ class _SubEnv:
     member_id: str
     env: gym.Env[Any, Any]
     num_steps: int = 0
-    """Of its running episode."""
+    """Steps of the running episode."""
 
 
 class SubEnvs:
-    """Scalar environments, each of a member, with the wrappers that their arguments ask for.
+    """Scalar environments of several members, with the wrappers that their arguments ask for.
 
     Args:
         env_id: Gymnasium id.
@@ -87,7 +87,7 @@ class SubEnvs:
             Their first observations.
 
         Raises:
-            EnvError: One cannot be made or reset; none is there then.
+            EnvError: One cannot be made or reset; then none is added.
         """
         made: list[_SubEnv] = []
         try:
@@ -108,10 +108,10 @@ class SubEnvs:
         self._envs = [one for one in self._envs if one.member_id != member_id]
 
     def step(self, actions: NDArray[Any]) -> SubStep:
-        """Step all; where an episode ends, begin the next.
+        """Step all sub-environments; where an episode ends, begin the next.
 
         Args:
-            actions: One for each, as the env takes them.
+            actions: One action for each, as the env takes them.
         """
         num = len(self._envs)
         space = self._envs[0].env.observation_space
@@ -138,14 +138,14 @@ class SubEnvs:
         return SubStep(finals, firsts, rewards, terminated, truncated, errors)
 
     def close(self) -> None:
-        """Close all."""
+        """Close all sub-environments."""
         _close(self._envs)
         self._envs = []
 
     def _find_unsound(
         self, rewards: NDArray[np.float32], finals: NDArray[Any], lengths: Sequence[int], errors: dict[str, EnvError]
     ) -> None:
-        """The members whose rewards or observations are not finite, into `errors`."""
+        """Add the members whose rewards or observations are not finite to `errors`."""
         for place, one in enumerate(self._envs):
             if one.member_id not in errors:
                 try:
@@ -155,7 +155,7 @@ class SubEnvs:
                     errors[one.member_id] = error
 
     def _step(self, one: _SubEnv, action: Any, final: NDArray[Any]) -> tuple[float, bool, bool]:
-        """Step one; its observation goes into `final`."""
+        """Step one sub-environment; its observation goes into `final`."""
         one.num_steps += 1
         try:
             observation, reward, terminated, truncated, _ = one.env.step(action)
@@ -169,7 +169,7 @@ class SubEnvs:
         try:
             observation, _ = one.env.reset(seed=seed)
             self._check_shape(one.env, observation)
-            # A copy: some envs return the array that they go on writing to.
+            # A copy, because some envs return an array that they change later.
             first = np.array(observation, dtype=observation_dtype(one.env.observation_space))
         except BaseException as error:  # an env may raise anything
             raise self._failed("reset", error) from error
@@ -188,23 +188,23 @@ class SubEnvs:
 
 
 class HereHost:
-    """Sub-environments in this very process."""
+    """Steps sub-environments in this process."""
 
     def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
         self._sub_envs = SubEnvs(env_id, env_args)
         self._asked: tuple[str, tuple[Any, ...]] = ("close", ())
 
     def send(self, method: str, *args: Any) -> None:
-        """See `Host.send`."""
+        """Remember the method and its arguments, for `receive`."""
         self._asked = method, args
 
     def receive(self) -> Any:
-        """See `Host.receive`."""
+        """Call the method that was asked for last, and return its result."""
         method, args = self._asked
         return getattr(self._sub_envs, method)(*args)
 
     def close(self) -> None:
-        """See `Host.close`."""
+        """Close all sub-environments."""
         self._sub_envs.close()
 
 

@@ -15,16 +15,16 @@ EnvKind = Literal["vectorised", "scalar", "processes"]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a step gave; arrays over all rows, which no later step changes."""
+    """The results of a step: arrays over all rows, which no later step changes."""
 
     observations: NDArray[Any]
-    """After the step; where an episode ended, the first of the next one. Shape (M * N, ...)."""
+    """Observations after the step, shape (M * N, ...); where an episode ended, the first one of the next episode."""
     final_observations: NDArray[Any]
-    """As the step left them, before any reset; the same array object if no episode ended."""
+    """Observations after the step, before any reset; the same array object if no episode ended."""
     rewards: NDArray[np.float32]
-    """What the learner sees: with the failure penalty, if there is one."""
+    """The rewards that the learner gets, with the failure penalty if there is one."""
     own_rewards: NDArray[np.float32]
-    """The env's own, of which returns are made; the same array object if there is no penalty."""
+    """The env's own rewards, which returns are the sums of; the same array object if there is no penalty."""
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
 
@@ -34,33 +34,33 @@ class PackedEnvs(Protocol):
 
     @property
     def num_envs(self) -> int:
-        """Sub-environments of each member: N."""
+        """The number of sub-environments of each member: N."""
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """Of one sub-environment."""
+        """The observation space of one sub-environment."""
 
     @property
     def action_space(self) -> gym.Space[Any]:
-        """Of one sub-environment."""
+        """The action space of one sub-environment."""
 
     @property
     def member_ids(self) -> tuple[str, ...]:
-        """In the order of their rows."""
+        """The members in the order of their rows."""
 
     @property
     def observations(self) -> NDArray[Any]:
-        """Those that the next actions answer, shape (M * N, ...): float32, or uint8 where images are."""
+        """The observations that the next actions answer, shape (M * N, ...): float32, or uint8 for images."""
 
     @property
     def errors(self) -> dict[str, Exception]:
-        """Members whose env raised, by id: the `EnvError`. Their rows are zeros from that step on."""
+        """The errors of members whose env raised one, by member id. Their rows are zeros from that step on."""
 
     def add(self, member_id: str, seed: int) -> None:
-        """A further member, after all others, its sub-environments reset from its seed.
+        """Add a member after all others, with its sub-environments reset with its seed.
 
         Raises:
-            EnvError: Its environments cannot be made or reset; it is no member then.
+            EnvError: Its environments cannot be made or reset; then it is not added.
         """
 
     def remove(self, member_id: str) -> None:
@@ -70,15 +70,15 @@ class PackedEnvs(Protocol):
         """Put the members into this order; their running episodes go on."""
 
     def begin(self, num_steps: int) -> None:
-        """Say that so many steps come next, so that start states can be drawn ahead of them."""
+        """Announce that `num_steps` steps come next, so that start states can be drawn ahead."""
 
     def step(self, actions: NDArray[Any]) -> Step:
         """Step every row.
 
         Args:
-            actions: Of shape (M * N,), whole numbers from 0 (the start of a Discrete space is added here), or
+            actions: Shape (M * N,), whole numbers from 0 (the start of a Discrete space is added here), or shape
                 (M * N, action_dim), within the bounds of the Box space.
         """
 
     def close(self) -> None:
-        """Close all environments; nothing after it."""
+        """Close all environments; no method may be called afterwards."""

@@ -1,1 +1,1 @@
-"""PPO of many members at once."""
+"""Train PPO for many members at once."""

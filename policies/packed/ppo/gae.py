@@ -1,4 +1,4 @@
-"""Generalised advantage estimation of many members at once.
+"""Generalised advantage estimation for many members at once.
 
 Source: Schulman et al. 2016, "High-dimensional continuous control using generalised advantage estimation", equation 16.
 
@@ -23,20 +23,20 @@ def advantages_and_targets(
     gamma: Floats,
     gae_lambda: Floats,
 ) -> tuple[Floats, Floats]:
-    """Advantages, not standardised, and value targets.
+    """Compute advantages, not standardised, and value targets.
 
     Args:
-        rewards: (T, S).
+        rewards: The rewards, (T, S).
         values: V of the observation that was acted on, (T, S).
-        next_values: V of what the step led to before any reset, (T, S): bootstrapped where an episode is cut off, by
-            its time limit or by the end of the fragment; what stands at terminated steps does not count.
-        terminated: (T, S).
-        ended: Terminated or truncated, (T, S): no advantage flows back over it.
-        gamma: Discount, (S,).
-        gae_lambda: (S,).
+        next_values: V of the observation after the step, before any reset, (T, S). It is bootstrapped from where an
+            episode is cut off by its time limit or by the end of the fragment; values at terminated steps are ignored.
+        terminated: Whether the step terminated its episode, (T, S).
+        ended: Whether the step terminated or truncated its episode, (T, S); no advantage flows back over the end.
+        gamma: Discount factors, (S,).
+        gae_lambda: Lambdas of the estimation, (S,).
 
     Returns:
-        Advantages and value targets, (T, S) each.
+        Advantages and value targets, each of shape (T, S).
     """
     residuals = rewards + np.where(terminated, np.float32(0.0), gamma * next_values) - values
     decay = np.where(ended, np.float32(0.0), gamma * gae_lambda)
@@ -49,7 +49,7 @@ def advantages_and_targets(
 
 
 def standardise(advantages: Floats) -> Floats:
-    """Each row to mean 0 and standard deviation 1, as RLlib does (a deviation below 1e-4 counts as that); (M, R)."""
+    """Scale each row, (M, R), to mean 0 and standard deviation 1, as RLlib does: a deviation is at least 1e-4."""
     mean = advantages.mean(axis=1, keepdims=True)
     std = advantages.std(axis=1, keepdims=True)
     out: Floats = ((advantages - mean) / np.maximum(std, np.float32(1e-4))).astype(np.float32)

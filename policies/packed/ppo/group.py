@@ -1,6 +1,6 @@
 """Members of a pack whose PPO networks are computed together: acting, values, and the updates of an iteration.
 
-Shapes: M members, T vector steps, N sub-environments a member, R = T * N rows, D numbers an observation, A outputs.
+Shapes: M members, T vector steps, N sub-environments per member, R = T * N rows, D numbers per observation, A outputs.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from policies.packed.rows import StackedRows
 from policies.packed.shared import SharedByPPO
 from policies.schedules import linear
 
-_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8  # RLlib leaves torch's defaults
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-8  # torch's defaults, which RLlib uses
 
 Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What an iteration's updates learn from, member by member."""
+    """The data that an iteration's updates learn from, member by member."""
 
     observations: Floats
-    """As the networks saw them, (M, R, D)."""
+    """Prepared observations, (M, R, D)."""
     actions: Floats
-    """One-hot, or as the policy drew them, (M, R, actions)."""
+    """Actions, one-hot or as the policy drew them, (M, R, actions)."""
     outputs: Floats
-    """Of the policy, (M, R, A)."""
+    """The policy's outputs, (M, R, A)."""
     advantages: Floats
-    """Standardised, (M, R)."""
+    """Standardised advantages, (M, R)."""
     value_targets: Floats
-    """(M, R)."""
+    """Value targets, (M, R)."""
 
 
 class PPOGroup:
@@ -49,9 +49,9 @@ class PPOGroup:
 
     Args:
         members: The members.
-        shared: What they have in common.
-        num_inputs: Numbers of an observation.
-        num_outputs: Of the policy's head.
+        shared: The hyperparameters that the members share.
+        num_inputs: Numbers per observation.
+        num_outputs: The number of outputs of the policy's head.
         is_gaussian: Whether actions are continuous.
         device: Where the updates are computed; acting is on the CPU.
     """
@@ -97,19 +97,19 @@ class PPOGroup:
         return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=torch.float32)
 
     def act(self, observations: Floats) -> Floats:
-        """The policy's outputs, (M, N, A), of observations as the networks see them, (M, N, D)."""
+        """Return the policy's outputs, (M, N, A), for prepared observations, (M, N, D)."""
         outputs = self._acting(observations)
         return outputs[..., : self._num_outputs] if self._shares else outputs
 
     def values(self, observations: Tensor) -> Tensor:
-        """V, (M, B), of observations with a last column of ones, (M, B, D + 1)."""
+        """Return the values V, (M, B), of observations with a last column of ones, (M, B, D + 1)."""
         num_members = len(self.members)
         if self._shares:
             return self._networks.forward(observations)[..., -1]
         return self._networks.evaluate(observations, num_members, 2 * num_members)[..., 0]
 
     def learn(self, batch: Batch) -> None:
-        """Make the updates of one iteration; on a GPU, only ask for them. `finish` comes next."""
+        """Make the updates of one iteration, or on a GPU start them; `finish` has to be called next."""
         shared = self._shared
         num_rows = batch.advantages.shape[1]
         num_updates = math.ceil(num_rows * shared.num_epochs / shared.minibatch_size)
@@ -133,13 +133,13 @@ class PPOGroup:
         """Wait for the updates of `learn`, and act with the new weights from now on.
 
         Returns:
-            For each member, numbers of the last update.
+            For each member, the metrics of the last update.
         """
         self._acting.refresh()
         return self._stats(*self._unfinished)
 
     def _columns(self, batch: Batch) -> Tensor:
-        """All that a minibatch needs side by side, so that one gather brings it; (M * R, columns)."""
+        """Put all that a minibatch needs side by side, (M * R, columns), so that one gather copies it."""
         observations = batch.observations
         num_members, num_rows, num_inputs = observations.shape
         num_actions, num_outputs = batch.actions.shape[2], self._num_outputs
@@ -159,7 +159,7 @@ class PPOGroup:
         return torch.from_numpy(columns).view(num_members * num_rows, -1).to(self._device)
 
     def _draw_rows(self, num_rows: int, num_drawn: int) -> NDArray[np.int64]:
-        """Rows of each update: pass after pass over the batch, each in a new order; into the flattened batch."""
+        """Draw the rows of each update as indices into the flattened batch: pass after pass, each in a new order."""
         num_passes = math.ceil(num_drawn / num_rows)
         drawn = np.empty((len(self.members), num_drawn), dtype=np.int64)
         ordered = np.tile(np.arange(num_rows), (num_passes, 1))
@@ -169,7 +169,7 @@ class PPOGroup:
         return drawn
 
     def _forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Policy outputs, (M, B, A), and values, (M, B)."""
+        """Return the policy's outputs, (M, B, A), and the values, (M, B)."""
         observations = rows[..., : self._bounds[0]]
         if self._shares:
             outputs = self._networks.forward(observations)
@@ -189,7 +189,7 @@ class PPOGroup:
         )
 
     def _update(self, outputs: Tensor, values: Tensor, minibatch: ppo.Minibatch) -> Tensor | None:
-        """One gradient step; the gradients' norms, (M, 1), if any are clipped."""
+        """Make one gradient step and return the gradients' norms, (M, 1), if any are clipped."""
         policy_gradient, value_gradient = ppo.gradients(
             outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian
         )
@@ -206,7 +206,7 @@ class PPOGroup:
         return norms
 
     def _move_schedules(self) -> None:
-        """Learning rates and entropy weights at the env steps so far, this iteration's among them."""
+        """Set learning rates and entropy weights for the env steps so far, including this iteration's."""
         lr, entropy = [], []
         for member, item in zip(self.members, self._hyperparams, strict=True):
             now = member.num_env_steps
@@ -238,12 +238,12 @@ class PPOGroup:
         return stats
 
     def write_back(self) -> None:
-        """Give the members their weights and moments as they are now."""
+        """Copy the present weights and moments back to the members."""
         self._rows.write_back(self._optimizer)
 
 
 def _next_kl_coeff(now: float, kl: float, target: float) -> float:
-    """RLlib's rule: half as much again above twice the target, half below half of it."""
+    """Return the next weight by RLlib's rule: times 1.5 above twice the target, times 0.5 below half of it."""
     if kl > 2.0 * target:
         return now * 1.5
     return now * 0.5 if kl < 0.5 * target else now

@@ -1,9 +1,9 @@
-"""PPO's update of many members at once: RLlib's loss, with each member's own coefficients.
+"""Compute PPO's loss and gradients for many members at once: RLlib's loss, with each member's own coefficients.
 
 Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equations 7 and 9, and RLlib's
 `PPOTorchLearner.compute_loss_for_module` (2.60), which clips the squared value error and adds an adaptive KL penalty.
 
-Shapes: M members, B rows of a minibatch a member, A actions (or components of one).
+Shapes: M members, B rows of a minibatch per member, A actions (or components of an action).
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LOG_STD_CLIP = 20.0  # RLlib's own, as in policies.networks.rl_modules
+LOG_STD_CLIP = 20.0  # RLlib's value, as in policies.networks.rl_modules
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
 @dataclass(eq=False)
 class Coefficients:
-    """What weighs the parts of the loss, (M, 1) each."""
+    """The coefficients of the parts of the loss, (M, 1) each."""
 
     clip_param: Tensor
     vf_clip_param: Tensor
-    """Infinity: no clipping."""
+    """The limit of the squared value error; infinity: no clipping."""
     vf_loss_coeff: Tensor
     entropy_coeff: Tensor
     kl_coeff: Tensor
@@ -32,23 +32,23 @@ class Coefficients:
 
 @dataclass(eq=False)
 class Minibatch:
-    """Rows to learn from."""
+    """The rows of one update."""
 
     actions: Tensor
-    """Discrete: one-hot, (M, B, A). Continuous: as the policy drew them, (M, B, A)."""
+    """Discrete actions one-hot, continuous ones as the policy drew them, (M, B, A)."""
     logp: Tensor
     """Log probability of the action when it was drawn, (M, B)."""
     advantages: Tensor
-    """(M, B)."""
+    """Standardised advantages, (M, B)."""
     value_targets: Tensor
-    """(M, B)."""
+    """Value targets, (M, B)."""
     old_outputs: Tensor | None = None
     """The policy's outputs when the action was drawn, (M, B, outputs); None: no KL penalty."""
 
 
 @dataclass(eq=False)
 class Parts:
-    """Means over the minibatch, (M,) each."""
+    """The loss and its parts as means over the minibatch, (M,) each."""
 
     total_loss: Tensor
     policy_loss: Tensor
@@ -60,21 +60,21 @@ class Parts:
 def gradients(
     outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, is_gaussian: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of each member's loss with respect to policy outputs and values.
+    """Return the gradients of each member's loss with respect to policy outputs and values.
 
     Args:
-        outputs: Of the policy, (M, B, A) logits or (M, B, 2A) means and log standard deviations.
-        values: (M, B).
+        outputs: The policy's outputs, (M, B, A) logits or (M, B, 2A) means and log standard deviations.
+        values: The value function's outputs, (M, B).
         batch: The rows.
-        coefficients: Of the members.
+        coefficients: The members' coefficients.
         is_gaussian: Whether the actions are continuous.
 
     Returns:
-        Of the shapes of `outputs` and `values`.
+        Two tensors with the shapes of `outputs` and `values`.
     """
     if is_gaussian:
         return _by_autograd(outputs, values, batch, coefficients)
-    # By hand: a graph of these small tensors would cost more than the networks.
+    # Written out, because torch's graph of these small tensors would cost more than the networks.
     num_rows = outputs.shape[1]
     logp_all = torch.log_softmax(outputs, dim=-1)
     probabilities = logp_all.exp()
@@ -82,7 +82,7 @@ def gradients(
     ratio = (logp - batch.logp).exp_()
     surrogate = batch.advantages * ratio
     limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param).mul_(batch.advantages)
-    # The minimum passes a gradient where the ratio itself is the smaller one, or both are equal; and what is no number.
+    # The minimum passes the gradient where the ratio itself is smaller, where both are equal, and where it is NaN.
     weight = torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / num_rows)
     out = (probabilities - batch.actions).mul_(weight.unsqueeze(-1))
     if bool(coefficients.entropy_coeff.any()):
@@ -114,7 +114,7 @@ def _by_autograd(
 
 
 def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, is_gaussian: bool) -> Parts:
-    """Each member's loss and its parts, as RLlib computes them; arguments as `gradients`."""
+    """Return each member's loss and its parts, as RLlib computes them; the arguments are those of `gradients`."""
     logp, entropy = _logp_and_entropy(outputs, batch.actions, is_gaussian=is_gaussian)
     ratio = torch.exp(logp - batch.logp)
     limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param)
@@ -129,7 +129,7 @@ def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coeffi
 
 
 def _logp_and_entropy(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) -> tuple[Tensor, Tensor]:
-    """Log probability of the actions and entropy of the policy, (M, B) each."""
+    """Return the log probability of the actions and the entropy of the policy, (M, B) each."""
     if not is_gaussian:
         logp_all = torch.log_softmax(outputs, dim=-1)
         return (logp_all * actions).sum(dim=-1), -(logp_all.exp() * logp_all).sum(dim=-1)
@@ -139,12 +139,12 @@ def _logp_and_entropy(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) ->
 
 
 def log_probabilities(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) -> Tensor:
-    """Log probability of the actions, (M, B); arguments as `gradients`."""
+    """Return the log probability of the actions, (M, B); the arguments are those of `gradients`."""
     return _logp_and_entropy(outputs, actions, is_gaussian=is_gaussian)[0]
 
 
 def _kl(old: Tensor, new: Tensor, *, is_gaussian: bool) -> Tensor:
-    """KL divergence of the policy now from the one that drew the actions, (M, B)."""
+    """Return the KL divergence of the present policy from the one that drew the actions, (M, B)."""
     if not is_gaussian:
         old_logp = torch.log_softmax(old, dim=-1)
         return (old_logp.exp() * (old_logp - torch.log_softmax(new, dim=-1))).sum(dim=-1)

@@ -1,6 +1,6 @@
-"""PPO of the members of a pack that share a tensor program: one vector of environments, one batched update.
+"""Train PPO for the members of a pack that share a tensor program: one vector of environments, one batched update.
 
-Shapes: M members, T vector steps, N sub-environments a member, S = M * N rows, R = T * N, D numbers an observation,
+Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, R = T * N, D numbers per observation,
 A outputs of the policy.
 """
 
@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from policies.envs.action_bounds import ToBounds
 from policies.hyperparams import PPOHyperparams
@@ -32,24 +33,24 @@ Floats = NDArray[np.float32]
 
 
 class Fragment:
-    """What T vector steps gave; columns of shape (T, S, ...)."""
+    """The results of T vector steps, as columns of shape (T, S, ...)."""
 
     def __init__(self, num_steps: int, num_rows: int, num_inputs: int, num_outputs: int) -> None:
         shape = (num_steps, num_rows)
         self.observations = np.empty((*shape, num_inputs), dtype=np.float32)
         self.outputs = np.empty((*shape, num_outputs), dtype=np.float32)
         self.actions: NDArray[Any] = np.empty(0)
-        """(T, S) of whole numbers, or (T, S, num_actions) as the policy drew them."""
+        """Whole numbers, (T, S), or continuous actions as the policy drew them, (T, S, num_actions)."""
         self.rewards, self.own_rewards = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         self.terminated, self.ended = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
         self.cuts: list[tuple[int, int, Floats]] = []
-        """(step, row, observation) at the end of each truncated episode."""
+        """The step, the row and the last observation of each truncated episode."""
         self.last: Floats = np.empty((num_rows, num_inputs), dtype=np.float32)
         """The observations that the next actions answer."""
 
 
 class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
-    """See `Stack`."""
+    """Trains the PPO members of a pack together; see `Stack`."""
 
     def __init__(self, shared: SharedByPPO, envs: PackedEnvs, device: str = "cpu") -> None:
         super().__init__(shared, envs, device)
@@ -84,7 +85,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         self._stale = False
 
     def begin_iteration(self) -> None:
-        """See `Stack.begin_iteration`: sample a batch of each member and ask for the updates."""
+        """Sample a batch for each member and start the updates."""
         if self._stale:
             self._regroup()
         self._is_written = False
@@ -106,8 +107,8 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         self._observations.learn(fragment.observations)
         self._ended = episodes
 
+    @override
     def finish_iteration(self) -> dict[str, MemberStats]:
-        """See `Stack.finish_iteration`."""
         with self._on_own_stream():
             stats = [found for group in self._groups for found in group.finish()]
         return {
@@ -116,7 +117,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         }
 
     def _on_own_stream(self) -> AbstractContextManager[Any]:
-        """Where a GPU works on other stacks too, each waits for its own work alone."""
+        """Use this stack's own CUDA stream, so that a GPU shared with other stacks is waited for only for own work."""
         return contextlib.nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
 
     def _sample(self, num_steps: int) -> Fragment:
@@ -146,7 +147,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         return fragment
 
     def _draw_noise(self, num_steps: int) -> Floats:
-        """What the actions of so many steps are drawn with: Gumbel or normal numbers, (T, S, actions)."""
+        """Draw the random numbers for the actions of T steps: Gumbel or normal numbers, (T, S, actions)."""
         num_envs = self.envs.num_envs
         shape = (num_steps, num_envs, self._num_actions)
         parts = []
@@ -161,7 +162,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             np.maximum(noise, np.finfo(np.float32).tiny, out=noise)
             np.negative(np.log(noise, out=noise), out=noise)
             if self._num_actions == 2:
-                # Then only the difference counts.
+                # With two actions only the difference counts.
                 noise = noise[..., 0] - noise[..., 1]
         return noise
 
@@ -177,17 +178,17 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
     def _to_env(self, actions: NDArray[Any]) -> NDArray[Any]:
         if not self._is_gaussian:
             return actions
-        # A member whose weights are not finite fails at its next evaluation, and no env should be given what it draws.
+        # A member whose weights are not finite fails at its next evaluation; until then no env may get its NaN actions.
         return self._to_bounds(np.nan_to_num(actions))
 
     def _batch(self, group: PPOGroup, fragment: Fragment, start: int, stop: int) -> Batch:
-        """The rows of a group's members, start to stop of the stack, with advantages and value targets."""
+        """Return the rows of a group's members, `start` to `stop` of the stack, with advantages and value targets."""
         num_envs = self.envs.num_envs
         rows = slice(start * num_envs, stop * num_envs)
         num_members, num_steps = stop - start, len(fragment.rewards)
 
         def by_member(values: NDArray[Any]) -> NDArray[Any]:
-            """(T, m * N, ...) -> (m, T * N, ...)."""
+            """Reshape (T, m * N, ...) to (m, T * N, ...)."""
             shape = (num_steps, num_members, num_envs, *values.shape[2:])
             moved = values.reshape(shape).swapaxes(0, 1)
             return moved.reshape(num_members, num_steps * num_envs, *values.shape[2:])
@@ -220,7 +221,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
     def _values(
         self, group: PPOGroup, fragment: Fragment, seen: Floats, start: int, stop: int
     ) -> tuple[Floats, Floats]:
-        """V of what was acted on and of what each step led to, (T, m * N)."""
+        """Return V of the observations that were acted on and of those that each step led to, (T, m * N)."""
         num_envs = self.envs.num_envs
         num_members, num_steps = stop - start, len(fragment.rewards)
         observations = self._observations.part(start, stop)
@@ -232,7 +233,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         next_values = np.array(values[1:])
         cuts = [(step, row - rows.start, final) for step, row, final in fragment.cuts if rows.start <= row < rows.stop]
         if cuts:
-            # As many rows a member as the one with most has; what is not filled is not read.
+            # Each member gets as many rows as the member with the most; rows that are not filled are not read.
             places = [row // num_envs for _, row, _ in cuts]
             slots = [places[:number].count(place) for number, place in enumerate(places)]
             finals = np.zeros((num_members, max(slots) + 1, fragment.last.shape[1]), dtype=np.float32)
