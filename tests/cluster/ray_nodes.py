@@ -11,8 +11,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 BIN = Path(sys.executable).parent
 START_TIMEOUT_S = 180
@@ -24,10 +26,10 @@ OBJECT_STORE_BYTES = 100_000_000
 def free_port() -> int:
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
+        return int(sock.getsockname()[1])
 
 
-def kill_group(process: subprocess.Popen) -> None:
+def kill_group(process: subprocess.Popen[Any]) -> None:
     """End a child, which leads a process group of its own, and its children, at once."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
@@ -47,7 +49,7 @@ def processes_naming(text: str) -> list[int]:
 @dataclass
 class Node:
     name: str
-    process: subprocess.Popen
+    process: subprocess.Popen[bytes]
     log: Path
 
     def wait_until_started(self) -> None:
@@ -56,6 +58,17 @@ class Node:
             assert self.process.poll() is None, f"node {self.name} ended:\n{self.log.read_text()}"
             assert time.monotonic() < deadline, f"node {self.name} did not start:\n{self.log.read_text()}"
             time.sleep(0.1)
+
+    @property
+    def node_id(self) -> str:
+        """Ray's id of it, which its raylet, a child of `ray start`, was started with."""
+        for listing in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
+            for child in listing.read_text().split():
+                words = Path(f"/proc/{child}/cmdline").read_text().split("\0")
+                found = [word.partition("=")[2] for word in words if word.startswith("--node_id=")]
+                if found:
+                    return found[0]
+        raise AssertionError(f"node {self.name} has no raylet:\n{self.log.read_text()}")
 
     def stop(self) -> None:
         """As `ray stop` would: the node takes its leave of the cluster."""
@@ -108,11 +121,15 @@ class Cluster:
         ]  # fmt: skip
         return self._start("head", options, 1, (), {})
 
-    def start_worker(self, name: str, *, num_cpus: int = 1, prefix=(), environment=None) -> Node:
+    def start_worker(
+        self, name: str, *, num_cpus: int = 1, prefix: Sequence[str] = (), environment: dict[str, str] | None = None
+    ) -> Node:
         """Start a node; `prefix` is a command that runs the rest of its arguments."""
         return self._start(name, [f"--address={self.address}"], num_cpus, prefix, environment or {})
 
-    def _start(self, name, options, num_cpus, prefix, environment) -> Node:
+    def _start(
+        self, name: str, options: Sequence[str], num_cpus: int, prefix: Sequence[str], environment: dict[str, str]
+    ) -> Node:
         log = self.folder / f"{name}.log"
         command = [
             *prefix, str(BIN / "ray"), "start", *options, f"--num-cpus={num_cpus}", "--num-gpus=0",
@@ -128,19 +145,9 @@ class Cluster:
         node.wait_until_started()
         return node
 
-    def node_ids(self) -> dict[str, str]:
-        """The id of each node that is alive, by name."""
-        script = (
-            "import json, sys, ray\n"
-            "ray.init(address=sys.argv[1], log_to_driver=False, logging_level='error')\n"
-            "print(json.dumps([[n['NodeID'], list(n['Resources'])] for n in ray.nodes() if n['Alive']]))\n"
-        )
-        done = self.run([sys.executable, "-c", script, self.address])
-        assert done.returncode == 0, done.stderr
-        found = json.loads(done.stdout.splitlines()[-1])
-        return {name: node_id for node_id, resources in found for name in self.nodes if name in resources}
-
-    def run(self, command, *, timeout_s: float = 400, **environment) -> subprocess.CompletedProcess:
+    def run(
+        self, command: Sequence[str | Path], *, timeout_s: float = 400, **environment: str
+    ) -> subprocess.CompletedProcess[str]:
         process = self.begin(command, **environment)
         try:
             out, err = process.communicate(timeout=timeout_s)
@@ -148,7 +155,7 @@ class Cluster:
             kill_group(process)
         return subprocess.CompletedProcess(command, process.returncode, out, err)
 
-    def begin(self, command, **environment) -> subprocess.Popen:
+    def begin(self, command: Sequence[str | Path], **environment: str) -> subprocess.Popen[str]:
         """Start a command with the cluster's environment, in a folder that holds none of our code."""
         return subprocess.Popen(
             [str(part) for part in command], env={**self.environment, **environment}, cwd=self.folder,

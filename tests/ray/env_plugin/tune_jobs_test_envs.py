@@ -6,16 +6,19 @@ They are in a folder of their own, so that worker processes can import them from
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 # The block of seeds that belongs to one trial: those of its sub-environments.
 SEEDS_PER_TRIAL = 1024
 
 
-class Ticks(gym.Env):
+class Ticks(gym.Env[NDArray[np.float32], np.int64]):
     """The observation counts the steps of the episode; every number in it tells where it came from.
 
     An episode is terminated after `end` steps if it is given, and truncated by the time limit of its registration.
@@ -24,30 +27,32 @@ class Ticks(gym.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, *, end=None, start=5):
+    def __init__(self, *, end: int | None = None, start: int = 5) -> None:
         self.end = end
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.action_space = gym.spaces.Discrete(3, start=start)
         self.episode, self.ticks, self.stream = 0, 0, 0.0
 
-    def _observation(self):
+    def _observation(self) -> NDArray[np.float32]:
         return np.array([self.ticks, self.episode, self.stream], np.float32)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None:
             self.stream = float(self.np_random.normal())
         self.episode, self.ticks = self.episode + 1, 0
         return self._observation(), {}
 
-    def step(self, action):
+    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         assert self.action_space.contains(action), action
         self.ticks += 1
         ended = self.end is not None and self.ticks >= self.end + self.episode % 3
         return self._observation(), self.ticks + self.episode / 1000, ended, False, {"ticks": self.ticks}
 
 
-class Trouble(gym.Env):
+class Trouble(gym.Env[NDArray[np.float32], np.int64]):
     """A question a step (is the first number positive?), ten steps an episode; in some trials its step goes wrong.
 
     Args:
@@ -56,19 +61,28 @@ class Trouble(gym.Env):
             environment's life, over all its episodes) and `marker` (a file that is made when it happens; where it is
             there already, all is well).
         pause_s: Seconds that every step takes, in any trial.
+        pause_while: A file: steps take them only while it is there; None: always.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, *, troubles=None, pause_s=0.0):
+    def __init__(
+        self,
+        *,
+        troubles: dict[str, dict[str, Any]] | None = None,
+        pause_s: float = 0.0,
+        pause_while: str | None = None,
+    ) -> None:
         self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
         self.action_space = gym.spaces.Discrete(2)
-        self.troubles, self.pause_s = troubles or {}, pause_s
-        self.trouble = None
+        self.troubles, self.pause_s, self.pause_while = troubles or {}, pause_s, pause_while
+        self.trouble: dict[str, Any] | None = None
         self.life, self.ticks = 0, 0
         self.state = np.zeros(2, np.float32)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None:
             self.trouble = self.troubles.get(str(seed - seed % SEEDS_PER_TRIAL))
@@ -76,20 +90,20 @@ class Trouble(gym.Env):
         self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
         return self.state, {}
 
-    def step(self, action):
+    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         self.life += 1
         self.ticks += 1
         reward = None
         if self.trouble is not None and self.life >= self.trouble.get("at", 1):
             reward = self._go_wrong(**self.trouble)
-        if self.pause_s:
+        if self.pause_s and (self.pause_while is None or Path(self.pause_while).exists()):
             time.sleep(self.pause_s)
         if reward is None:
             reward = float(action == (self.state[0] > 0))
         self.state = self.np_random.uniform(-1, 1, 2).astype(np.float32)
         return self.state, reward, self.ticks >= 10, False, {}
 
-    def _go_wrong(self, how, at=1, marker=None):
+    def _go_wrong(self, how: str, at: int = 1, marker: str | None = None) -> float | None:
         if marker is not None:
             if Path(marker).exists():
                 return None
@@ -107,7 +121,7 @@ class Trouble(gym.Env):
         raise TimeoutError("nothing ended the process")
 
 
-class Shades(gym.Env):
+class Shades(gym.Env[NDArray[Any], Any]):
     """Images of noise, higher than they are wide; the right action tells in which half the noise is brighter.
 
     Args:
@@ -118,7 +132,9 @@ class Shades(gym.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, *, as_bytes=True, shape=(12, 9, 2), num_pushes=None):
+    def __init__(
+        self, *, as_bytes: bool = True, shape: Sequence[int] = (12, 9, 2), num_pushes: int | None = None
+    ) -> None:
         kind = (0, 255, np.uint8) if as_bytes else (0.0, 1.0, np.float32)
         self.observation_space = gym.spaces.Box(kind[0], kind[1], tuple(shape), kind[2])
         self.action_space = (
@@ -126,7 +142,7 @@ class Shades(gym.Env):
         )
         self.right, self.ticks = 0, 0
 
-    def _observation(self):
+    def _observation(self) -> NDArray[Any]:
         self.right = int(self.np_random.integers(2))
         image = self.np_random.uniform(0.0, 0.5, self.observation_space.shape)
         half = image.shape[0] // 2
@@ -135,18 +151,20 @@ class Shades(gym.Env):
             image *= 255
         return image.astype(self.observation_space.dtype)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
         super().reset(seed=seed)
         self.ticks = 0
         return self._observation(), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         self.ticks += 1
         reward = float(isinstance(self.action_space, gym.spaces.Discrete) and action == self.right)
         return self._observation(), reward, self.ticks >= 10, False, {}
 
 
-class Precise(gym.Env):
+class Precise(gym.Env[NDArray[Any], Any]):
     """A random walk of any precision, ten steps an episode, that takes the actions of its space alone.
 
     Args:
@@ -157,7 +175,13 @@ class Precise(gym.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, *, dtype="float64", shape=(3,), bounds=None):
+    def __init__(
+        self,
+        *,
+        dtype: str = "float64",
+        shape: Sequence[int] = (3,),
+        bounds: Sequence[Sequence[float | None]] | None = None,
+    ) -> None:
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, tuple(shape), np.dtype(dtype).type)
         self.action_space = gym.spaces.Discrete(2)
         if bounds is not None:
@@ -168,21 +192,23 @@ class Precise(gym.Env):
             self.action_space = gym.spaces.Box(low, high)
         self.ticks = 0
 
-    def _observation(self):
+    def _observation(self) -> NDArray[Any]:
         return self.np_random.normal(size=self.observation_space.shape).astype(self.observation_space.dtype)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
         super().reset(seed=seed)
         self.ticks = 0
         return self._observation(), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         assert self.action_space.contains(action), action
         self.ticks += 1
         return self._observation(), float(np.sum(action)), self.ticks >= 10, False, {}
 
 
-def register():
+def register() -> None:
     """What the entry point names; more than once does no harm."""
     for env_id, entry_point, limit in (
         ("TestTicks-v0", Ticks, 7),
@@ -191,4 +217,5 @@ def register():
         ("TestPrecise-v0", Precise, None),
     ):
         if env_id not in gym.registry:
-            gym.register(env_id, entry_point, max_episode_steps=limit)
+            # Gymnasium's type asks for classes that take any keywords.
+            gym.register(env_id, entry_point, max_episode_steps=limit)  # type: ignore[arg-type]
