@@ -15,7 +15,7 @@ def check_sums(trees: SumTrees) -> None:
 
 
 @pytest.mark.parametrize("capacity", [1, 2, 3, 64, 65])
-def test_any_height_leads_to_the_leaf_that_it_is_in(capacity):
+def test_any_height_leads_to_the_leaf_that_it_is_in(capacity: int) -> None:
     rng = np.random.default_rng(capacity)
     trees = SumTrees(3, capacity)
     assert capacity <= trees.num_leaves
@@ -32,7 +32,7 @@ def test_any_height_leads_to_the_leaf_that_it_is_in(capacity):
         np.testing.assert_array_equal(found, tree * trees.num_leaves + expected)
 
 
-def test_several_trees_are_each_as_if_alone():
+def test_several_trees_are_each_as_if_alone() -> None:
     rng = np.random.default_rng(1)
     together, alone = SumTrees(4, 100), [SumTrees(1, 100) for _ in range(4)]
     first = together.num_leaves * np.arange(4)[:, None]
@@ -47,7 +47,7 @@ def test_several_trees_are_each_as_if_alone():
             np.testing.assert_array_equal(found[tree], alone[tree].find(np.zeros(32, dtype=np.int64), heights[tree]))
 
 
-def test_of_a_leaf_that_is_set_twice_at_once_the_last_value_stays():
+def test_of_a_leaf_that_is_set_twice_at_once_the_last_value_stays() -> None:
     trees = SumTrees(1, 4)
     trees.set(np.array([2, 2, 0]), np.array([1.0, 3.0, 5.0]))
     np.testing.assert_array_equal(trees.leaves, [5, 0, 3, 0])
@@ -56,7 +56,7 @@ def test_of_a_leaf_that_is_set_twice_at_once_the_last_value_stays():
     assert trees.totals.tolist() == [8]
 
 
-def test_trees_that_grow_keep_their_leaves_and_one_is_cleared_alone():
+def test_trees_that_grow_keep_their_leaves_and_one_is_cleared_alone() -> None:
     trees = SumTrees(0, 0).resized(2, 3)
     trees.set(np.array([0, 1, 2, 4, 6]), np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
     larger = trees.resized(3, 5)

@@ -35,7 +35,7 @@ RECORD = TrialRecord(
 )  # fmt: skip
 
 
-def test_the_file_of_a_trial_is_as_it_was_before_its_record_was_made_of_parts():
+def test_the_file_of_a_trial_is_as_it_was_before_its_record_was_made_of_parts() -> None:
     record = TrialRecord(
         trial_id="t0002", index=2, point_index=1, seed_index=0, seed=2048, point={"lr": 0.2},
         hyperparams={"lr": 0.2, "hidden_sizes": [64, 64]}, has_point=True, engine="packed", changes=(CHANGE,),
@@ -48,12 +48,12 @@ def test_the_file_of_a_trial_is_as_it_was_before_its_record_was_made_of_parts():
     assert TrialRecord.model_validate_json(SAMPLE.read_bytes()) == record
 
 
-def test_every_field_of_a_record_is_planned_or_of_the_state():
+def test_every_field_of_a_record_is_planned_or_of_the_state() -> None:
     assert list(TrialRecord.model_fields) == [*TrialPlan.model_fields, *TrialState.model_fields]
     assert set(Progress.model_fields) == {*TrialState.model_fields, "evaluated"}
 
 
-def test_a_planned_trial_waits_with_what_is_planned_of_it():
+def test_a_planned_trial_waits_with_what_is_planned_of_it() -> None:
     record = transitions.pending_record(PLAN)
     assert record == TrialRecord(**dict(PLAN))
     assert (record.status, record.num_env_steps, record.checkpoints) == ("pending", 0, ())
@@ -103,12 +103,12 @@ def test_what_becomes_of_a_record_changes_so_much_of_it_and_no_more(
     assert become(RECORD) == RECORD.model_copy(update=expected)
 
 
-def test_a_trial_that_begins_again_began_when_it_first_did():
+def test_a_trial_that_begins_again_began_when_it_first_did() -> None:
     assert transitions.begun(transitions.pending_record(PLAN), 10.0).started_at == 10.0
     assert transitions.begun(RECORD, 10.0).started_at == 5.0
 
 
-def test_what_a_process_tells_is_all_but_failures_and_where_it_runs():
+def test_what_a_process_tells_is_all_but_failures_and_where_it_runs() -> None:
     progress = Progress(
         status="running", evaluated=True, num_iterations=4, num_env_steps=400, notes=("new", "old"), started_at=7.0,
         checkpoints=(CHECKPOINT,),
@@ -122,12 +122,12 @@ def test_what_a_process_tells_is_all_but_failures_and_where_it_runs():
     assert record.checkpoints == (CHECKPOINT,)
 
 
-def test_a_process_does_not_tell_what_there_is_no_field_for():
+def test_a_process_does_not_tell_what_there_is_no_field_for() -> None:
     with pytest.raises(ValueError, match="iteration"):
         Progress(status="running", evaluated=True, iteration=4)  # type: ignore[call-arg]
 
 
-def test_every_status_is_shown():
+def test_every_status_is_shown() -> None:
     statuses = set(get_args(TrialStatus))
     assert set(live_table._STATUS_STYLES) == set(output._STATUS_ORDER) == statuses
     assert statuses > FINISHED
