@@ -129,20 +129,12 @@ def style_axes(axes: Axes, *, xlabel: str, ylabel: str, title: str = "") -> None
 
 
 def steps_axis(axes: Axes) -> None:
-    """Make the horizontal axis one of env steps from 0, with short numbers."""
-    from matplotlib.ticker import FuncFormatter, MaxNLocator
+    """Make the horizontal axis one of env steps from 0, with short numbers: 12k, 1.5M."""
+    from matplotlib.ticker import EngFormatter, MaxNLocator
 
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
-
-
-def _short(value: float) -> str:
-    """Format 12000 as "12k" and 1500000 as "1.5M"."""
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if abs(value) >= unit:
-            return f"{value / unit:g}{letter}"
-    return f"{value:g}"
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
 def drawable(values: ArrayLike) -> NDArray[np.float64]:

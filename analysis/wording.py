@@ -9,6 +9,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
+from rich import filesize
+
 from analysis.statistics import Estimate
 
 NONE = "\u2013"
@@ -111,9 +113,5 @@ def difference_text(value: float) -> str:
 
 
 def bytes_text(number: float) -> str:
-    """Format bytes in powers of 1,000."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if number < 1000:
-            return f"{number:.0f} {unit}"
-        number /= 1000
-    return f"{number:.1f} TB"
+    """Format bytes in powers of 1,000, such as "61.2 MB"."""
+    return filesize.decimal(round(number))

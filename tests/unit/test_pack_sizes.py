@@ -76,9 +76,9 @@ def test_packs_are_smaller_where_memory_is_short():
     tight = plan(Machine(2, memory_bytes=2.1 * 6 * MEMBER), **MEMORY)
     assert (tight.packs.num_packs, tight.packs.slots) == (2, 3)
     (note,) = tight.packs.notes
-    # Ten trials of 0.05 GB; half of what there is.
-    assert "Packs are planned smaller: 2 x 5 trials at once may take 0.5 GB of memory" in note
-    assert "half of what this machine has available is 0.3 GB. 2 x 3 trials run at once" in note
+    # Ten trials of 48 MB; half of what there is.
+    assert "Packs are planned smaller: 2 x 5 trials at once may take 481.5 MB of memory" in note
+    assert "half of what this machine has available is 302.4 MB. 2 x 3 trials run at once" in note
     assert tight.max_concurrent == 6
 
 
@@ -92,7 +92,7 @@ def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own():
     made = plan(Machine(2, memory_bytes=MEMBER), **MEMORY)
     assert (made.packs.num_packs, made.packs.slots) == (1, 1)
     (note,) = made.packs.notes
-    assert "one trial may take 0.0 GB" in note or "one trial may take 0.1 GB" in note
+    assert "one trial may take 48.2 MB of memory, more than half of what this machine has available, 24.0 MB" in note
     assert "One pack trains one trial at a time" in note
     assert made.engines == {"packed": 10}
 

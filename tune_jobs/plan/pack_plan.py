@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from analysis.wording import bytes_text
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -104,16 +105,16 @@ def _by_memory(
     slots = max(1, sum(total <= budget for total in itertools.accumulate(largest)))
     if largest[0] > budget:
         note = (
-            f"Packs are planned smaller: one trial may take {_shown(largest[0])} of memory, more than half of what "
-            f"{machine.source} has available, {_shown(budget)}. One pack trains one trial at a time."
+            f"Packs are planned smaller: one trial may take {bytes_text(largest[0])} of memory, more than half of what "
+            f"{machine.source} has available, {bytes_text(budget)}. One pack trains one trial at a time."
         )
         return 1, 1, (note,)
     if (num_packs, slots) == wanted:
         return num_packs, slots, ()
     note = (
         f"Packs are planned smaller: {wanted[0]} x {wanted[1]} trials at once may take "
-        f"{_shown(wanted[0] * sum(largest))} of memory, and half of what {machine.source} has available is "
-        f"{_shown(machine.memory_bytes * _SHARE_OF_MEMORY if machine.memory_bytes else 0)}. "
+        f"{bytes_text(wanted[0] * sum(largest))} of memory, and half of what {machine.source} has available is "
+        f"{bytes_text(machine.memory_bytes * _SHARE_OF_MEMORY if machine.memory_bytes else 0)}. "
         f"{num_packs} x {slots} trials run at once."
     )
     return num_packs, slots, (note,)
@@ -143,7 +144,3 @@ def _in_stacks(members: Sequence[TrialToPack]) -> list[TrialToPack]:
         stacks.setdefault(member.key, []).append(member)
     unknown = stacks.pop(None, [])
     return [member for stack in [*stacks.values(), unknown] for member in stack]
-
-
-def _shown(num_bytes: float) -> str:
-    return f"{num_bytes / 1e9:.1f} GB"
