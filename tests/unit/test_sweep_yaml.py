@@ -52,6 +52,7 @@ def test_what_is_no_yaml_is_told_in_whole_sentences_with_its_place(text, message
         ("1__000", "1__000"), ("1_", "1_"), ("1,000", "1,000"), ("2024-01-01", "2024-01-01"), ("=", "="), ("y", "y"),
         ("1e", "1e"), ("0x", "0x"), ("-", ["-"]), ("nan", "nan"), ("inf", "inf"), ("None", "None"), ("10:70", "10:70"),
         ("a:30", "a:30"), ("'010'", "010"), ('"yes"', "yes"), ("'1:30'", "1:30"), ("!!str no", "no"), ("'<<'", "<<"),
+        ("<<", "<<"),
         ("!!int '5'", 5), ("!!float 5", 5), ("|\n    010\n", "010\n"),
     ],
 )  # fmt: skip
@@ -118,8 +119,8 @@ def test_a_merged_mapping_gives_way_to_what_is_written():
     [
         ("a: &a {x: 1}\nb: {<<: *a, <<: *a}", "x.yaml, line 2, column 13: the key '<<' stands twice (several"),
         ("{a: 1, 'a': 2}", "the key 'a' stands twice"),
-        ("<<: 3", "<< takes a mapping"),
-        ("<<: [3]", "<< takes a mapping"),
+        ("<<: 3", "expected a mapping or list of mappings for merging, but found scalar"),
+        ("<<: [3]", "expected a mapping for merging, but found scalar"),
         ("a: 1\n---\na: 2", "x.yaml, line 2"),
     ],
 )
