@@ -2,6 +2,9 @@
 
 import math
 import struct
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from synthetic_sweep import make_sweep
@@ -11,6 +14,7 @@ from tune_jobs.store.sweep_store import SweepStore
 
 event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
 crc32c = pytest.importorskip("tensorboardX.crc32c")
+ROOT = Path(__file__).parents[2]
 
 
 def masked(data):
@@ -66,3 +70,16 @@ def test_a_run_that_goes_on_writes_a_file_of_its_own(tmp_path):
         writer.write(trial, evaluated=True)
         writer.flush()
     assert [len(read(path)) for path in files(tmp_path, trial.trial_id)] == [2, 2]
+
+
+def test_writing_event_files_loads_no_torch():
+    code = (
+        "import sys, types\n"
+        "from tune_jobs.store.event_files import ScalarWriter\n"
+        "fields = dict.fromkeys(['training_return', 'evaluation_return', 'num_episodes', 'time_s'], 1.0)\n"
+        "record = types.SimpleNamespace(trial_id='t0000', num_env_steps=1, **fields)\n"
+        "ScalarWriter(None).write(record, evaluated=True)\n"
+        "print('tensorboard' in sys.modules, 'torch' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout == "True False\n"
