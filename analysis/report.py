@@ -140,6 +140,7 @@ def _content(source: _Sweep) -> dict[str, Any]:
     return {
         "sweep": sweep,
         "env_id": report_data.env_of(sweep),
+        "about": report_data.about_of(sweep),
         "algorithm": report_data.algorithm_of(sweep),
         "trained": report_data.is_trained(sweep),
         "goal": goal,

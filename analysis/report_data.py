@@ -53,6 +53,13 @@ def algorithm_of(sweep: SweepRecord) -> str:
     return {"random": "Random play", "constant": "A constant action"}.get(name, name.upper())
 
 
+def about_of(sweep: SweepRecord) -> dict[str, str]:
+    """Look up what the sweep file says of the sweep, for the head of the page: title, description, expected."""
+    told = sweep.spec.get("about")
+    told = told if isinstance(told, Mapping) else {}
+    return {name: str(told.get(name) or "") for name in ("title", "description", "expected")}
+
+
 def is_trained(sweep: SweepRecord) -> bool:
     """Whether a sweep's policies learn, which those of baselines don't."""
     return sweep.spec.get("algorithm") not in BASELINE_KINDS

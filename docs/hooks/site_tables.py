@@ -60,7 +60,7 @@ def domains() -> str:
     """What may stand in a space."""
     definitions = json_schema()["$defs"]
     references = re.findall(r"#/\$defs/(\w+)", json.dumps(definitions["Domain"]))
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for name in dict.fromkeys(references):
         ((kind, field),) = definitions[name]["properties"].items()
         rows.append((f"`{kind}`", field["description"], definitions[name]["description"]))
@@ -87,7 +87,7 @@ def presets() -> str:
         }  # fmt: skip
         lines = "\n".join(f"- {label}: {_escaped(text)}" for label, text in facts.items() if text)
         text = "\n\n".join(part for part in (_escaped(preset.title) + ".", lines, _escaped(preset.description)) if part)
-        parts.append(f"### {preset.name}\n\n{text}\n\n```yaml\n{_without_comment(preset.text)}```")
+        parts.append(f"### {preset.name}\n\n{text}\n\n```yaml\n{_without_about(preset.text)}```")
     return "\n\n".join(parts)
 
 
@@ -106,7 +106,7 @@ TABLES: dict[str, Callable[[], str]] = {
 def _fields(schema: Schema, links: Mapping[str, str] = {}) -> str:
     """A table of a mapping's fields; `links` has the words for fields that are mappings themselves, by definition."""
     required = schema.get("required", ())
-    rows: list[tuple[str, ...]] = [
+    rows = [
         (
             f"`{name}`",
             " or ".join(dict.fromkeys(_values(field, links))),
@@ -177,6 +177,6 @@ def _escaped(text: str) -> str:
     return re.sub(r"([\\*_<\[#])", r"\\\1", text)
 
 
-def _without_comment(text: str) -> str:
-    """A preset's file without the comment that it begins with, which the page tells."""
-    return re.sub(r"\A(?:#.*\n)*", "", text)
+def _without_about(text: str) -> str:
+    """A preset's file without what it says about itself, which the page tells."""
+    return re.sub(r"^about:\n(?: .*\n)*\n*", "", text, flags=re.MULTILINE)

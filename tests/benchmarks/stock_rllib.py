@@ -42,8 +42,7 @@ def _config(point: dict[str, Any]) -> dict[str, Any]:
             }
         )
     )
-    settings: dict[str, Any] = config.to_dict()
-    return settings
+    return config.to_dict()
 
 
 def main(num_env_steps: int) -> None:

@@ -154,7 +154,7 @@ def verdict(task: Task, found: Measurement) -> tuple[bool, str]:
 
 
 def owns_up(preset: Preset) -> bool:
-    """Whether a preset's comment says that it is not better than random play."""
+    """Whether a preset says of itself that it is not better than random play."""
     words = f"{preset.shows} {preset.expected} {preset.description}".lower()
     return re.search(r"\b(not|no|never|hardly)\b[^.;]{0,40}\b(beat|better)[^.;]{0,30}\brandom\b", words) is not None
 

@@ -15,14 +15,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
 
 import yaml
-
-from tests.narrowing import present
 
 TIMEOUT_S = 1800
 # What a RUN may need to reach the package index of this machine.
@@ -58,26 +54,25 @@ def read_dockerfile(path: Path) -> list[Instruction]:
     return [Instruction(word.upper(), rest.strip()) for word, rest in parts]
 
 
-def read_compose(path: Path, variables: dict[str, str]) -> dict[str, Any]:
+def read_compose(path: Path, variables: dict[str, str]) -> dict:
     """The services, `${NAME:-default}` and `${NAME:?message}` replaced."""
 
-    def replace(match: re.Match[str]) -> str:
+    def replace(match: re.Match) -> str:
         name, kind, rest = match.groups()
         if variables.get(name):
             return variables[name]
         if kind == ":?":
             raise KeyError(f"{name}: {rest}")
-        return str(rest or "")
+        return rest or ""
 
     text = "\n".join(line for line in path.read_text().splitlines() if not line.lstrip().startswith("#"))
-    services: dict[str, Any] = yaml.safe_load(re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", replace, text))
-    return services
+    return yaml.safe_load(re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", replace, text))
 
 
 class Root:
     """A root file system that is thrown away, and the namespaces in which commands see it."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self):
         script = """
             mount -t tmpfs -o size=16g tmpfs /mnt
             mkdir /mnt/upper /mnt/work /mnt/root
@@ -96,34 +91,26 @@ class Root:
         self._keeper, self._inside = _hold(
             ["unshare", "--mount", "--pid", "--fork", "--kill-child"], ["sh", "-ec", script]
         )
-        self._network: subprocess.Popen[str] | None = None
-        self._children: list[subprocess.Popen[bytes]] = []
+        self._network: subprocess.Popen | None = None
+        self._children: list[subprocess.Popen] = []
         self._enter = ["nsenter", f"--target={self._inside}", "--mount", "--pid"]
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         for process in [*self._children, self._network, self._keeper]:
             if process is not None:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
 
-    def cut_off(self) -> None:
+    def cut_off(self):
         """From now on, commands share a network that has nothing but a loopback device."""
         self._network, inside = _hold(
             [*self._enter, "unshare", "--net"], ["sh", "-ec", "ip link set lo up; echo ready; exec sleep infinity"]
         )
         self._enter = [*self._enter, f"--net=/proc/{inside}/ns/net"]
 
-    def begin(
-        self,
-        command: Sequence[str],
-        *,
-        environment: Mapping[str, str],
-        workdir: str = "/",
-        user: str | None = None,
-        log: Path | None = None,
-    ) -> subprocess.Popen[bytes]:
+    def begin(self, command, *, environment, workdir="/", user=None, log=None) -> subprocess.Popen:
         """Start a command in the root; without a user as root, else as Docker would with all capabilities dropped."""
         become = []
         if user is not None:
@@ -141,7 +128,7 @@ class Root:
         self._children.append(process)
         return process
 
-    def run(self, command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    def run(self, command, **options) -> subprocess.CompletedProcess:
         process = self.begin(command, **options)
         out, _ = process.communicate(timeout=TIMEOUT_S)
         return subprocess.CompletedProcess(command, process.returncode, out.decode(errors="replace"))
@@ -151,13 +138,13 @@ class Root:
         return Path(f"/proc/{self._inside}/root/mnt/root{path}")
 
 
-def _hold(namespaces: list[str], command: list[str]) -> tuple[subprocess.Popen[str], int]:
+def _hold(namespaces: list[str], command: list[str]) -> tuple[subprocess.Popen, int]:
     """Start a command that says `ready` and stays, in namespaces; returns its parent and its own process id."""
     process = subprocess.Popen(
         [*namespaces, *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     )  # fmt: skip
-    if present(process.stdout).readline() != "ready\n":
+    if process.stdout.readline() != "ready\n":
         process.kill()
         raise OSError(process.communicate()[1].strip())
     inside = process.pid
@@ -188,29 +175,29 @@ class Image:
         for instruction in read_dockerfile(dockerfile):
             getattr(self, f"_{instruction.word.lower()}")(instruction.rest, context, arguments)
 
-    def _from(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _from(self, rest, context, arguments):
         """The base image: see `build`."""
 
-    def _arg(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _arg(self, rest, context, arguments):
         name, _, default = rest.partition("=")
         arguments[name] = default.strip('"')
 
-    def _env(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _env(self, rest, context, arguments):
         for assignment in shlex.split(rest):
             name, _, value = assignment.partition("=")
             self.environment[name] = value.replace("$PATH", self.environment["PATH"])
 
-    def _workdir(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _workdir(self, rest, context, arguments):
         self.workdir = rest
         self._checked(["mkdir", "-p", rest])
 
-    def _user(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _user(self, rest, context, arguments):
         self.user = rest
 
-    def _cmd(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _cmd(self, rest, context, arguments):
         self.command = json.loads(rest)
 
-    def _copy(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _copy(self, rest, context, arguments):
         *sources, target = rest.split()
         folder = self.root.path(os.path.normpath(Path(self.workdir, target)))
         ignore = shutil.ignore_patterns("__pycache__")
@@ -220,38 +207,27 @@ class Image:
             else:
                 shutil.copy(context / source, folder / source)
 
-    def _run(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+    def _run(self, rest, context, arguments):
         self._checked(["sh", "-ec", rest], arguments)
 
-    def _checked(self, command: Sequence[str], arguments: dict[str, str] | None = None) -> None:
+    def _checked(self, command, arguments=None):
         environment = {**(arguments or {}), "HOME": "/root", **self.environment}
         done = self.root.run(command, environment=environment, workdir=self.workdir if "-p" not in command else "/")
         assert done.returncode == 0, f"{command} failed:\n{done.stdout[-4000:]}"
 
-    def begin(
-        self,
-        command: Sequence[str],
-        *,
-        environment: Mapping[str, str],
-        log: Path | None = None,
-        workdir: str | None = None,
-    ) -> subprocess.Popen[bytes]:
+    def begin(self, command, *, environment, log=None, workdir=None) -> subprocess.Popen:
         """Start a command as a container of this image would."""
         return self.root.begin(
             command, environment={"HOME": f"/home/{self.user}", **self.environment, **environment},
             workdir=workdir or self.workdir, user=self.user, log=log,
         )  # fmt: skip
 
-    def run(
-        self, command: Sequence[str], *, environment: Mapping[str, str], workdir: str | None = None
-    ) -> subprocess.CompletedProcess[str]:
+    def run(self, command, *, environment, workdir=None) -> subprocess.CompletedProcess:
         process = self.begin(command, environment=environment, workdir=workdir)
         out, _ = process.communicate(timeout=TIMEOUT_S)
         return subprocess.CompletedProcess(command, process.returncode, out.decode(errors="replace"))
 
-    def wait_until_healthy(
-        self, service: dict[str, Any], process: subprocess.Popen[bytes], log: Path, timeout_s: float = 300
-    ) -> None:
+    def wait_until_healthy(self, service: dict, process: subprocess.Popen, log: Path, timeout_s: float = 300) -> None:
         """Ask a service's health check until it passes."""
         kind, *test = service["healthcheck"]["test"]
         command = ["sh", "-c", *test] if kind == "CMD-SHELL" else test
@@ -261,9 +237,7 @@ class Image:
             assert time.monotonic() < deadline, f"never healthy: {done.stdout}\n{log.read_text()}"
             time.sleep(1)
 
-    def wait_until(
-        self, command: Sequence[str], pattern: str, *, environment: Mapping[str, str], timeout_s: float = 120
-    ) -> None:
+    def wait_until(self, command, pattern: str, *, environment, timeout_s: float = 120) -> None:
         """Run a command until its output matches."""
         deadline = time.monotonic() + timeout_s
         while not re.search(pattern, (done := self.run(command, environment=environment)).stdout):

@@ -12,7 +12,6 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
-from tests.narrowing import present
 from tune_jobs.spec.domains import DOMAIN_KINDS
 from tune_jobs.spec.file import list_presets
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -27,30 +26,27 @@ MOST_WORDS = 1_300
 class Page(HTMLParser):
     """What a page links to and loads, its anchors and its text."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.links: list[str] = []
-        self.loads: list[str] = []
-        self.anchors: set[str] = set()
-        self.text = ""
+        self.links, self.loads, self.anchors, self.text = [], [], set(), ""
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         found = dict(attrs)
-        self.anchors |= {present(found["id"])} if "id" in found else set()
+        self.anchors |= {found["id"]} if "id" in found else set()
         if tag == "a" and found.get("href"):
-            self.links.append(present(found["href"]))
+            self.links.append(found["href"])
         elif tag == "link" and found.get("rel") not in ("prev", "next", "canonical"):
-            self.loads.append(present(found["href"]))
+            self.loads.append(found["href"])
         elif found.get("src"):
-            self.loads.append(present(found["src"]))
+            self.loads.append(found["src"])
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.text += data
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)]
     env = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONDONTWRITEBYTECODE": "1"}
@@ -60,15 +56,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def pages(site: Path) -> dict[Path, Page]:
+def pages(site):
     return {path: Page(path.read_text()) for path in sorted(site.rglob("*.html"))}
 
 
-def test_the_readme_is_short() -> None:
+def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().split()) <= MOST_WORDS
 
 
-def test_every_link_leads_to_a_page_and_a_place_on_it(site: Path, pages: dict[Path, Page]) -> None:
+def test_every_link_leads_to_a_page_and_a_place_on_it(site, pages):
     lost = set()
     for path, page in pages.items():
         if path.name == "404.html":  # its links are of a server's root
@@ -83,7 +79,7 @@ def test_every_link_leads_to_a_page_and_a_place_on_it(site: Path, pages: dict[Pa
     assert lost == set()
 
 
-def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -> None:
+def test_nothing_is_loaded_from_elsewhere(site, pages):
     loaded = {(path.relative_to(site), load) for path, page in pages.items() for load in page.loads}
     assert {(path, load) for path, load in loaded if urlsplit(load).scheme not in ("", "data")} == set()
     styles = "".join(path.read_text() for path in site.rglob("*.css"))
@@ -92,8 +88,8 @@ def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -
     assert not any('class="mermaid"' in path.read_text() for path in pages)
 
 
-def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site: Path, pages: dict[Path, Page]) -> None:
-    def text(name: str) -> str:
+def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site, pages):
+    def text(name):
         return pages[site / name].text
 
     fields = {name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields}
@@ -108,12 +104,12 @@ def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site: Path, 
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_search_works_in_files_that_no_server_serves(site: Path, tmp_path: Path) -> None:
+def test_search_works_in_files_that_no_server_serves(site, tmp_path):
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
     page = f"{(site / 'index.html').as_uri()}?q=vf_clip_param"
     done = subprocess.run(
-        [present(CHROMIUM), *flags.split(), "--host-resolver-rules=MAP * ~NOTFOUND",
-         f"--user-data-dir={tmp_path}/profile", "--virtual-time-budget=20000", "--dump-dom", page],
+        [CHROMIUM, *flags.split(), "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path}/profile",
+         "--virtual-time-budget=20000", "--dump-dom", page],
         capture_output=True, text=True, check=True, timeout=600,
     )  # fmt: skip
     found = re.findall(r'href="([^"#?]*)[^"]*" class="md-search-result__link"', done.stdout)

@@ -1,20 +1,15 @@
 """The cases of the hyperparameters of networks; see `rllib_cases`."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from rllib_cases import Build, linears, module_of, modules_of, reaches
+from rllib_cases import linears, module_of, modules_of, reaches
 from torch import nn
-
-from policies.hyperparams import Algorithm
 
 FILTERS = ((5, 4, 2), (3, 2, 1))
 
 
-def heads_of(module: Any) -> dict[nn.Linear, float]:
+def heads_of(module):
     """{head: gain of its orthogonal weights}"""
     heads = {module.pi: 0.01} if hasattr(module, "pi") else {module.af: 1.0}
     if getattr(module, "vf", None) is not None:
@@ -23,7 +18,7 @@ def heads_of(module: Any) -> dict[nn.Linear, float]:
 
 
 @reaches("ppo", "dqn", field="initializer")
-def check_initializer(build: Build, algorithm: Algorithm) -> None:
+def check_initializer(build, algorithm):
     values = {"hidden_sizes": (40, 30), "activation": "tanh"}
     for initializer in ("torch", "he_uniform", "orthogonal"):
         algo = build(algorithm, initializer=initializer, **values)
@@ -55,7 +50,7 @@ def check_initializer(build: Build, algorithm: Algorithm) -> None:
 
 
 @reaches("ppo", "dqn", field="conv_filters")
-def check_conv_filters(build: Build, algorithm: Algorithm) -> None:
+def check_conv_filters(build, algorithm):
     algo = build(algorithm, "TestShades-v0", conv_filters=FILTERS, activation="relu", initializer="he_uniform")
     for module in modules_of(algo):
         encoder = module.encoder["actor_encoder"] if algorithm == "ppo" else module.encoder
@@ -75,14 +70,14 @@ def check_conv_filters(build: Build, algorithm: Algorithm) -> None:
 
 
 @reaches("ppo", "dqn", field="normalize_observations")
-def check_normalize_observations(build: Build, algorithm: Algorithm) -> None:
+def check_normalize_observations(build, algorithm):
     plain = module_of(build(algorithm, normalize_observations=False))
     assert not [name for name in plain.state_dict() if name.startswith("obs_")]
     algo = build(algorithm, normalize_observations=True)
     module, seen = module_of(algo), []
     update = module.update_observation_statistics
 
-    def spied(observations: NDArray[Any]) -> None:
+    def spied(observations):
         seen.append(np.asarray(observations).copy())
         update(observations)
 

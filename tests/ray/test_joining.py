@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -11,7 +10,7 @@ pytestmark = pytest.mark.ray
 FORK_FAILURE = "Initialization failure from server:\nRuntimeError: Starting Ray client server failed. See the log."
 
 
-def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path, monkeypatch):
     import ray._common.utils
 
     from tune_jobs.ray_tune.address import recorded_cluster
@@ -24,19 +23,17 @@ def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize(("error", "attempts"), [(FORK_FAILURE, 3), ("ray client connection timeout", 1)])
-def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(
-    monkeypatch: pytest.MonkeyPatch, error: str, attempts: int
-) -> None:
+def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(monkeypatch, error, attempts):
     from tune_jobs.ray_tune import cluster
 
     asked = []
 
-    def init(address: str, **_: Any) -> None:
+    def init(address, **_):
         asked.append(address)
         if len(asked) < 3:
             raise ConnectionAbortedError(error)
 
-    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
+    monkeypatch.setattr(cluster.ray, "init", init)
     if attempts == 1:
         with pytest.raises(ConnectionAbortedError):
             cluster._init_patiently("ray://host:10001")
@@ -45,26 +42,26 @@ def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(
     assert asked == ["ray://host:10001"] * attempts
 
 
-def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch):
     from policies.errors import CannotRunError
     from tune_jobs.ray_tune import cluster
 
-    def init(address: str, **_: Any) -> None:
+    def init(address, **_):
         raise ConnectionAbortedError(FORK_FAILURE)
 
-    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
+    monkeypatch.setattr(cluster.ray, "init", init)
     with pytest.raises(CannotRunError, match="cannot be joined: Initialization failure from server"):
         cluster._join("ray://host:10001")
 
 
-def test_a_refused_token_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_token_is_named(monkeypatch):
     from policies.errors import CannotRunError
     from tune_jobs.ray_tune import cluster
 
-    def init(address: str, **_: Any) -> None:
+    def init(address, **_):
         os.write(2, b"W gcs_client.cc:210: Failed to get cluster ID: InvalidAuthToken: token is missing or incorrect\n")
         raise ConnectionError("Failed to connect")
 
-    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
+    monkeypatch.setattr(cluster.ray, "init", init)
     with pytest.raises(CannotRunError, match="does not accept this machine's token"):
         cluster._join("host:6379")

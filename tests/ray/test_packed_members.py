@@ -1,47 +1,35 @@
 """Members come and go, are saved and restored; what becomes of one does not depend on the others."""
 
-from __future__ import annotations
-
 import copy
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 import torch
-from packed_rllib import MODULE, PPOMember, assert_same_stats, learner_of, state_of
+from packed_rllib import MODULE, assert_same_stats, learner_of, state_of
 from trials import make_task
 
 from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError
 from policies.hyperparams import PPOHyperparams
-from policies.packed.envs.vector import EnvKind
-from policies.packed.member import AnyMember, MemberStats, Weights
-from policies.portable.file import PortablePolicy, save_policy
-from tune_jobs.training.protocol import IterationStats, TrialTask
-
-if TYPE_CHECKING:
-    from policies.packed.ppo.stack import PPOStack
-    from tune_jobs.training.packed import PackedEngine
+from policies.portable.file import save_policy
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 SHARED = {"train_batch_size": 256, "minibatch_size": 64, "num_epochs": 4, "num_envs": 8, "lr": 3e-3}
 
 
-def make_stack(env_id: str, **shared: Any) -> PPOStack:
+def make_stack(env_id, **shared):
     from policies.packed.envs.make import make_packed_envs
     from policies.packed.make import make_stack as make
 
     hyperparams = PPOHyperparams(**{**SHARED, **shared})
-    kind: EnvKind = "vectorised" if env_id == "CartPole-v1" else "scalar"
-    return cast("PPOStack", make(hyperparams, make_packed_envs(env_id, {}, hyperparams.num_envs, kind=kind)))
+    kind = "vectorised" if env_id == "CartPole-v1" else "scalar"
+    return make(hyperparams, make_packed_envs(env_id, {}, hyperparams.num_envs, kind=kind))
 
 
-def add(stack: PPOStack, name: str, seed: int, member: PPOMember | None = None, **values: Any) -> None:
+def add(stack, name, seed, member=None, **values):
     from policies.packed.initial import new_member
 
     if member is None:
@@ -62,9 +50,7 @@ OTHERS = [
 WATCHED = {"hidden_sizes": (21, 18), "grad_clip": 0.5, "entropy_coeff": 0.01}
 
 
-def in_pack(
-    env_id: str, num_others: int, *, comings_and_goings: bool = False, **shared: Any
-) -> tuple[PPOMember, list[MemberStats]]:
+def in_pack(env_id, num_others, *, comings_and_goings=False, **shared):
     """The watched member after 5 iterations beside others, and what its iterations gave."""
     stack, seen = make_stack(env_id, **shared), []
     for index in range(num_others // 2):
@@ -89,7 +75,7 @@ def in_pack(
     ("CartPole-v1", {"vf_share_layers": True, "use_kl_loss": True, "normalize_observations": True}),
     ("Pendulum-v1", {"normalize_observations": True, "train_batch_size": 128}),
 ])  # fmt: skip
-def test_a_member_does_not_depend_on_the_others(env_id: str, shared: dict[str, Any]) -> None:
+def test_a_member_does_not_depend_on_the_others(env_id, shared):
     """Weights after 5 iterations; all that differs is what products of padded sizes round otherwise.
 
     Rounding changes a component of a gradient by a share of 1e-4 at most, of those that are a thousandth of the
@@ -113,7 +99,7 @@ def test_a_member_does_not_depend_on_the_others(env_id: str, shared: dict[str, A
         assert packed.num_optimizer_steps == alone.num_optimizer_steps
 
 
-def test_members_of_one_seed_are_the_same() -> None:
+def test_members_of_one_seed_are_the_same():
     stack = make_stack("CartPole-v1")
     for name in ("a", "b"):
         add(stack, name, 5)
@@ -127,14 +113,14 @@ def test_members_of_one_seed_are_the_same() -> None:
 # -- on disk
 
 
-def assert_same_arrays(ours: Weights, theirs: Weights) -> None:
+def assert_same_arrays(ours, theirs):
     assert set(ours) == set(theirs)
     for name, value in theirs.items():
         assert ours[name].dtype == value.dtype
         np.testing.assert_array_equal(ours[name], value)
 
 
-def assert_same_member(ours: AnyMember, theirs: AnyMember) -> None:
+def assert_same_member(ours, theirs):
     assert_same_arrays(ours.weights, theirs.weights)
     assert set(ours.moments) == set(theirs.moments)
     for name, value in theirs.moments.items():
@@ -147,7 +133,7 @@ def assert_same_member(ours: AnyMember, theirs: AnyMember) -> None:
 
 
 @pytest.mark.parametrize("shared", [{}, {"use_kl_loss": True, "normalize_observations": True, "vf_share_layers": True}])
-def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path: Path, shared: dict[str, Any]) -> None:
+def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path, shared):
     from policies.packed.state import load_member, save_member
 
     stack = make_stack("CartPole-v1", **shared)
@@ -159,7 +145,7 @@ def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path: Path, s
     assert before.num_optimizer_steps == before.num_updates == 32
     assert set(before.moments) == {"exp_avg", "exp_avg_sq"}
     save_member(before, tmp_path / "packed")
-    loaded = cast("PPOMember", load_member(tmp_path / "packed", "a"))
+    loaded = load_member(tmp_path / "packed", "a")
     assert_same_member(loaded, before)
     ends = []
     for member in (before, loaded):
@@ -175,11 +161,10 @@ def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path: Path, s
 
 
 LR = 3e-3
-Saved = tuple[Path, TrialTask, PortablePolicy]
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory, ray_session: None) -> Saved:
+def checkpoint(tmp_path_factory, ray_session):
     """(a checkpoint of a trial of the packed engine, its task, its policy)."""
     from tune_jobs.training.packed import PackedEngine
 
@@ -201,7 +186,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory, ray_session: None) -> S
 
 
 @pytest.fixture
-def engine() -> Iterator[PackedEngine]:
+def engine():
     from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine()
@@ -209,7 +194,7 @@ def engine() -> Iterator[PackedEngine]:
     engine.close()
 
 
-def test_a_trial_goes_on_from_its_checkpoint(checkpoint: Saved, engine: PackedEngine) -> None:
+def test_a_trial_goes_on_from_its_checkpoint(checkpoint, engine):
     from policies.packed.state import load_member
 
     folder, task, policy = checkpoint
@@ -220,13 +205,12 @@ def test_a_trial_goes_on_from_its_checkpoint(checkpoint: Saved, engine: PackedEn
     for layer, other in zip(engine.policy("t0000").network.layers, policy.network.layers, strict=True):
         np.testing.assert_array_equal(layer.weight, other.weight)
     stats = engine.train_iteration()["t0000"]
-    assert isinstance(stats, IterationStats)
     assert stats.num_env_steps == 4 * 128
     assert stats.learner["lr"] == pytest.approx(LR * (1 - 0.512))
     assert engine.policy("t0000").training["iteration"] == 4
 
 
-def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(checkpoint: Saved) -> None:
+def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(checkpoint):
     from policies.packed.state import load_member
     from policies.packed.to_rllib import algorithm_from_checkpoint
 
@@ -272,12 +256,12 @@ def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(checkpoint: Saved) ->
     algorithm.stop()
 
 
-def cut_short(path: Path) -> None:
+def cut_short(path):
     path.write_bytes(path.read_bytes()[:-10])
 
 
-def edit(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    def damage(path: Path) -> None:
+def edit(change):
+    def damage(path):
         description = json.loads(path.read_text())
         change(description)
         path.write_text(json.dumps(description))
@@ -285,28 +269,28 @@ def edit(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
     return damage
 
 
-def without_a_weight(path: Path) -> None:
+def without_a_weight(path):
     from safetensors.numpy import load_file, save_file
 
     tensors = load_file(path)
     save_file({name: value for name, value in tensors.items() if name != "weights/pi.bias"}, path)
 
 
-def without_a_moment(path: Path) -> None:
+def without_a_moment(path):
     from safetensors.numpy import load_file, save_file
 
     tensors = load_file(path)
     save_file({name: value for name, value in tensors.items() if name != "exp_avg/pi.bias"}, path)
 
 
-def with_another_shape(path: Path) -> None:
+def with_another_shape(path):
     from safetensors.numpy import load_file, save_file
 
     tensors = load_file(path)
     save_file({**tensors, "exp_avg_sq/pi.bias": np.zeros(3, np.float32)}, path)
 
 
-DAMAGE: dict[str, tuple[str, Callable[[Path], object]]] = {
+DAMAGE = {
     "no tensors": ("state.safetensors", lambda path: path.unlink()),
     "no description": ("state.json", lambda path: path.unlink()),
     "tensors cut short": ("state.safetensors", cut_short),
@@ -333,7 +317,7 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_state_is_refused(checkpoint: Saved, engine: PackedEngine, tmp_path: Path, kind: str) -> None:
+def test_a_damaged_state_is_refused(checkpoint, engine, tmp_path, kind):
     folder, task, _ = checkpoint
     copied = tmp_path / folder.name
     shutil.copytree(folder, copied)
@@ -348,7 +332,7 @@ def test_a_damaged_state_is_refused(checkpoint: Saved, engine: PackedEngine, tmp
     assert set(engine.train_iteration()) == {"t0000"}
 
 
-def test_a_checkpoint_of_another_engine_is_refused(checkpoint: Saved, engine: PackedEngine, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_engine_is_refused(checkpoint, engine, tmp_path):
     _, task, policy = checkpoint
     save_policy(policy, tmp_path / "000001")
     with pytest.raises(CheckpointError, match="not of the packed engine"):

@@ -1,29 +1,24 @@
 """PPO's schedules and KL weight over iterations and restores; observation statistics over env runners."""
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from ppo_cases import current_lr, entropy_weight
-from rllib_cases import MODULE, SMALL, Build, env_steps, learner_of, module_of
+from rllib_cases import MODULE, SMALL, env_steps, learner_of, module_of
 
 from policies.hyperparams import PPOHyperparams
-from policies.packed.member import Weights
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 
 @pytest.fixture
-def build() -> Iterator[Build]:
+def build():
     """Make a PPO Algorithm from a few hyperparameters; all are stopped at the end."""
     from policies.rllib.config import build_algorithm_config
 
     built = []
 
-    def make(num_env_runners: int = 0, **values: Any) -> Any:
+    def make(num_env_runners=0, **values):
         hyperparams = PPOHyperparams(**{**SMALL["ppo"], **values})
         config = build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=7, num_env_runners=num_env_runners)
         built.append(config.build_algo())
@@ -34,7 +29,7 @@ def build() -> Iterator[Build]:
         algo.stop()
 
 
-def saved_and_restored(algo: Any, folder: Path, make_new: Callable[[], Any]) -> Any:
+def saved_and_restored(algo, folder, make_new):
     """A second Algorithm with the first one's checkpoint."""
     algo.save_to_path(str(folder))
     restored = make_new()
@@ -42,12 +37,12 @@ def saved_and_restored(algo: Any, folder: Path, make_new: Callable[[], Any]) -> 
     return restored
 
 
-def in_first_update(algo: Any, read: Callable[[Any], float]) -> tuple[int, float]:
+def in_first_update(algo, read):
     """(env steps, what `read` gives in the first update of the next iteration)."""
     learner, seen = learner_of(algo), []
     update = learner._update
 
-    def reading(*args: Any, **kwargs: Any) -> Any:
+    def reading(*args, **kwargs):
         seen.append(read(algo))
         return update(*args, **kwargs)
 
@@ -61,9 +56,7 @@ def in_first_update(algo: Any, read: Callable[[Any], float]) -> tuple[int, float
     (current_lr, "lr", "lr_decay_steps"),
     (entropy_weight, "entropy_coeff", "entropy_decay_steps"),
 ])  # fmt: skip
-def test_schedules_go_on_after_a_restore(
-    build: Build, tmp_path: Path, read: Callable[[Any], float], name: str, decay: str
-) -> None:
+def test_schedules_go_on_after_a_restore(build, tmp_path, read, name, decay):
     values = {name: 0.1, f"{name}_final": 0.02, decay: 400}
     algo = build(**values)
     for _ in range(2):
@@ -74,7 +67,7 @@ def test_schedules_go_on_after_a_restore(
     assert value == pytest.approx(0.1 - 0.08 * steps / 400, rel=1e-3)
 
 
-def test_the_kl_weight_moves_in_training_and_is_restored(build: Build, tmp_path: Path) -> None:
+def test_the_kl_weight_moves_in_training_and_is_restored(build, tmp_path):
     values = {"use_kl_loss": True, "kl_coeff": 0.4, "kl_target": 1e-9, "lr": 1e-2, "num_epochs": 4}
     algo = build(**values)
     for iteration in (1, 2):
@@ -88,18 +81,17 @@ def test_the_kl_weight_moves_in_training_and_is_restored(build: Build, tmp_path:
     assert float(learner_of(mutated).curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.6)
 
 
-def first_ratios(algo: Any) -> torch.Tensor:
+def first_ratios(algo):
     """exp(log probability in the first update - in sampling) of the rows that are env steps."""
-    learner, module = learner_of(algo), module_of(algo)
-    ratios: list[torch.Tensor] = []
+    learner, module, ratios = learner_of(algo), module_of(algo), []
     update = learner._update
 
-    def reading(batch: Any, *args: Any, **kwargs: Any) -> Any:
+    def reading(batch, *args, **kwargs):
         if not ratios:
             rows = batch[MODULE]
             with torch.no_grad():
                 logits = module.forward_train(rows)["action_dist_inputs"]
-            now = torch.distributions.Categorical(logits=logits).log_prob(rows["actions"])  # type: ignore[no-untyped-call]
+            now = torch.distributions.Categorical(logits=logits).log_prob(rows["actions"])
             ratios.append(torch.exp(now - rows["action_logp"])[rows["loss_mask"]])
         return update(batch, *args, **kwargs)
 
@@ -109,7 +101,7 @@ def first_ratios(algo: Any) -> torch.Tensor:
     return ratios[0]
 
 
-def runner_statistics(algo: Any) -> list[Weights]:
+def runner_statistics(algo):
     return [
         {name: np.asarray(value) for name, value in state.items() if name.startswith("obs_")}
         for state in algo.env_runner_group.foreach_env_runner(
@@ -120,7 +112,7 @@ def runner_statistics(algo: Any) -> list[Weights]:
 
 
 @pytest.mark.parametrize("num_env_runners", [0, 2])
-def test_sampling_and_training_use_the_same_statistics(build: Build, num_env_runners: int) -> None:
+def test_sampling_and_training_use_the_same_statistics(build, num_env_runners):
     algo = build(num_env_runners, normalize_observations=True, lr=1e-2, vf_share_layers=True)
     for _ in range(3):
         # Statistics move by a lot in the first iterations: with newer ones the ratios would be far from 1.
@@ -134,14 +126,14 @@ def test_sampling_and_training_use_the_same_statistics(build: Build, num_env_run
                 np.testing.assert_array_equal(found[name], module_of(algo).state_dict()[name].numpy())
 
 
-def test_statistics_are_of_the_env_steps_alone(build: Build) -> None:
+def test_statistics_are_of_the_env_steps_alone(build):
     """RLlib's batch has a row more for each episode chunk, which would be counted twice."""
     algo = build(normalize_observations=True)
     steps = env_steps(algo.train())
     assert int(module_of(algo).obs_count) == steps
 
 
-def test_statistics_are_restored_and_grow_on(build: Build, tmp_path: Path) -> None:
+def test_statistics_are_restored_and_grow_on(build, tmp_path):
     algo = build(normalize_observations=True)
     algo.train()
     before = {name: value.clone() for name, value in module_of(algo).state_dict().items()}

@@ -2,7 +2,6 @@
 
 import socket
 import threading
-from functools import partial
 
 import pytest
 
@@ -12,17 +11,17 @@ pytestmark = pytest.mark.ray
 class Clock:
     now = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
-def test_a_part_is_dead_when_it_has_been_silent_for_long() -> None:
+def test_a_part_is_dead_when_it_has_been_silent_for_long():
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
 
     clock, answers = Clock(), {"this": True, "that": True}
-    watch = RayWatch({name: partial(answers.__getitem__, name) for name in answers}, 10.0, clock)
+    watch = RayWatch({name: lambda name=name: answers[name] for name in answers}, 10.0, clock)
 
-    def look(at: float) -> None:
+    def look(at):
         clock.now = at
         watch.look()
         watch.check()
@@ -41,7 +40,7 @@ def test_a_part_is_dead_when_it_has_been_silent_for_long() -> None:
         look(30.0)
 
 
-def test_what_a_trial_raised_is_not_waited_for() -> None:
+def test_what_a_trial_raised_is_not_waited_for():
     from ray.exceptions import RayTaskError
 
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
@@ -53,18 +52,12 @@ def test_what_a_trial_raised_is_not_waited_for() -> None:
     assert not issubclass(RayDiedError, Exception)
 
 
-def test_a_block_that_goes_on_is_stuck() -> None:
-    from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
+def test_a_block_that_goes_on_is_stuck():
+    from tune_jobs.ray_tune.processes import RayWatch
 
-    told = threading.Event()
-    deaths: list[str] = []
-
-    def tell(death: RayDiedError) -> None:
-        deaths.append(str(death))
-        told.set()
-
+    told, deaths = threading.Event(), []
     with RayWatch({"it": lambda: False}, 0.05, stuck_s=0.05) as watch:
-        watch.when_stuck = tell
+        watch.when_stuck = lambda death: (deaths.append(str(death)), told.set())
         assert told.wait(60)
     assert deaths == ["it"]
     with RayWatch({"it": lambda: False}, 0.05, stuck_s=3600) as watch:
@@ -73,7 +66,7 @@ def test_a_block_that_goes_on_is_stuck() -> None:
     assert deaths == ["it"]
 
 
-def test_it_looks_by_itself_and_ends_with_its_block() -> None:
+def test_it_looks_by_itself_and_ends_with_its_block():
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, _answers
 
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -81,7 +74,7 @@ def test_it_looks_by_itself_and_ends_with_its_block() -> None:
         assert _answers(socket.AF_INET, address)
     looked = threading.Event()
 
-    def probe() -> bool:
+    def probe():
         looked.set()
         return _answers(socket.AF_INET, address)
 

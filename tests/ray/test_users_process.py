@@ -5,24 +5,22 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.ray
 
 SCRIPT = Path(__file__).with_name("a_users_script.py")
-Told = dict[str, dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Where the script runs."""
     return tmp_path_factory.mktemp("script")
 
 
 @pytest.fixture(scope="module")
-def told(folder: Path) -> Told:
+def told(folder):
     """What the script told of each of its launches."""
     # What "another Ray" is said to listen at.
     with socket.create_server(("127.0.0.1", 0)) as server, (folder / "errors").open("w") as errors:
@@ -50,19 +48,19 @@ def told(folder: Path) -> Told:
         ("the user's Ray", "exit code 0"),
     ],
 )
-def test_a_launch_leaves_the_process_as_it_was(told: Told, what: str, came_of_it: str) -> None:
+def test_a_launch_leaves_the_process_as_it_was(told, what, came_of_it):
     assert told[what]["came of it"].startswith(came_of_it)
     assert told[what]["changed"] == {}
 
 
-def test_a_created_sweep_that_a_thread_drives_gives_what_a_launch_gives(told: Told, folder: Path) -> None:
+def test_a_created_sweep_that_a_thread_drives_gives_what_a_launch_gives(told, folder):
     assert "two threads" in told
     launched, driven = (what_it_learned(folder / "sweeps" / name) for name in ("one", "created"))
     assert driven == launched
     assert len(launched) == 3
 
 
-def what_it_learned(sweep: Path) -> list[Any]:
+def what_it_learned(sweep):
     """Its records, results and weights, without times and places."""
     trial = sweep / "trials" / "t0000"
     results = [json.loads(line) for line in (trial / "results.jsonl").read_text().splitlines()]

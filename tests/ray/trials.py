@@ -1,15 +1,13 @@
 """Single trials without Ray Tune: what several test modules here run."""
 
 from pathlib import Path
-from typing import Any
 
 from policies.acting.evaluate import Evaluator
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
-from tune_jobs.store.progress import Progress
-from tune_jobs.training.protocol import TrainingEngine, TrialTask
+from tune_jobs.training.protocol import TrialTask
 
 TRIAL_SEED = 9 * 1024
-SMALL: dict[str, dict[str, Any]] = {
+SMALL = {
     "ppo": {"hidden_sizes": (8,), "train_batch_size": 128, "minibatch_size": 64, "num_epochs": 2, "num_envs": 4},
     "dqn": {
         "hidden_sizes": (8,),
@@ -22,7 +20,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
-def make_task(folder: Path, algorithm: str = "ppo", **changes: Any) -> TrialTask:
+def make_task(folder: Path, algorithm="ppo", **changes):
     """A trial of a few iterations; hyperparameters by name, other fields of `TrialTask` too."""
     fields = {name: changes.pop(name) for name in list(changes) if name in TrialTask.__dataclass_fields__}
     return TrialTask(
@@ -43,7 +41,7 @@ def make_task(folder: Path, algorithm: str = "ppo", **changes: Any) -> TrialTask
     )
 
 
-def run_trial(task: TrialTask, engine: TrainingEngine) -> Progress:
+def run_trial(task, engine):
     """Run a trial to its end; the engine keeps the Algorithm."""
     from tune_jobs.training.trial_loop import TrialLoop
 

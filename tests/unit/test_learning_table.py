@@ -73,7 +73,7 @@ def test_falling_short_of_random_play_passes_only_where_the_preset_says_so(monke
     for words, fine in (("It does not beat random play.", True), ("It beats random play.", False)):
         monkeypatch.setattr(
             "tests.learning.measure.find_preset",
-            lambda name, words=words: read_preset(name, f"# T\n# Shows: {words}\n"),
+            lambda name, words=words: read_preset(name, f"about: {{title: T, shows: {words}}}\n"),
         )
         passed, word = verdict(last, found)
         assert passed is fine
@@ -91,7 +91,7 @@ def test_falling_short_of_random_play_passes_only_where_the_preset_says_so(monke
     ],
 )
 def test_what_owning_up_means(words, fine):
-    assert owns_up(read_preset("x", f"# T\n# More\n# {words}\n")) is fine
+    assert owns_up(read_preset("x", f"about:\n  title: T\n  description: More {words}\n")) is fine
 
 
 def test_the_target_is_the_fixed_siblings_and_the_plain_one_is_measured_beside_it():
@@ -152,7 +152,7 @@ def run(monkeypatch, tmp_path, answers, *arguments):
         return dataclasses.replace(answer, preset=task.preset)
 
     monkeypatch.setattr(command, "measure", fake)
-    presets = [read_preset(name, "# T\n") for name in answers]
+    presets = [read_preset(name, "about: {title: T}\n") for name in answers]
     monkeypatch.setattr(command, "list_presets", lambda: presets)
     return command.main([*arguments, "--json", str(tmp_path / "out.json")])
 

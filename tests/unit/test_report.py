@@ -175,6 +175,16 @@ def test_how_it_was_run_is_told(typical):
     assert yaml.safe_load(spec) == synthetic.sweep.spec
 
 
+def test_what_the_sweep_file_says_of_the_sweep_stands_at_the_head(tmp_path, typical):
+    synthetic = make_sweep()
+    about = {"title": "Which size?", "source": None, "expected": "195 & more", "description": "Two\nlines."}
+    synthetic.sweep = synthetic.sweep.model_copy(update={"spec": {**synthetic.sweep.spec, "about": about}})
+    _, html, page = report(tmp_path, synthetic)
+    assert '<p class="lines">Which size?</p>' in html
+    assert "Two lines. Expected by the sweep file: 195 & more" in page.words
+    assert "sweep file:" not in typical[-1].words
+
+
 def test_a_sweep_without_a_winner_says_why(tmp_path):
     synthetic = make_sweep(failed=range(20))
     assert synthetic.best is None

@@ -108,10 +108,11 @@ def test_every_preset_loads_says_what_it_is_and_has_no_name():
         assert re.match(r"-?[\d.,]+ \(", preset.expected), f"{preset.name}: {preset.expected!r}"
 
 
-def test_a_presets_header_is_read_label_by_label():
+def test_a_preset_is_what_its_about_says():
     text = (
-        "# Plain title: with a colon\n# Source: a book: chapter 2\n# Shows: what happens\n# Expected: 195 (x)\n"
-        "# Env steps: 3,000\n# Time: 2 s on 2 cores\n# Free words,\n# Time: more of them\nenv: CartPole-v1\n# no more\n"
+        "about:\n  title: 'Plain title: with a colon'\n  source: 'a book: chapter 2'\n  shows: what happens\n"
+        "  expected: 195 (x)\n  env_steps: 3,000\n  time: 2 s on 2 cores\n  description: >-\n    Free words,\n"
+        "    Time: more of them\nenv: CartPole-v1\n# no more\n"
     )
     preset = read_preset("mine", text)
     assert preset == (
@@ -119,6 +120,37 @@ def test_a_presets_header_is_read_label_by_label():
         "2 s on 2 cores", "Free words, Time: more of them", text,
     )  # fmt: skip
     assert read_preset("bare", "env: x\n")[1:-1] == ("",) * 7
+
+
+def test_any_sweep_may_say_what_it_is_about(tmp_path):
+    spec = load_spec(write(tmp_path, "about: Which one?\nenv: CartPole-v1\nalgorithm: ppo\n"), ["about.expected=high"])
+    assert (spec.about.title, spec.about.expected, spec.about.description) == ("Which one?", "high", "")
+    assert SweepSpec.model_validate(json.loads(spec.model_dump_json())) == spec
+    assert SweepSpec(**MINIMAL, about="Which one?").about.title == "Which one?"
+    assert load_spec("cartpole-ppo").about.title == find_preset("cartpole-ppo").title
+
+
+def test_a_sweep_that_says_nothing_of_itself_is_written_as_if_there_were_no_such_field():
+    # Fields that are null are what older versions may not know.
+    assert load_spec(MINIMAL).model_dump(mode="json")["about"] is None
+    assert load_spec({**MINIMAL, "about": {"title": ""}}).model_dump(mode="json")["about"] is None
+
+
+@pytest.mark.parametrize(
+    ("about", "part"),
+    [
+        (3, "about: 3 is not allowed: give a text, or a mapping"),
+        ({"expected": 195}, "about.expected: 195 is not allowed: it should be a text"),
+        ({"titel": "x"}, "about.titel: there is no field 'titel' here. Did you mean 'title'?"),
+    ],
+)
+def test_what_a_sweep_says_of_itself_is_text(about, part):
+    assert part in errors(about=about)
+
+
+def test_the_words_of_about_are_not_proposed_as_settings():
+    assert "Did you mean 'num_env_steps'?" in errors(stop={"env_steps": 5})
+    assert "Did you mean 'time_s'?" in errors(stop={"time": 5})
 
 
 def test_the_cartpole_preset_is_the_tutorials_sweep():

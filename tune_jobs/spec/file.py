@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,18 +19,19 @@ from policies.suggestions import did_you_mean
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
+from tune_jobs.spec.sections import AboutSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.yaml import parse_yaml
 from tune_jobs.store.names import SWEEP_RECORD
 
 # What the characters that are read may take up at most, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
-_SECTIONS_OF_TEXT = {"env": "id", "scheduler": "type", "search": "type"}
+_SECTIONS_OF_TEXT = {"about": "title", "env": "id", "scheduler": "type", "search": "type"}
 """Sections that may be written as one text, and the field that it stands for."""
 
 
 class Preset(NamedTuple):
-    """A sweep file that ships with the package; all but name and text stand in the comment it begins with."""
+    """A sweep file that ships with the package; all but name and text stand under its key `about`."""
 
     name: str
     title: str
@@ -43,43 +45,25 @@ class Preset(NamedTuple):
     time: str
     """On 2 cores."""
     description: str
-    """The rest of the comment."""
+    """More."""
     text: str
     """The whole file."""
 
 
-_PRESET_LABELS = {
-    "Source": "source", "Shows": "shows", "Expected": "expected", "Env steps": "env_steps", "Time": "time",
-}  # fmt: skip
-
-
 def list_presets() -> list[Preset]:
     """The presets, by name."""
-    folder = resources.files("tune_jobs.spec").joinpath("presets")
-    files = [file for file in folder.iterdir() if file.name.endswith(".yaml")]
-    presets = [read_preset(file.name.removesuffix(".yaml"), file.read_text(encoding="utf-8")) for file in files]
-    return sorted(presets)
+    return [read_preset(name, file.read_text(encoding="utf-8")) for name, file in _preset_files().items()]
 
 
 def read_preset(name: str, text: str) -> Preset:
-    """A preset from its file's text: a title, then labelled lines, then more; what is missing is empty.
+    """A preset from its file's text; what `about` leaves out is empty.
 
     Args:
         name: The file's name without its ending.
-        text: The file. Its first lines are `# <title>`, `# Source: ...`, `# Shows: ...`, `# Expected: ...`,
-            `# Env steps: ...`, `# Time: ... on 2 cores`, and free comment lines.
+        text: The file.
     """
-    comment = re.match(r"(?:#.*\n)*", text)
-    title, *lines = [line.lstrip("#").strip() for line in (comment.group() if comment else "").splitlines()] or [""]
-    fields = dict.fromkeys(_PRESET_LABELS.values(), "")
-    rest: list[str] = []
-    for line in lines:
-        label, _, value = line.partition(": ")
-        if label in _PRESET_LABELS and not rest:
-            fields[_PRESET_LABELS[label]] = value.strip()
-        else:
-            rest.append(line)
-    return Preset(name=name, title=title, **fields, description=" ".join(rest).strip(), text=text)
+    about = AboutSpec.model_validate((parse_yaml(text, f"preset {name}") or {}).get("about", {}))
+    return Preset(name=name, **about.model_dump(), text=text)
 
 
 def find_preset(name: str) -> Preset:
@@ -88,13 +72,20 @@ def find_preset(name: str) -> Preset:
     Raises:
         SpecError: There is none; the message names the nearest.
     """
-    presets = {preset.name: preset for preset in list_presets()}
-    if name not in presets:
+    files = _preset_files()
+    if name not in files:
         raise SpecError(
-            f"There is no preset {name!r}.{did_you_mean(name, presets)}",
-            f"The presets are: {', '.join(presets)}.",
+            f"There is no preset {name!r}.{did_you_mean(name, files)}",
+            f"The presets are: {', '.join(files)}.",
         )
-    return presets[name]
+    return read_preset(name, files[name].read_text(encoding="utf-8"))
+
+
+def _preset_files() -> dict[str, Traversable]:
+    """The presets' files by their names, in order; reading all of them as YAML takes longer than to plan one."""
+    files = resources.files("tune_jobs.spec").joinpath("presets").iterdir()
+    presets = {file.name.removesuffix(".yaml"): file for file in files if file.name.endswith(".yaml")}
+    return dict(sorted(presets.items()))
 
 
 @checked
@@ -210,9 +201,9 @@ def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 def _read_text(source: str | Path) -> tuple[str, str]:
     path = Path(source)
     if not path.is_file():
-        presets = {preset.name: preset for preset in list_presets()}
+        presets = _preset_files()
         if str(source) in presets:
-            return f"preset {source}", presets[str(source)].text
+            return f"preset {source}", presets[str(source)].read_text(encoding="utf-8")
         if path.is_dir():
             raise SpecError(f"{source} is a folder, not a sweep file", "Name the .yaml file, or a preset.")
         suggestion = did_you_mean(source, presets)

@@ -46,6 +46,7 @@ _FORMS = {
     "name": f"use {NAME_RULE}",
     "rl_module": "write module:Class",
     "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
+    "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random or tpe, or a mapping of its fields",
     "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
 }
@@ -98,7 +99,8 @@ def _other_place(name: str) -> str:
     places = [
         f"{section}.{name}"
         for section, field in SweepFields.model_fields.items()
-        if isinstance(field.annotation, type)
+        if section != "about"  # its texts are no settings
+        and isinstance(field.annotation, type)
         and issubclass(field.annotation, BaseModel)
         and name in field.annotation.model_fields
     ]

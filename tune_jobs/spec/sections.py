@@ -12,6 +12,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    field_serializer,
 )
 
 from policies.hyperparams import Algorithm
@@ -37,6 +38,18 @@ class Section(BaseModel):
     """A part of a sweep: frozen, and without fields that it does not know."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class AboutSpec(Section):
+    """What a sweep is for, in words for its readers; nothing that is trained depends on it."""
+
+    title: str = Field("", description="What it is, in one line.")
+    source: str = Field("", description="Where its settings come from.")
+    shows: str = Field("", description="What is to be seen.")
+    expected: str = Field("", description="The score that it should reach.")
+    env_steps: str = Field("", description="How many env steps it takes.")
+    time: str = Field("", description="How long it takes, and on what.")
+    description: str = Field("", description="More, in as many lines as it needs.")
 
 
 class EnvSpec(Section):
@@ -175,6 +188,9 @@ class SweepFields(Section):
         pattern=f"^{NAME_PATTERN}$",
         description="Name of the sweep and of its folder; null: the file's or preset's, with a number if it is taken.",
     )
+    about: Annotated[AboutSpec, _from_text("title")] = Field(
+        default_factory=AboutSpec, description="What the sweep is for: a text, or a mapping. The report shows it."
+    )
     env: Annotated[EnvSpec, _from_text("id")] = Field(description="Gymnasium id, or a mapping of id and args.")
     algorithm: Algorithm = Field(description="ppo or dqn; or a baseline that does not learn: random or constant.")
     rl_module: str | None = Field(
@@ -204,6 +220,11 @@ class SweepFields(Section):
     iteration_timeout_s: PositiveNumber = Field(
         600.0, description="An iteration that takes longer counts as a failure of its trial."
     )
+
+    @field_serializer("about")
+    def _null_if_empty(self, about: AboutSpec) -> AboutSpec | None:
+        # In sweep.json null, as of any field that is left out: versions that don't know it read the sweep too.
+        return None if about == AboutSpec() else about
 
     @property
     def grace_env_steps(self) -> int:

@@ -3,14 +3,12 @@
 import os
 import time
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 
-class Edge(gym.Env[NDArray[np.float32], np.int64]):
+class Edge(gym.Env):
     """Walk on five tiles; falling over the left edge is failure, whoever stays is rewarded with 1 a step.
 
     Its first observation tells where it is, in [-1, 1].
@@ -18,27 +16,25 @@ class Edge(gym.Env[NDArray[np.float32], np.int64]):
 
     metadata = {"render_modes": ["rgb_array"], "failure": "terminated"}  # noqa: RUF012
 
-    def __init__(self, *, limit: int = 12, render_mode: str | None = None) -> None:
+    def __init__(self, *, limit=12, render_mode=None):
         self.limit, self.render_mode = limit, render_mode
         self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
         self.action_space = gym.spaces.Discrete(2)
         self.tile = self.ticks = 0
 
-    def _observation(self) -> NDArray[np.float32]:
+    def _observation(self):
         return np.array([(self.tile - 2) / 3, 1.0], np.float32)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.tile, self.ticks = int(self.np_random.integers(5)), 0
         return self._observation(), {}
 
-    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         self.tile, self.ticks = min(4, self.tile + (1 if action else -1)), self.ticks + 1
         return self._observation(), 1.0, self.tile < 0, self.ticks >= self.limit, {}
 
-    def render(self) -> Any:
+    def render(self):
         picture = np.zeros((32, 80, 3), np.uint8)
         picture[:, 16 * max(self.tile, 0) : 16 * max(self.tile, 0) + 16] = 255
         return picture
@@ -47,11 +43,11 @@ class Edge(gym.Env[NDArray[np.float32], np.int64]):
 class SlowEdge(Edge):
     """The same with steps of two milliseconds; each copy writes down which process it is in, and that one's parent."""
 
-    def __init__(self, *, pids: str | None, **kwargs: Any) -> None:
+    def __init__(self, *, pids, **kwargs):
         super().__init__(**kwargs)
         self.pids = pids
 
-    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action):
         if self.pids is not None:
             with Path(self.pids).open("a") as file:
                 file.write(f"{os.getpid()} {os.getppid()}\n")
@@ -61,5 +57,4 @@ class SlowEdge(Edge):
 
 
 if "TestEdge-v0" not in gym.registry:
-    # Gymnasium's type asks for a class that takes any keywords.
-    gym.register("TestEdge-v0", Edge, reward_threshold=11.5)  # type: ignore[arg-type]
+    gym.register("TestEdge-v0", Edge, reward_threshold=11.5)

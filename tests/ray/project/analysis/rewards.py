@@ -1,7 +1,5 @@
 """A helper of the project's environment."""
 
-from typing import SupportsFloat
 
-
-def reward_of(action: SupportsFloat) -> float:
+def reward_of(action):
     return float(action)
