@@ -46,14 +46,19 @@ $(VENV)/installed-bench: $(VENV)/installed
 	@touch $@
 
 # In three processes on two cores, as many of the tests wait for processes of their own: two halves of those in tests/ray,
-# each with a Ray of its own, and the others. What the halves print, skipped tests with their reasons too, comes at the end.
+# each with a Ray of its own, and the others; with the types beside them. What the halves print, skipped tests with their
+# reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
+# the environment says.
 RAY := tests/ray
-test: $(VENV)/installed-test lint types
-	@$(BIN)/python -m pytest $(RAY)/test_[a-o]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
+test: export PYTHONDONTWRITEBYTECODE =
+test: $(VENV)/installed-test lint
+	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
+	$(BIN)/python -m pytest $(RAY)/test_[a-o]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
 	$(BIN)/python -m pytest $(RAY)/test_[p-z]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
 	$(BIN)/python -m pytest --ignore=$(RAY); others=$$?; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
-	exit $$((first || second || others))
+	wait $$types; types=$$?; cat $(VENV)/types.log; \
+	exit $$((first || second || others || types))
 
 unit: $(VENV)/installed-test
 	$(BIN)/python -m pytest --quiet --numprocesses=2 tests/unit

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def guard():
+def guard() -> Iterator[None]:
     """One guard's child for all tests here: each plan would start one of its own."""
     from policies.guard.guard import guarding
 
@@ -28,7 +29,7 @@ def guard():
 
 
 @pytest.fixture(scope="session")
-def env_plugin(tmp_path_factory):
+def env_plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Install `env_plugin` for this process and those it starts: a metadata folder with Gymnasium's entry point."""
     folder = tmp_path_factory.mktemp("site")
     metadata = folder / "tune_jobs_test_envs-1.0.dist-info"
@@ -54,11 +55,11 @@ def env_plugin(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def ray_session(env_plugin):
+def ray_session(env_plugin: None) -> Iterator[None]:
     """A Ray of two CPUs, started as a sweep starts its own; RLlib would start one without these settings."""
     import ray
 
-    from tune_jobs.ray_tune.run_trials import prepare_environment
+    from tune_jobs.ray_tune.environment import prepare_environment
 
     prepare_environment()
     ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")

@@ -31,7 +31,7 @@ def main(storage: str | Path = "sweeps", overrides: Sequence[str] = ()) -> float
     while not done:
         observation, reward, terminated, truncated, _ = env.step(policy.act(observation))
         total, done = total + float(reward), terminated or truncated
-    env.close()
+    env.close()  # type: ignore[no-untyped-call]
     print(f"one episode of the best policy: {total:g}")
     return total
 

@@ -60,7 +60,7 @@ def domains() -> str:
     """What may stand in a space."""
     definitions = json_schema()["$defs"]
     references = re.findall(r"#/\$defs/(\w+)", json.dumps(definitions["Domain"]))
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in dict.fromkeys(references):
         ((kind, field),) = definitions[name]["properties"].items()
         rows.append((f"`{kind}`", field["description"], definitions[name]["description"]))
@@ -106,7 +106,7 @@ TABLES: dict[str, Callable[[], str]] = {
 def _fields(schema: Schema, links: Mapping[str, str] = {}) -> str:
     """A table of a mapping's fields; `links` has the words for fields that are mappings themselves, by definition."""
     required = schema.get("required", ())
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             f"`{name}`",
             " or ".join(dict.fromkeys(_values(field, links))),

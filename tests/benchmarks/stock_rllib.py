@@ -42,7 +42,8 @@ def _config(point: dict[str, Any]) -> dict[str, Any]:
             }
         )
     )
-    return config.to_dict()
+    settings: dict[str, Any] = config.to_dict()
+    return settings
 
 
 def main(num_env_steps: int) -> None:

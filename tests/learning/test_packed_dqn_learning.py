@@ -52,7 +52,8 @@ def test_a_pack_of_dqn_trials_solves_cartpole(ray_session: None, tmp_path: Path)
     from tune_jobs.training.packed import PackedEngine
 
     spec = load_spec("cartpole-dqn-tuned")
-    engine, reached = PackedEngine(), {}
+    engine = PackedEngine()
+    reached: dict[str, int] = {}
     running = [f"t{index:04d}" for index in range(NUM_SEEDS)]
     for index in range(NUM_SEEDS):
         engine.add(task_of(spec, index, tmp_path), None)

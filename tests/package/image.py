@@ -15,10 +15,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Self
 
 import yaml
+
+from tests.narrowing import present
 
 TIMEOUT_S = 1800
 # What a RUN may need to reach the package index of this machine.
@@ -54,25 +58,26 @@ def read_dockerfile(path: Path) -> list[Instruction]:
     return [Instruction(word.upper(), rest.strip()) for word, rest in parts]
 
 
-def read_compose(path: Path, variables: dict[str, str]) -> dict:
+def read_compose(path: Path, variables: dict[str, str]) -> dict[str, Any]:
     """The services, `${NAME:-default}` and `${NAME:?message}` replaced."""
 
-    def replace(match: re.Match) -> str:
+    def replace(match: re.Match[str]) -> str:
         name, kind, rest = match.groups()
         if variables.get(name):
             return variables[name]
         if kind == ":?":
             raise KeyError(f"{name}: {rest}")
-        return rest or ""
+        return str(rest or "")
 
     text = "\n".join(line for line in path.read_text().splitlines() if not line.lstrip().startswith("#"))
-    return yaml.safe_load(re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", replace, text))
+    services: dict[str, Any] = yaml.safe_load(re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", replace, text))
+    return services
 
 
 class Root:
     """A root file system that is thrown away, and the namespaces in which commands see it."""
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         script = """
             mount -t tmpfs -o size=16g tmpfs /mnt
             mkdir /mnt/upper /mnt/work /mnt/root
@@ -91,26 +96,34 @@ class Root:
         self._keeper, self._inside = _hold(
             ["unshare", "--mount", "--pid", "--fork", "--kill-child"], ["sh", "-ec", script]
         )
-        self._network: subprocess.Popen | None = None
-        self._children: list[subprocess.Popen] = []
+        self._network: subprocess.Popen[str] | None = None
+        self._children: list[subprocess.Popen[bytes]] = []
         self._enter = ["nsenter", f"--target={self._inside}", "--mount", "--pid"]
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         for process in [*self._children, self._network, self._keeper]:
             if process is not None:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
 
-    def cut_off(self):
+    def cut_off(self) -> None:
         """From now on, commands share a network that has nothing but a loopback device."""
         self._network, inside = _hold(
             [*self._enter, "unshare", "--net"], ["sh", "-ec", "ip link set lo up; echo ready; exec sleep infinity"]
         )
         self._enter = [*self._enter, f"--net=/proc/{inside}/ns/net"]
 
-    def begin(self, command, *, environment, workdir="/", user=None, log=None) -> subprocess.Popen:
+    def begin(
+        self,
+        command: Sequence[str],
+        *,
+        environment: Mapping[str, str],
+        workdir: str = "/",
+        user: str | None = None,
+        log: Path | None = None,
+    ) -> subprocess.Popen[bytes]:
         """Start a command in the root; without a user as root, else as Docker would with all capabilities dropped."""
         become = []
         if user is not None:
@@ -128,7 +141,7 @@ class Root:
         self._children.append(process)
         return process
 
-    def run(self, command, **options) -> subprocess.CompletedProcess:
+    def run(self, command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
         process = self.begin(command, **options)
         out, _ = process.communicate(timeout=TIMEOUT_S)
         return subprocess.CompletedProcess(command, process.returncode, out.decode(errors="replace"))
@@ -138,13 +151,13 @@ class Root:
         return Path(f"/proc/{self._inside}/root/mnt/root{path}")
 
 
-def _hold(namespaces: list[str], command: list[str]) -> tuple[subprocess.Popen, int]:
+def _hold(namespaces: list[str], command: list[str]) -> tuple[subprocess.Popen[str], int]:
     """Start a command that says `ready` and stays, in namespaces; returns its parent and its own process id."""
     process = subprocess.Popen(
         [*namespaces, *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     )  # fmt: skip
-    if process.stdout.readline() != "ready\n":
+    if present(process.stdout).readline() != "ready\n":
         process.kill()
         raise OSError(process.communicate()[1].strip())
     inside = process.pid
@@ -175,29 +188,29 @@ class Image:
         for instruction in read_dockerfile(dockerfile):
             getattr(self, f"_{instruction.word.lower()}")(instruction.rest, context, arguments)
 
-    def _from(self, rest, context, arguments):
+    def _from(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         """The base image: see `build`."""
 
-    def _arg(self, rest, context, arguments):
+    def _arg(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         name, _, default = rest.partition("=")
         arguments[name] = default.strip('"')
 
-    def _env(self, rest, context, arguments):
+    def _env(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         for assignment in shlex.split(rest):
             name, _, value = assignment.partition("=")
             self.environment[name] = value.replace("$PATH", self.environment["PATH"])
 
-    def _workdir(self, rest, context, arguments):
+    def _workdir(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         self.workdir = rest
         self._checked(["mkdir", "-p", rest])
 
-    def _user(self, rest, context, arguments):
+    def _user(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         self.user = rest
 
-    def _cmd(self, rest, context, arguments):
+    def _cmd(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         self.command = json.loads(rest)
 
-    def _copy(self, rest, context, arguments):
+    def _copy(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         *sources, target = rest.split()
         folder = self.root.path(os.path.normpath(Path(self.workdir, target)))
         ignore = shutil.ignore_patterns("__pycache__")
@@ -207,27 +220,38 @@ class Image:
             else:
                 shutil.copy(context / source, folder / source)
 
-    def _run(self, rest, context, arguments):
+    def _run(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         self._checked(["sh", "-ec", rest], arguments)
 
-    def _checked(self, command, arguments=None):
+    def _checked(self, command: Sequence[str], arguments: dict[str, str] | None = None) -> None:
         environment = {**(arguments or {}), "HOME": "/root", **self.environment}
         done = self.root.run(command, environment=environment, workdir=self.workdir if "-p" not in command else "/")
         assert done.returncode == 0, f"{command} failed:\n{done.stdout[-4000:]}"
 
-    def begin(self, command, *, environment, log=None, workdir=None) -> subprocess.Popen:
+    def begin(
+        self,
+        command: Sequence[str],
+        *,
+        environment: Mapping[str, str],
+        log: Path | None = None,
+        workdir: str | None = None,
+    ) -> subprocess.Popen[bytes]:
         """Start a command as a container of this image would."""
         return self.root.begin(
             command, environment={"HOME": f"/home/{self.user}", **self.environment, **environment},
             workdir=workdir or self.workdir, user=self.user, log=log,
         )  # fmt: skip
 
-    def run(self, command, *, environment, workdir=None) -> subprocess.CompletedProcess:
+    def run(
+        self, command: Sequence[str], *, environment: Mapping[str, str], workdir: str | None = None
+    ) -> subprocess.CompletedProcess[str]:
         process = self.begin(command, environment=environment, workdir=workdir)
         out, _ = process.communicate(timeout=TIMEOUT_S)
         return subprocess.CompletedProcess(command, process.returncode, out.decode(errors="replace"))
 
-    def wait_until_healthy(self, service: dict, process: subprocess.Popen, log: Path, timeout_s: float = 300) -> None:
+    def wait_until_healthy(
+        self, service: dict[str, Any], process: subprocess.Popen[bytes], log: Path, timeout_s: float = 300
+    ) -> None:
         """Ask a service's health check until it passes."""
         kind, *test = service["healthcheck"]["test"]
         command = ["sh", "-c", *test] if kind == "CMD-SHELL" else test
@@ -237,7 +261,9 @@ class Image:
             assert time.monotonic() < deadline, f"never healthy: {done.stdout}\n{log.read_text()}"
             time.sleep(1)
 
-    def wait_until(self, command, pattern: str, *, environment, timeout_s: float = 120) -> None:
+    def wait_until(
+        self, command: Sequence[str], pattern: str, *, environment: Mapping[str, str], timeout_s: float = 120
+    ) -> None:
         """Run a command until its output matches."""
         deadline = time.monotonic() + timeout_s
         while not re.search(pattern, (done := self.run(command, environment=environment)).stdout):

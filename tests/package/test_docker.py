@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ TOKEN = "0123456789abcdef" * 4
 
 
 @pytest.fixture(scope="module")
-def image():
+def image() -> Iterator[Image]:
     if reason := why_not():
         pytest.skip(reason)
     with Root() as root:
@@ -29,7 +30,7 @@ def canonical(name: str) -> str:
     return re.sub("[-_.]+", "-", name).lower()
 
 
-def test_the_image_holds_the_pinned_versions_and_nothing_runs_as_root(image):
+def test_the_image_holds_the_pinned_versions_and_nothing_runs_as_root(image: Image) -> None:
     assert image.run(["id", "-un"], environment={}).stdout == "tune\n"
     assert "Usage: tune-jobs" in image.run(image.command, environment={}).stdout
     done = image.run(["pip", "list", "--format=json"], environment={})
@@ -47,7 +48,7 @@ def test_the_image_holds_the_pinned_versions_and_nothing_runs_as_root(image):
     assert image.run(["rm", "/sweeps/file"], environment={}).returncode == 0
 
 
-def test_the_composed_services_run_a_sweep_on_two_workers(image, tmp_path):
+def test_the_composed_services_run_a_sweep_on_two_workers(image: Image, tmp_path: Path) -> None:
     compose = read_compose(ROOT / "docker" / "compose.yaml", {"RAY_AUTH_TOKEN": TOKEN, "WORKER_CPUS": "1"})
     services = compose["services"]
     head_log = tmp_path / "head.log"

@@ -3,6 +3,7 @@
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import pytest
 from image import read_compose, read_dockerfile
@@ -13,25 +14,25 @@ INSTRUCTIONS = read_dockerfile(DOCKER / "Dockerfile")
 
 
 @pytest.fixture(scope="module")
-def compose():
+def compose() -> dict[str, Any]:
     return read_compose(DOCKER / "compose.yaml", {"RAY_AUTH_TOKEN": "secret"})
 
 
-def rest_of(word):
+def rest_of(word: str) -> list[str]:
     return [instruction.rest for instruction in INSTRUCTIONS if instruction.word == word]
 
 
-def copied():
+def copied() -> list[str]:
     return [source for rest in rest_of("COPY") for source in rest.split()[:-1]]
 
 
-def test_the_image_runs_as_another_user_than_root():
+def test_the_image_runs_as_another_user_than_root() -> None:
     assert rest_of("USER") == ["tune"]
     words = [instruction.word for instruction in INSTRUCTIONS]
     assert "RUN" not in words[words.index("USER") :]
 
 
-def test_the_base_and_every_package_are_pinned():
+def test_the_base_and_every_package_are_pinned() -> None:
     (base,) = rest_of("FROM")
     assert base.startswith("python:3.11-slim-")
     installs = [command for rest in rest_of("RUN") for command in rest.split("&&") if "pip install" in command]
@@ -39,7 +40,7 @@ def test_the_base_and_every_package_are_pinned():
     assert all("--constraint constraints.txt" in command or "--no-deps" in command for command in installs)
 
 
-def test_the_whole_package_is_copied_and_nothing_else_is_sent():
+def test_the_whole_package_is_copied_and_nothing_else_is_sent() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     packages = [name.rstrip("*") for name in project["tool"]["setuptools"]["packages"]["find"]["include"]]
     assert set(packages) <= set(copied())
@@ -51,17 +52,17 @@ def test_the_whole_package_is_copied_and_nothing_else_is_sent():
     assert all((ROOT / source).exists() for source in copied())
 
 
-def test_the_secret_is_never_committed():
+def test_the_secret_is_never_committed() -> None:
     ignored = (ROOT / ".gitignore").read_text().split()
     assert any(fnmatch("docker/.env", rule) for rule in ignored)
 
 
-def test_without_a_token_nothing_starts():
+def test_without_a_token_nothing_starts() -> None:
     with pytest.raises(KeyError, match=r"RAY_AUTH_TOKEN: Write one to docker/\.env first"):
         read_compose(DOCKER / "compose.yaml", {})
 
 
-def test_every_service_shows_the_token_and_shares_the_storage(compose):
+def test_every_service_shows_the_token_and_shares_the_storage(compose: dict[str, Any]) -> None:
     (storage,) = [part for rest in rest_of("ENV") for part in rest.split() if part.startswith("TUNE_JOBS_STORAGE=")]
     for service in compose["services"].values():
         assert service["environment"]["RAY_AUTH_MODE"] == "token"
@@ -72,18 +73,18 @@ def test_every_service_shows_the_token_and_shares_the_storage(compose):
     assert list(compose["volumes"]) == ["sweeps"]
 
 
-def test_no_port_is_published(compose):
+def test_no_port_is_published(compose: dict[str, Any]) -> None:
     assert not any("ports" in service or "network_mode" in service for service in compose["services"].values())
 
 
-def test_workers_scale(compose):
+def test_workers_scale(compose: dict[str, Any]) -> None:
     worker = compose["services"]["worker"]
     assert "container_name" not in worker
     assert "hostname" not in worker
     assert f"--num-cpus={worker['cpus']}" in worker["command"]
 
 
-def test_the_services_agree_on_the_heads_ports(compose):
+def test_the_services_agree_on_the_heads_ports(compose: dict[str, Any]) -> None:
     head, worker, launcher = (compose["services"][name] for name in ("head", "worker", "launcher"))
     assert "--port=6379" in head["command"]
     assert "--address=head:6379" in worker["command"]

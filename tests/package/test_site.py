@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tests.narrowing import present
 from tune_jobs.spec.domains import DOMAIN_KINDS
 from tune_jobs.spec.file import list_presets
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -26,27 +27,30 @@ MOST_WORDS = 1_300
 class Page(HTMLParser):
     """What a page links to and loads, its anchors and its text."""
 
-    def __init__(self, text):
+    def __init__(self, text: str) -> None:
         super().__init__()
-        self.links, self.loads, self.anchors, self.text = [], [], set(), ""
+        self.links: list[str] = []
+        self.loads: list[str] = []
+        self.anchors: set[str] = set()
+        self.text = ""
         self.feed(text)
 
-    def handle_starttag(self, tag, attrs):
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         found = dict(attrs)
-        self.anchors |= {found["id"]} if "id" in found else set()
+        self.anchors |= {present(found["id"])} if "id" in found else set()
         if tag == "a" and found.get("href"):
-            self.links.append(found["href"])
+            self.links.append(present(found["href"]))
         elif tag == "link" and found.get("rel") not in ("prev", "next", "canonical"):
-            self.loads.append(found["href"])
+            self.loads.append(present(found["href"]))
         elif found.get("src"):
-            self.loads.append(found["src"])
+            self.loads.append(present(found["src"]))
 
-    def handle_data(self, data):
+    def handle_data(self, data: str) -> None:
         self.text += data
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)]
     env = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONDONTWRITEBYTECODE": "1"}
@@ -56,15 +60,15 @@ def site(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pages(site):
+def pages(site: Path) -> dict[Path, Page]:
     return {path: Page(path.read_text()) for path in sorted(site.rglob("*.html"))}
 
 
-def test_the_readme_is_short():
+def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().split()) <= MOST_WORDS
 
 
-def test_every_link_leads_to_a_page_and_a_place_on_it(site, pages):
+def test_every_link_leads_to_a_page_and_a_place_on_it(site: Path, pages: dict[Path, Page]) -> None:
     lost = set()
     for path, page in pages.items():
         if path.name == "404.html":  # its links are of a server's root
@@ -79,7 +83,7 @@ def test_every_link_leads_to_a_page_and_a_place_on_it(site, pages):
     assert lost == set()
 
 
-def test_nothing_is_loaded_from_elsewhere(site, pages):
+def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -> None:
     loaded = {(path.relative_to(site), load) for path, page in pages.items() for load in page.loads}
     assert {(path, load) for path, load in loaded if urlsplit(load).scheme not in ("", "data")} == set()
     styles = "".join(path.read_text() for path in site.rglob("*.css"))
@@ -88,8 +92,8 @@ def test_nothing_is_loaded_from_elsewhere(site, pages):
     assert not any('class="mermaid"' in path.read_text() for path in pages)
 
 
-def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site, pages):
-    def text(name):
+def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site: Path, pages: dict[Path, Page]) -> None:
+    def text(name: str) -> str:
         return pages[site / name].text
 
     fields = {name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields}
@@ -104,12 +108,12 @@ def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site, pages)
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_search_works_in_files_that_no_server_serves(site, tmp_path):
+def test_search_works_in_files_that_no_server_serves(site: Path, tmp_path: Path) -> None:
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
     page = f"{(site / 'index.html').as_uri()}?q=vf_clip_param"
     done = subprocess.run(
-        [CHROMIUM, *flags.split(), "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path}/profile",
-         "--virtual-time-budget=20000", "--dump-dom", page],
+        [present(CHROMIUM), *flags.split(), "--host-resolver-rules=MAP * ~NOTFOUND",
+         f"--user-data-dir={tmp_path}/profile", "--virtual-time-budget=20000", "--dump-dom", page],
         capture_output=True, text=True, check=True, timeout=600,
     )  # fmt: skip
     found = re.findall(r'href="([^"#?]*)[^"]*" class="md-search-result__link"', done.stdout)

@@ -17,6 +17,7 @@ import traceback
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ ENDLESS = {"stop": {"num_env_steps": 500_000_000}}
 STORAGE = Path(sys.argv[1])
 
 
-def state() -> dict:
+def state() -> dict[str, Any]:
     root, mine = logging.getLogger(), logging.getLogger("mine")
     return {
         "environment": dict(os.environ),
@@ -56,7 +57,7 @@ def state() -> dict:
     }
 
 
-def launch(name: str, **changes) -> str:
+def launch(name: str, **changes: Any) -> str:
     """Launch a sweep; what came of it."""
     try:
         keywords = {key: changes.pop(key) for key in ("address", "finish") if key in changes}
@@ -86,7 +87,7 @@ class Holder:
         return True
 
 
-def tell(what: str, before: dict, came_of_it: str) -> None:
+def tell(what: str, before: dict[str, Any], came_of_it: str) -> None:
     after = state()
     changed = {key: [repr(value), repr(after[key])] for key, value in before.items() if after[key] != value}
     print(json.dumps({"what": what, "came of it": came_of_it, "changed": changed}), flush=True)

@@ -2,43 +2,34 @@
 
 import itertools
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from rllib_cases import (
+    Build,
     count_updates,
     env_steps,
     learner_of,
     module_of,
     optimizer_of,
     reaches,
+    sampled_rows,
 )
 
-
-def sampled_rows(algo, num_iterations=1):
-    """What the loss was computed from, update by update."""
-    rows = []
-    learner = learner_of(algo)
-    update = learner.update_from_transitions
-
-    def spied(batch, optimizer):
-        rows.append(batch)
-        return update(batch, optimizer)
-
-    learner.update_from_transitions = spied
-    for _ in range(num_iterations):
-        algo.train()
-    return rows
+from policies.replay import PrioritizedReplayBuffer, ReplayBuffer, Transitions
 
 
-def column(rows, name):
+def column(rows: Sequence[Transitions], name: str) -> NDArray[Any]:
     return np.concatenate([getattr(batch, name) for batch in rows])
 
 
 @reaches("dqn", field="lr_final")
 @reaches("dqn", field="lr_decay_steps")
-def check_lr_schedule(build, _):
+def check_lr_schedule(build: Build, _: object) -> None:
     algo = build("dqn", lr=1e-2, lr_final=2e-3, lr_decay_steps=40)
     found = []
     for _ in range(3):
@@ -48,19 +39,22 @@ def check_lr_schedule(build, _):
 
 
 @reaches("dqn", field="grad_clip")
-def check_grad_clip(build, _):
+def check_grad_clip(build: Build, _: object) -> None:
     norms = {}
     for clip in (None, 1e-3):
         algo = build("dqn", grad_clip=clip)
         optimizer = optimizer_of(algo)
-        step, seen = optimizer.step, []
+        step: Callable[..., Any] = optimizer.step
+        seen: list[float] = []
 
-        def spied(*args, optimizer=optimizer, seen=seen, step=step):
+        def spied(
+            *args: Any, optimizer: Any = optimizer, seen: list[float] = seen, step: Callable[..., Any] = step
+        ) -> Any:
             params = optimizer.param_groups[0]["params"]
             seen.append(float(torch.sqrt(sum((param.grad**2).sum() for param in params))))
             return step(*args)
 
-        optimizer.step = spied
+        optimizer.step = spied  # type: ignore[method-assign, assignment]
         algo.train()
         norms[clip] = max(seen)
     assert norms[None] > 1e-2
@@ -68,7 +62,7 @@ def check_grad_clip(build, _):
 
 
 @reaches("dqn", field="gamma")
-def check_dqn_gamma(build, _):
+def check_dqn_gamma(build: Build, _: object) -> None:
     rows = sampled_rows(build("dqn", gamma=0.5, n_step=3), 3)
     rewards, discounts = column(rows, "rewards"), column(rows, "discounts")
     # CartPole gives 1 a step: three steps of it, discounted; fewer at the end of an episode.
@@ -78,7 +72,7 @@ def check_dqn_gamma(build, _):
 
 
 @reaches("dqn", field="n_step")
-def check_n_step(build, _):
+def check_n_step(build: Build, _: object) -> None:
     rows = sampled_rows(build("dqn", gamma=1.0, n_step=4), 3)
     rewards = column(rows, "rewards")
     assert max(rewards) == np.median(rewards) == 4.0
@@ -87,7 +81,7 @@ def check_n_step(build, _):
     assert np.median(np.abs(following[:, 0] - observations[:, 0] - 0.08 * observations[:, 1])) < 0.03
 
 
-def target_of(algo, *, next_online, next_target, q=0.0):
+def target_of(algo: Any, *, next_online: list[float], next_target: list[float], q: float = 0.0) -> tuple[float, float]:
     """(loss, |TD error|) for reward 0, discount 1 and these Q-values of the next state."""
     batch = {
         "actions": torch.zeros(2, dtype=torch.long),
@@ -104,7 +98,7 @@ def target_of(algo, *, next_online, next_target, q=0.0):
 
 
 @reaches("dqn", field="double_q")
-def check_double_q(build, _):
+def check_double_q(build: Build, _: object) -> None:
     for double_q, expected in ((True, 2.0), (False, 6.0)):
         algo = build("dqn", double_q=double_q)
         # The online network prefers action 0, the target network action 1.
@@ -112,14 +106,14 @@ def check_double_q(build, _):
 
 
 @reaches("dqn", field="td_loss")
-def check_td_loss(build, _):
+def check_td_loss(build: Build, _: object) -> None:
     for loss, expected in (("huber", 2.5), ("mse", 9.0)):
         algo = build("dqn", td_loss=loss)
         assert target_of(algo, next_online=[1.0, 0.0], next_target=[3.0, 0.0])[0] == pytest.approx(expected)
 
 
 @reaches("dqn", field="dueling")
-def check_dueling(build, _):
+def check_dueling(build: Build, _: object) -> None:
     obs = torch.randn(5, 4)
     for dueling in (True, False):
         module = module_of(build("dqn", dueling=dueling))
@@ -132,23 +126,23 @@ def check_dueling(build, _):
 
 
 @reaches("dqn", field="train_batch_size")
-def check_dqn_train_batch_size(build, _):
+def check_dqn_train_batch_size(build: Build, _: object) -> None:
     rows = sampled_rows(build("dqn", train_batch_size=13))
     assert {len(batch.obs) for batch in rows} == {13}
 
 
 @reaches("dqn", field="env_steps_per_iteration")
-def check_env_steps_per_iteration(build, _):
+def check_env_steps_per_iteration(build: Build, _: object) -> None:
     algo = build("dqn", env_steps_per_iteration=37)
     assert [env_steps(algo.train()) for _ in range(2)] == [37, 74]
 
 
 @reaches("dqn", field="train_freq")
-def check_train_freq(build, _):
+def check_train_freq(build: Build, _: object) -> None:
     algo = build("dqn", train_freq=5, train_batch_size=1)
     phases, update = [], learner_of(algo).update_from_replay
 
-    def spied(replay, num_updates, **counts):
+    def spied(replay: ReplayBuffer, num_updates: int, **counts: int) -> Any:
         phases.append((num_updates, counts["num_env_steps"]))
         return update(replay, num_updates, **counts)
 
@@ -158,7 +152,7 @@ def check_train_freq(build, _):
 
 
 @reaches("dqn", field="updates_per_env_step")
-def check_updates_per_env_step(build, _):
+def check_updates_per_env_step(build: Build, _: object) -> None:
     # (updates a step, sub-environments): updates for 48 env steps
     for rate, num_envs, expected in ((1.0, 1, 48), (1.0, 4, 48), (0.25, 1, 12), (0.3, 4, 14), (3.0, 2, 144)):
         algo = build(
@@ -170,7 +164,7 @@ def check_updates_per_env_step(build, _):
 
 
 @reaches("dqn", field="optimizer")
-def check_optimizer(build, _):
+def check_optimizer(build: Build, _: object) -> None:
     for name, kind in (("adam", torch.optim.Adam), ("rmsprop", torch.optim.RMSprop)):
         algo = build("dqn", optimizer=name)
         assert type(optimizer_of(algo)) is kind
@@ -179,39 +173,41 @@ def check_optimizer(build, _):
         assert not torch.equal(before, module_of(algo).af.weight)
 
 
-def check_optimizer_argument(build, field, value, *, key, optimizer, expected=None):
+def check_optimizer_argument(
+    build: Build, field: str, value: float, *, key: str, optimizer: str, expected: tuple[float, float] | None = None
+) -> None:
     algo = build("dqn", optimizer=optimizer, **{field: value})
     algo.train()
     assert [group[key] for group in optimizer_of(algo).param_groups] == [value if expected is None else expected]
 
 
 @reaches("dqn", field="optimizer_epsilon")
-def check_optimizer_epsilon(build, _):
+def check_optimizer_epsilon(build: Build, _: object) -> None:
     for optimizer in ("adam", "rmsprop"):
         check_optimizer_argument(build, "optimizer_epsilon", 1e-4, key="eps", optimizer=optimizer)
 
 
 @reaches("dqn", field="adam_beta1")
-def check_adam_beta1(build, _):
+def check_adam_beta1(build: Build, _: object) -> None:
     check_optimizer_argument(build, "adam_beta1", 0.5, key="betas", optimizer="adam", expected=(0.5, 0.999))
 
 
 @reaches("dqn", field="adam_beta2")
-def check_adam_beta2(build, _):
+def check_adam_beta2(build: Build, _: object) -> None:
     check_optimizer_argument(build, "adam_beta2", 0.5, key="betas", optimizer="adam", expected=(0.9, 0.5))
 
 
 @reaches("dqn", field="rmsprop_rho")
-def check_rmsprop_rho(build, _):
+def check_rmsprop_rho(build: Build, _: object) -> None:
     check_optimizer_argument(build, "rmsprop_rho", 0.5, key="alpha", optimizer="rmsprop")
 
 
 @reaches("dqn", field="rmsprop_momentum")
-def check_rmsprop_momentum(build, _):
+def check_rmsprop_momentum(build: Build, _: object) -> None:
     check_optimizer_argument(build, "rmsprop_momentum", 0.5, key="momentum", optimizer="rmsprop")
 
 
-def next_values(algo):
+def next_values(algo: Any) -> tuple[torch.Tensor, torch.Tensor]:
     """(online, target) Q-values of the same next observations, after the online weights moved."""
     module = module_of(algo)
     with torch.no_grad():
@@ -222,7 +218,7 @@ def next_values(algo):
 
 
 @reaches("dqn", field="target_network")
-def check_target_network(build, _):
+def check_target_network(build: Build, _: object) -> None:
     online, target = next_values(build("dqn", target_network=True, double_q=False))
     assert not torch.allclose(online, target)
     algo = build("dqn", target_network=False, double_q=False)
@@ -234,13 +230,13 @@ def check_target_network(build, _):
     assert learner_of(algo).num_target_updates == 0
 
 
-def target_updates(algo, num_iterations):
+def target_updates(algo: Any, num_iterations: int) -> list[int]:
     """How often the target network really changed, iteration by iteration."""
     learner, counts = learner_of(algo), []
     update, target = learner.update_target, module_of(algo)._target_af.weight
     changes = []
 
-    def spied():
+    def spied() -> None:
         before = target.clone()
         update()
         changes.append(not torch.equal(before, target))
@@ -253,7 +249,7 @@ def target_updates(algo, num_iterations):
 
 
 @reaches("dqn", field="target_update_freq")
-def check_target_update_freq(build, _):
+def check_target_update_freq(build: Build, _: object) -> None:
     # At 7, 14, 21, 28, 35, ... env steps.
     assert target_updates(build("dqn", target_update_freq=7, train_batch_size=1), 3) == [2, 5, 8]
     # The updates of a training phase are spread over the env steps before it.
@@ -264,7 +260,7 @@ def check_target_update_freq(build, _):
 
 
 @reaches("dqn", field="target_update_unit")
-def check_target_update_unit(build, _):
+def check_target_update_unit(build: Build, _: object) -> None:
     algo = build("dqn", target_update_freq=2, target_update_unit="episode", env_steps_per_iteration=150)
     counts = target_updates(algo, 2)
     assert counts[-1] == algo.num_episodes // 2
@@ -272,7 +268,7 @@ def check_target_update_unit(build, _):
 
 
 @reaches("dqn", field="tau")
-def check_tau(build, _):
+def check_tau(build: Build, _: object) -> None:
     for tau in (0.25, 1.0):
         algo = build("dqn", tau=tau)
         module = module_of(algo)
@@ -286,7 +282,7 @@ def check_tau(build, _):
 
 
 @reaches("dqn", field="replay")
-def check_replay(build, _):
+def check_replay(build: Build, _: object) -> None:
     uniform = sampled_rows(build("dqn", replay="uniform"), 2)
     assert all(rows.weights is None for rows in uniform)
     prioritized = sampled_rows(build("dqn", replay="prioritized"), 2)
@@ -299,29 +295,29 @@ def check_replay(build, _):
 
 
 @reaches("dqn", field="replay_capacity")
-def check_replay_capacity(build, _):
+def check_replay_capacity(build: Build, _: object) -> None:
     algo = build("dqn", replay_capacity=60, env_steps_per_iteration=200)
     algo.train()
     assert len(algo.replay) == algo.replay.capacity == 60
 
 
 @reaches("dqn", field="prioritized_alpha")
-def check_prioritized_alpha(build, _):
+def check_prioritized_alpha(build: Build, _: object) -> None:
     """With alpha 0 all rows are as likely, whatever their TD errors."""
     for alpha, expected in ((0.0, 1.0), (1.0, 100.0)):
         replay = build("dqn", replay="prioritized", prioritized_alpha=alpha).replay
         assert priority_ratio(replay, 100.0) == pytest.approx(expected, rel=1e-3)
 
 
-def priority_ratio(replay, td_error):
+def priority_ratio(replay: PrioritizedReplayBuffer, td_error: float) -> float:
     rows = sampled_like(replay, 2)
     where = replay.add(rows)
     replay.set_priorities(where, np.array([1.0, td_error], dtype=np.float32))
     leaves = replay._priorities.leaves[where]
-    return leaves[1] / leaves[0]
+    return float(leaves[1] / leaves[0])
 
 
-def sampled_like(replay, count):
+def sampled_like(replay: ReplayBuffer, count: int) -> Transitions:
     from policies.replay import Transitions
 
     numbers = np.arange(count, dtype=np.float32)
@@ -330,7 +326,7 @@ def sampled_like(replay, count):
 
 
 @reaches("dqn", field="prioritized_beta")
-def check_prioritized_beta(build, _):
+def check_prioritized_beta(build: Build, _: object) -> None:
     for beta, flat in ((0.0, True), (1.0, False)):
         algo = build("dqn", replay="prioritized", prioritized_beta=beta)
         weights = column(sampled_rows(algo, 3), "weights")
@@ -338,7 +334,7 @@ def check_prioritized_beta(build, _):
 
 
 @reaches("dqn", field="learning_starts")
-def check_learning_starts(build, _):
+def check_learning_starts(build: Build, _: object) -> None:
     algo = build("dqn", learning_starts=50)
     sizes = count_updates(algo)
     counts = []
@@ -348,13 +344,13 @@ def check_learning_starts(build, _):
     assert counts == [0, 0, 11, 31]
 
 
-def epsilons(build, num_iterations, **values):
+def epsilons(build: Build, num_iterations: int, **values: Any) -> tuple[Any, list[tuple[int, float]]]:
     """(t, epsilon) of each step that the env runner explored."""
     algo = build("dqn", **values)
     module = algo.env_runner.module
     explore, used = module._forward_exploration, []
 
-    def spied(batch, t):
+    def spied(batch: dict[str, torch.Tensor], t: int) -> Any:
         used.append((t, module.exploration_schedule.at(t)))
         return explore(batch, t=t)
 
@@ -367,20 +363,20 @@ def epsilons(build, num_iterations, **values):
 @reaches("dqn", field="epsilon_initial")
 @reaches("dqn", field="epsilon_final")
 @reaches("dqn", field="epsilon_decay")
-def check_epsilon(build, _):
+def check_epsilon(build: Build, _: object) -> None:
     _, used = epsilons(build, 3, epsilon_initial=0.8, epsilon_final=0.2, epsilon_decay=30)
     # As a mapping: a vector env's step that only resets is no env step, and acts with the epsilon of the next one.
     assert dict(used) == {t: pytest.approx(max(0.2, 0.8 - 0.02 * t)) for t in range(60)}
 
 
 @reaches("dqn", field="epsilon_start")
-def check_epsilon_start(build, _):
+def check_epsilon_start(build: Build, _: object) -> None:
     _, used = epsilons(build, 2, epsilon_initial=1.0, epsilon_final=0.0, epsilon_decay=10, epsilon_start=15)
     assert dict(used) == {t: pytest.approx(min(1.0, max(0.0, 2.5 - 0.1 * t))) for t in range(40)}
 
 
 @reaches("dqn", field="epsilon_schedule")
-def check_epsilon_schedule(build, _):
+def check_epsilon_schedule(build: Build, _: object) -> None:
     values = {"epsilon_initial": 0.9, "epsilon_final": 0.1, "epsilon_decay": 10}
     _, used = epsilons(build, 2, epsilon_schedule="exponential", **values)
     assert dict(used) == {t: pytest.approx(0.1 + 0.8 * math.exp(-t / 10)) for t in range(40)}
@@ -389,7 +385,7 @@ def check_epsilon_schedule(build, _):
 
 
 @reaches("dqn", field="epsilon_unit")
-def check_epsilon_unit(build, _):
+def check_epsilon_unit(build: Build, _: object) -> None:
     # Episodes that end within a training phase count at once.
     algo, used = epsilons(build, 2, epsilon_unit="episode", env_steps_per_iteration=150, train_freq=75)
     episodes = [t for t, _ in used]

@@ -5,15 +5,17 @@ What they decide is what is to be decided: the tests of `tune_jobs.ray_tune.sche
 
 import dataclasses
 import math
+from typing import Any
 
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import ASHAScheduler, MedianStoppingRule, TrialScheduler
 
 from tune_jobs.ray_tune.scheduling import WORST_SCORE
+from tune_jobs.spec.sections import SchedulerSpec
 
 
-class _EndsUnscored(TrialScheduler):
-    def on_trial_result(self, tune_controller, trial, result):
+class _EndsUnscored(TrialScheduler):  # type: ignore[misc]
+    def on_trial_result(self, tune_controller: Any, trial: Any, result: dict[str, Any]) -> Any:
         if not result.get("evaluated"):
             return "CONTINUE"
         score = result.get("score", WORST_SCORE)
@@ -22,15 +24,15 @@ class _EndsUnscored(TrialScheduler):
         return super().on_trial_result(tune_controller, trial, result)
 
 
-class _ASHA(_EndsUnscored, ASHAScheduler):
+class _ASHA(_EndsUnscored, ASHAScheduler):  # type: ignore[misc]
     pass
 
 
-class _Median(_EndsUnscored, MedianStoppingRule):
+class _Median(_EndsUnscored, MedianStoppingRule):  # type: ignore[misc]
     pass
 
 
-def former(spec, max_env_steps):
+def former(spec: SchedulerSpec, max_env_steps: int) -> Any:
     """The scheduler of a sweep; see `SchedulerSpec`, whose `grace_env_steps` is set."""
     grace = spec.grace_env_steps
     common = {"time_attr": "num_env_steps", "metric": "score", "mode": "max"}
@@ -50,7 +52,7 @@ class FakedTrial:
     status: str = Trial.RUNNING
 
     @property
-    def config(self):
+    def config(self) -> dict[str, str]:
         return {"trial_id": self.trial_id}
 
 
@@ -58,7 +60,7 @@ class FakedTrial:
 class FakedController:
     """What they need of the controller: the trials, of which some may wait."""
 
-    live: tuple = ()
+    live: tuple[FakedTrial, ...] = ()
 
-    def get_live_trials(self):
+    def get_live_trials(self) -> list[FakedTrial]:
         return list(self.live)

@@ -1,15 +1,20 @@
 """The cases of the hyperparameters of networks; see `rllib_cases`."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from rllib_cases import linears, module_of, modules_of, reaches
+from numpy.typing import NDArray
+from rllib_cases import Build, linears, module_of, modules_of, reaches
 from torch import nn
+
+from policies.hyperparams import Algorithm
 
 FILTERS = ((5, 4, 2), (3, 2, 1))
 
 
-def heads_of(module):
+def heads_of(module: Any) -> dict[nn.Linear, float]:
     """{head: gain of its orthogonal weights}"""
     heads = {module.pi: 0.01} if hasattr(module, "pi") else {module.af: 1.0}
     if getattr(module, "vf", None) is not None:
@@ -18,7 +23,7 @@ def heads_of(module):
 
 
 @reaches("ppo", "dqn", field="initializer")
-def check_initializer(build, algorithm):
+def check_initializer(build: Build, algorithm: Algorithm) -> None:
     values = {"hidden_sizes": (40, 30), "activation": "tanh"}
     for initializer in ("torch", "he_uniform", "orthogonal"):
         algo = build(algorithm, initializer=initializer, **values)
@@ -50,7 +55,7 @@ def check_initializer(build, algorithm):
 
 
 @reaches("ppo", "dqn", field="conv_filters")
-def check_conv_filters(build, algorithm):
+def check_conv_filters(build: Build, algorithm: Algorithm) -> None:
     algo = build(algorithm, "TestShades-v0", conv_filters=FILTERS, activation="relu", initializer="he_uniform")
     for module in modules_of(algo):
         encoder = module.encoder["actor_encoder"] if algorithm == "ppo" else module.encoder
@@ -70,14 +75,14 @@ def check_conv_filters(build, algorithm):
 
 
 @reaches("ppo", "dqn", field="normalize_observations")
-def check_normalize_observations(build, algorithm):
+def check_normalize_observations(build: Build, algorithm: Algorithm) -> None:
     plain = module_of(build(algorithm, normalize_observations=False))
     assert not [name for name in plain.state_dict() if name.startswith("obs_")]
     algo = build(algorithm, normalize_observations=True)
     module, seen = module_of(algo), []
     update = module.update_observation_statistics
 
-    def spied(observations):
+    def spied(observations: NDArray[Any]) -> None:
         seen.append(np.asarray(observations).copy())
         update(observations)
 

@@ -1,19 +1,32 @@
 """Training phases of a DQN pack, and the same ones by RLlib's own Learner, member by member."""
 
+from __future__ import annotations
+
 import contextlib
 import copy
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, cast
 from unittest.mock import patch
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from packed_rllib import MODULE, difference, learner_of, state_of
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn import loss as dqn
+from policies.packed.dqn.group import DQNGroup
+from policies.packed.dqn.replay import Drawn
+from policies.packed.envs.vector import EnvKind
+from policies.packed.member import Member, Weights
+from policies.packed.sampling import Observations
 from policies.replay import Transitions
 
-SMALL = {
+if TYPE_CHECKING:
+    from policies.packed.dqn.stack import DQNStack
+
+SMALL: dict[str, Any] = {
     "hidden_sizes": (8,),
     "num_envs": 4,
     "env_steps_per_iteration": 64,
@@ -24,25 +37,32 @@ SMALL = {
     "replay_capacity": 500,
     "epsilon_decay": 200,
 }
+DQNMember = Member[DQNHyperparams]
+Phases = Sequence[tuple[int, int, int]]
 # As in `packed_rllib`: of nine updates, each on 16 rows, whose differences add up.
 ROUNDING = 9 * (16 + 30) * 6e-8
-PHASES = ((3, 16, 1), (4, 16, 2), (2, 8, 1))
+PHASES: Phases = ((3, 16, 1), (4, 16, 2), (2, 8, 1))
 """(updates, env steps since the phase before, episodes that ended in them)."""
 
 
-def make_stack(env_id="CartPole-v1", env_args=None, failure_penalty=None, **shared):
+def make_stack(
+    env_id: str = "CartPole-v1",
+    env_args: dict[str, Any] | None = None,
+    failure_penalty: float | None = None,
+    **shared: Any,
+) -> DQNStack:
     """A stack without members."""
     from policies.packed.envs.make import make_packed_envs
     from policies.packed.make import make_stack as make
 
     torch.set_num_threads(1)  # as the engine does
     hyperparams = DQNHyperparams(**{**SMALL, **shared})
-    kind = "vectorised" if env_id == "CartPole-v1" else "scalar"
+    kind: EnvKind = "vectorised" if env_id == "CartPole-v1" else "scalar"
     envs = make_packed_envs(env_id, env_args or {}, hyperparams.num_envs, kind=kind, failure_penalty=failure_penalty)
-    return make(hyperparams, envs)
+    return cast("DQNStack", make(hyperparams, envs))
 
 
-def add(stack, name, seed, member=None, **values):
+def add(stack: DQNStack, name: str, seed: int, member: DQNMember | None = None, **values: Any) -> DQNMember:
     """A further member; a new one from a few hyperparameters if there is none."""
     from policies.packed.initial import new_member
 
@@ -53,7 +73,7 @@ def add(stack, name, seed, member=None, **values):
     return member
 
 
-def shake(stack, scale=0.3):
+def shake(stack: DQNStack, scale: float = 0.3) -> None:
     """Move all weights, so that target networks differ from the online ones by much."""
     for member in list(stack.members):
         stack.member(member.member_id)
@@ -64,7 +84,7 @@ def shake(stack, scale=0.3):
     stack._arrange()
 
 
-def add_noise_rows(stack, gamma=0.9):
+def add_noise_rows(stack: DQNStack, gamma: float = 0.9) -> None:
     """Transitions with rewards of all sizes and discounts of one to three steps, the same for all members."""
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(100, stack._replay.num_columns)).astype(np.float32)
@@ -80,27 +100,27 @@ def add_noise_rows(stack, gamma=0.9):
 class Learned:
     """What a member's updates gave, one after another."""
 
-    losses: list = field(default_factory=list)
-    td_errors: list = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    td_errors: list[NDArray[np.float32]] = field(default_factory=list)
     """Without sign, (B,) each."""
-    gradients: list = field(default_factory=list)
+    gradients: list[Weights] = field(default_factory=list)
     """By weight, clipped."""
-    weights: list = field(default_factory=list)
+    weights: list[Weights] = field(default_factory=list)
     """After each update and the target update that may follow it."""
-    moments: dict = field(default_factory=dict)
+    moments: dict[str, Weights] = field(default_factory=dict)
     """After the last one."""
-    lrs: list = field(default_factory=list)
+    lrs: list[float] = field(default_factory=list)
     num_target_updates: int = 0
-    batches: list = field(default_factory=list)
+    batches: list[Transitions] = field(default_factory=list)
 
 
-def read_gradients(group, index):
+def read_gradients(group: DQNGroup, index: int) -> Weights:
     views = group._networks.views_of(group._networks.gradients)
     (layout,) = group._rows._layouts[index]
     return layout.read([layer[index] for layer in views], group._num_inputs)
 
 
-def as_transitions(rows, num_inputs, weights):
+def as_transitions(rows: NDArray[np.float32], num_inputs: int, weights: NDArray[np.float32] | None) -> Transitions:
     return Transitions(
         obs=rows[:, :num_inputs],
         actions=rows[:, -3].astype(np.int64),
@@ -111,17 +131,17 @@ def as_transitions(rows, num_inputs, weights):
     )
 
 
-def follow(group, found):
+def follow(group: DQNGroup, found: dict[str, Learned]) -> contextlib.ExitStack:
     """Write down what each of a group's updates gives; returns what ends that."""
     stack = contextlib.ExitStack()
     update, move, gradient = group._update, group._update_targets, dqn.loss_gradient
     losses = []
 
-    def spied_gradient(*args):
+    def spied_gradient(*args: Any) -> dqn.Loss:
         losses.append(gradient(*args))
         return losses[-1]
 
-    def spied_update(drawn, observations, *, wants_stats):
+    def spied_update(drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
         rows = drawn.rows.copy()
         stats = update(drawn, observations, wants_stats=True)
         for index, member in enumerate(group.members):
@@ -134,7 +154,7 @@ def follow(group, found):
             one.gradients.append(read_gradients(group, index))
         return stats if wants_stats else []
 
-    def spied_move(num_steps_after):
+    def spied_move(num_steps_after: float) -> None:
         move(num_steps_after)
         group.write_back()
         for member in group.members:
@@ -146,7 +166,7 @@ def follow(group, found):
     return stack
 
 
-def learn_in_pack(stack, phases=PHASES):
+def learn_in_pack(stack: DQNStack, phases: Phases = PHASES) -> dict[str, Learned]:
     """Some training phases of all members, with given numbers; by member."""
     rng = np.random.default_rng(1)
     found = {member.member_id: Learned() for member in stack.members}
@@ -169,17 +189,17 @@ def learn_in_pack(stack, phases=PHASES):
 class GivenBatches:
     """Stands in for a replay memory."""
 
-    def __init__(self, batches):
+    def __init__(self, batches: Sequence[Transitions]) -> None:
         self.rest = iter(batches)
 
-    def batches(self, num_batches, batch_size):
+    def batches(self, num_batches: int, batch_size: int) -> Iterator[Transitions]:
         for _ in range(num_batches):
             batch = next(self.rest)
             assert len(batch.obs) == batch_size
             yield batch
 
 
-def learn_in_rllib(member, env_id, batches, phases=PHASES):
+def learn_in_rllib(member: DQNMember, env_id: str, batches: Sequence[Transitions], phases: Phases = PHASES) -> Learned:
     """The same from the same weights and moments, by `DQNLearner`'s own `update_from_replay`."""
     from policies.packed.to_rllib import to_algorithm
 
@@ -188,8 +208,8 @@ def learn_in_rllib(member, env_id, batches, phases=PHASES):
     module = learner.module[MODULE].unwrapped()
     update, move = learner.update_from_transitions, learner._update_target
 
-    def spied_update(rows, optimizer):
-        stats = update(rows, optimizer)
+    def spied_update(rows: Transitions, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+        stats: dict[str, Any] = update(rows, optimizer)
         found.losses.append(float(stats["total_loss"]))
         found.td_errors.append(stats["td_errors"].numpy().copy())
         found.lrs.append(optimizer.param_groups[0]["lr"])
@@ -198,7 +218,7 @@ def learn_in_rllib(member, env_id, batches, phases=PHASES):
         )
         return stats
 
-    def spied_move(*args):
+    def spied_move(*args: Any) -> None:
         move(*args)
         found.weights.append(state_of(learner)[0])
 
@@ -214,7 +234,14 @@ def learn_in_rllib(member, env_id, batches, phases=PHASES):
     return found
 
 
-def compare(members, *, seeds=None, env_id="CartPole-v1", phases=PHASES, only=None):
+def compare(
+    members: Sequence[dict[str, Any]],
+    *,
+    seeds: Sequence[int] | None = None,
+    env_id: str = "CartPole-v1",
+    phases: Phases = PHASES,
+    only: Sequence[int] | None = None,
+) -> tuple[list[tuple[Learned, Learned | None]], DQNStack]:
     """Learn in the pack and in RLlib, after two iterations of the pack.
 
     Args:
@@ -247,14 +274,14 @@ def compare(members, *, seeds=None, env_id="CartPole-v1", phases=PHASES, only=No
     return pairs, stack
 
 
-def differences(ours, theirs):
+def differences(ours: Learned, theirs: Learned) -> dict[str, float]:
     """The largest of each kind over all updates, relative to what is large of its kind."""
     num_updates = len(theirs.losses)
     assert num_updates == len(ours.losses) == len(ours.weights) == len(theirs.weights)
     assert {name for name in theirs.moments if name != "step"} == set(ours.moments)
     found = dict.fromkeys(("losses", "td_errors", "gradients", "weights", "moments", "lr"), 0.0)
 
-    def note(what, value):
+    def note(what: str, value: float) -> None:
         found[what] = max(found[what], value)
 
     for update in range(num_updates):
@@ -279,7 +306,7 @@ def differences(ours, theirs):
     return found
 
 
-def q_values_of(module, observations):
+def q_values_of(module: Any, observations: NDArray[np.float32]) -> Any:
     """Q by an RLModule."""
     with torch.no_grad():
         return module.compute_q_values({"obs": torch.from_numpy(observations)})["qf_preds"].numpy()

@@ -4,21 +4,27 @@ Here those of an update, which compare two members, one with the hyperparameter 
 the network; the others are in `packed_dqn_traces`.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
-from packed_dqn import ROUNDING, add, compare, differences, make_stack, q_values_of
+from packed_dqn import ROUNDING, DQNMember, Learned, add, compare, differences, make_stack, q_values_of
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import DQNHyperparams
+from policies.packed.dqn.replay import StackedPrioritizedReplay
+from tests.narrowing import present
 from tests.rounding import assert_network
 
-CASES = {}
+Case = Callable[[], object]
+CASES: dict[str, Case] = {}
 
 
-def arrives(*names):
+def arrives(*names: str) -> Callable[[Case], Case]:
     """Make a function the case of these fields."""
 
-    def add_names(check):
+    def add_names(check: Case) -> Case:
         for name in names:
             assert name not in CASES
             CASES[name] = check
@@ -30,42 +36,42 @@ def arrives(*names):
 # -- of an update
 
 
-def updates(shared=None, **values):
+def updates(shared: dict[str, Any] | None = None, **values: Any) -> tuple[Learned, Learned]:
     """Training phases of two members, the second one with these values, and as RLlib's Learner makes them."""
     shared = shared or {}
     ((plain, _), (changed, theirs)), _ = compare([shared, {**shared, **values}], seeds=[3, 3], only=[1])
-    for what, value in differences(changed, theirs).items():
+    for what, value in differences(changed, present(theirs)).items():
         assert value < ROUNDING, what
     return plain, changed
 
 
-def other_weights(one, another, updates_before=0):
+def other_weights(one: Learned, another: Learned, updates_before: int = 0) -> float:
     """The largest difference of the weights after an update."""
     ours, theirs = one.weights[updates_before], another.weights[updates_before]
-    return max(np.abs(ours[name] - theirs[name]).max() for name in ours)
+    return max(float(np.abs(ours[name] - theirs[name]).max()) for name in ours)
 
 
-def check_update(shared=None, **values):
+def check_update(shared: dict[str, Any] | None = None, **values: Any) -> None:
     """RLlib's update with these values is the pack's, and another one than without."""
     plain, changed = updates(shared, **values)
     assert other_weights(plain, changed) > 1e-4
 
 
-def check_shared(values, shared=None):
+def check_shared(values: dict[str, Any], shared: dict[str, Any] | None = None) -> None:
     """The same of what all members of a stack have in common."""
     ((plain, _),) = compare([shared or {}], seeds=[3], only=[])[0]
     ((changed, expected),) = compare([{**(shared or {}), **values}], seeds=[3])[0]
-    assert max(differences(changed, expected).values()) < ROUNDING
+    assert max(differences(changed, present(expected)).values()) < ROUNDING
     assert abs(plain.losses[0] - changed.losses[0]) > 1e-4
 
 
 @arrives("lr")
-def check_lr():
+def check_lr() -> None:
     check_update(lr=5e-3)
 
 
 @arrives("grad_clip")
-def check_grad_clip():
+def check_grad_clip() -> None:
     plain, changed = updates(grad_clip=0.3)
     norms = [np.sqrt(sum((value**2).sum() for value in one.gradients[0].values())) for one in (plain, changed)]
     assert norms[0] > 0.5
@@ -73,71 +79,72 @@ def check_grad_clip():
 
 
 @arrives("optimizer")
-def check_optimizer():
+def check_optimizer() -> None:
     for name, moments in (("adam", {"exp_avg", "exp_avg_sq"}), ("rmsprop", {"square_avg"})):
         for ours, theirs in compare([{"optimizer": name}])[0]:
-            assert max(differences(ours, theirs).values()) < ROUNDING
+            assert max(differences(ours, present(theirs)).values()) < ROUNDING
             assert set(ours.moments) == moments
 
 
 @arrives("optimizer_epsilon")
-def check_optimizer_epsilon():
+def check_optimizer_epsilon() -> None:
     check_update(optimizer_epsilon=0.1)
     check_update({"optimizer": "rmsprop"}, optimizer_epsilon=0.1)
 
 
 @arrives("adam_beta1")
-def check_adam_beta1():
+def check_adam_beta1() -> None:
     check_update(adam_beta1=0.3)
 
 
 @arrives("adam_beta2")
-def check_adam_beta2():
+def check_adam_beta2() -> None:
     check_update(adam_beta2=0.3)
 
 
 @arrives("rmsprop_rho")
-def check_rmsprop_rho():
+def check_rmsprop_rho() -> None:
     check_update({"optimizer": "rmsprop"}, rmsprop_rho=0.5)
 
 
 @arrives("rmsprop_momentum")
-def check_rmsprop_momentum():
+def check_rmsprop_momentum() -> None:
     check_update({"optimizer": "rmsprop"}, rmsprop_momentum=0.8)
 
 
 @arrives("double_q")
-def check_double_q():
+def check_double_q() -> None:
     check_shared({"double_q": False})
 
 
 @arrives("dueling")
-def check_dueling():
+def check_dueling() -> None:
     check_shared({"dueling": False})
 
 
 @arrives("td_loss")
-def check_td_loss():
+def check_td_loss() -> None:
     check_shared({"td_loss": "mse"})
 
 
 @arrives("target_network")
-def check_target_network():
+def check_target_network() -> None:
     check_shared({"target_network": False}, {"double_q": False})
 
 
 @arrives("tau")
-def check_tau():
+def check_tau() -> None:
     plain, changed = updates({"tau": 0.1, "target_update_freq": 1}, tau=0.8)
     assert other_weights(plain, changed) > 1e-2
 
 
 @arrives("prioritized_alpha")
-def check_prioritized_alpha():
+def check_prioritized_alpha() -> None:
     stack = make_stack(replay="prioritized")
     for name, alpha in (("a", 0.0), ("b", 1.0)):
         add(stack, name, 0, replay="prioritized", prioritized_alpha=alpha)
     replay = stack._replay
+    assert isinstance(replay, StackedPrioritizedReplay)
     slots = replay.slots(["a", "b"])
     replay.add(slots, np.zeros((2, 2, replay.num_columns), dtype=np.float32))
     replay.set_priorities(slots, np.array([[0, 1]] * 2), np.array([[1.0, 100.0]] * 2, dtype=np.float32))
@@ -147,16 +154,16 @@ def check_prioritized_alpha():
 
 
 @arrives("prioritized_beta")
-def check_prioritized_beta():
+def check_prioritized_beta() -> None:
     plain, changed = updates({"replay": "prioritized", "prioritized_beta": 0.0}, prioritized_beta=1.0)
-    assert all(np.ptp(batch.weights) == 0 for batch in plain.batches)
-    assert all(np.ptp(batch.weights) > 0.01 for batch in changed.batches)
+    assert all(np.ptp(present(batch.weights)) == 0 for batch in plain.batches)
+    assert all(np.ptp(present(batch.weights)) > 0.01 for batch in changed.batches)
 
 
 # -- of the network
 
 
-def check_first_q_values(**values):
+def check_first_q_values(**values: Any) -> DQNMember:
     """A member's first Q-values are those of RLlib's module with the seed."""
     from policies.rllib.config import build_algorithm_config
 
@@ -179,7 +186,7 @@ def check_first_q_values(**values):
 
 
 @arrives("hidden_sizes")
-def check_hidden_sizes():
+def check_hidden_sizes() -> None:
     for sizes in ((7,), (12, 5, 9)):
         member = check_first_q_values(hidden_sizes=sizes)
         found = [
@@ -189,20 +196,20 @@ def check_hidden_sizes():
 
 
 @arrives("activation")
-def check_activation():
+def check_activation() -> None:
     for activation in ACTIVATIONS:
         check_first_q_values(activation=activation, hidden_sizes=(8, 6))
 
 
 @arrives("initializer")
-def check_initializer():
+def check_initializer() -> None:
     found = [check_first_q_values(initializer=name) for name in ("torch", "he_uniform", "orthogonal")]
     first = [member.weights["encoder.mlp.0.weight"] for member in found]
     assert not any(np.allclose(first[index], first[index - 1]) for index in range(3))
 
 
 @arrives("conv_filters")
-def check_conv_filters():
+def check_conv_filters() -> None:
     from tune_jobs.plan.engine_choice import why_not
     from tune_jobs.spec.engines import engine_named
     from tune_jobs.spec.sweep_spec import SweepSpec
@@ -210,9 +217,9 @@ def check_conv_filters():
     spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "dqn"})
     packed = engine_named("packed")
     assert why_not(packed, spec, DQNHyperparams()) is None
-    assert "conv_filters" in why_not(packed, spec, DQNHyperparams(conv_filters=((16, 4, 2),)))
+    assert "conv_filters" in present(why_not(packed, spec, DQNHyperparams(conv_filters=((16, 4, 2),))))
 
 
 @arrives("normalize_observations")
-def check_normalize_observations():
+def check_normalize_observations() -> None:
     check_shared({"normalize_observations": True})

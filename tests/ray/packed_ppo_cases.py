@@ -3,18 +3,31 @@
 Most compare a pack of two members, one with the hyperparameter changed, with RLlib's Learner: see `packed_rllib`.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
-from packed_rllib import ROUNDING, ROWS, compare, differences, make_stack, sample
+import torch
+from numpy.typing import NDArray
+from packed_rllib import ROUNDING, ROWS, Learned, Sampled, compare, differences, make_stack, sample
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import PPOHyperparams
+from policies.packed.ppo.loss import Minibatch
+from tests.narrowing import present
 
-CASES = {}
+if TYPE_CHECKING:
+    from policies.packed.ppo.stack import Fragment, PPOStack
+
+Case = Callable[[], object]
+CASES: dict[str, Case] = {}
 FIRST_LAYER = "encoder.actor_encoder.mlp.0.weight"
 
 
-def arrives(check):
+def arrives(check: Case) -> Case:
     """Make a function the case of the field that its name says."""
     field = check.__name__.removeprefix("check_")
     assert field not in CASES
@@ -22,7 +35,7 @@ def arrives(check):
     return check
 
 
-def updates(shared=None, **values):
+def updates(shared: dict[str, Any] | None = None, **values: Any) -> tuple[Learned, Learned, Sampled]:
     """Two updates of two members, the second one with these values, which are those of RLlib's Learner.
 
     Returns:
@@ -37,7 +50,7 @@ def updates(shared=None, **values):
     return plain, changed, sampled
 
 
-def assert_other_gradients(plain, changed, at_least=1e-3):
+def assert_other_gradients(plain: Learned, changed: Learned, at_least: float = 1e-3) -> None:
     scale = max(np.abs(value).max() for value in plain.last_gradients.values())
     found = max(np.abs(changed.last_gradients[name] - value).max() for name, value in plain.last_gradients.items())
     assert found > at_least * scale
@@ -47,7 +60,7 @@ def assert_other_gradients(plain, changed, at_least=1e-3):
 
 
 @arrives
-def check_hidden_sizes():
+def check_hidden_sizes() -> None:
     for sizes in ((7,), (5, 9)):
         pairs, stack, _ = compare("CartPole-v1", [{"hidden_sizes": (8,) * len(sizes)}, {"hidden_sizes": sizes}])
         assert len(stack._groups) == (1 if len(sizes) == 1 else 2)
@@ -60,7 +73,7 @@ def check_hidden_sizes():
 
 
 @arrives
-def check_activation():
+def check_activation() -> None:
     pairs, stack, _ = compare("CartPole-v1", [{"activation": name} for name in ACTIVATIONS], seeds=[3] * 6)
     assert len(stack._groups) == 6
     for ours, theirs in pairs:
@@ -69,7 +82,7 @@ def check_activation():
 
 
 @arrives
-def check_initializer():
+def check_initializer() -> None:
     names = ("torch", "he_uniform", "orthogonal")
     stack = make_stack("CartPole-v1", [{"initializer": name} for name in names], seeds=[3] * 3)
     torchs, he_uniform, orthogonal = (member.weights for member in stack.members)
@@ -84,7 +97,7 @@ def check_initializer():
 
 
 @arrives
-def check_conv_filters():
+def check_conv_filters() -> None:
     """Packs have none: the plan leaves such trials to RLlib."""
     from tune_jobs.plan.engine_choice import why_not
     from tune_jobs.spec.engines import engine_named
@@ -93,11 +106,11 @@ def check_conv_filters():
     spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "ppo"})
     packed = engine_named("packed")
     assert why_not(packed, spec, PPOHyperparams()) is None
-    assert "no convolutions" in why_not(packed, spec, PPOHyperparams(conv_filters=((4, 8, 4),)))
+    assert "no convolutions" in present(why_not(packed, spec, PPOHyperparams(conv_filters=((4, 8, 4),))))
 
 
 @arrives
-def check_vf_share_layers():
+def check_vf_share_layers() -> None:
     _, changed, _ = updates(shared={"vf_share_layers": True}, vf_loss_coeff=2.0)
     assert {name.split(".")[1] for name in changed.weights if name.startswith("encoder")} == {"encoder"}
     plain, _, _ = updates()
@@ -108,7 +121,7 @@ def check_vf_share_layers():
 
 
 @arrives
-def check_normalize_observations():
+def check_normalize_observations() -> None:
     # compare() trains one iteration before the one it looks at.
     plain, _, sampled = updates(shared={"normalize_observations": True})
     assert int(plain.weights["obs_count"]) == 2 * ROWS
@@ -124,7 +137,7 @@ def check_normalize_observations():
 
 
 @arrives
-def check_lr():
+def check_lr() -> None:
     """Adam's first step moves each weight by its learning rate."""
     for lr in (1e-4, 3e-2):
         stack = make_stack("CartPole-v1", [{}, {"lr": lr}])
@@ -136,7 +149,7 @@ def check_lr():
 
 
 @arrives
-def check_lr_final():
+def check_lr_final() -> None:
     """The value at the env steps so far, this iteration's among them."""
     stack = make_stack("CartPole-v1", [{}, {"lr": 4e-3, "lr_final": 1e-3, "lr_decay_steps": 150}])
     for num_env_steps in (ROWS, 2 * ROWS, 3 * ROWS):
@@ -148,8 +161,8 @@ def check_lr_final():
 
 
 @arrives
-def check_lr_decay_steps():
-    values = {"lr": 4e-3, "lr_final": 0.0, "lr_decay_steps": 2 * ROWS}
+def check_lr_decay_steps() -> None:
+    values: dict[str, Any] = {"lr": 4e-3, "lr_final": 0.0, "lr_decay_steps": 2 * ROWS}
     stack = make_stack("CartPole-v1", [{}, values])
     stack.train_iteration()
     before = {name: value.copy() for name, value in stack.member("m1").weights.items()}
@@ -162,7 +175,7 @@ def check_lr_decay_steps():
 
 
 @arrives
-def check_grad_clip():
+def check_grad_clip() -> None:
     plain, changed, _ = updates(grad_clip=0.25)
     norms = [np.sqrt(sum((g**2).sum() for g in found.last_gradients.values())) for found in (plain, changed)]
     assert norms[0] > 1
@@ -176,21 +189,21 @@ def check_grad_clip():
 
 
 @arrives
-def check_clip_param():
+def check_clip_param() -> None:
     plain, changed, _ = updates(clip_param=0.01)
     assert_other_gradients(plain, changed)
     assert changed.losses["policy_loss"] > plain.losses["policy_loss"]
 
 
 @arrives
-def check_vf_clip_param():
+def check_vf_clip_param() -> None:
     plain, changed, _ = updates(vf_clip_param=2.5)
     assert_other_gradients(plain, changed)
     assert changed.losses["vf_loss"] <= 2.5 < plain.losses["vf_loss"]
 
 
 @arrives
-def check_vf_loss_coeff():
+def check_vf_loss_coeff() -> None:
     plain, changed, _ = updates(vf_loss_coeff=2.0)
     assert_other_gradients(plain, changed)
     for found, coefficient in ((plain, 0.5), (changed, 2.0)):
@@ -198,14 +211,14 @@ def check_vf_loss_coeff():
         assert found.losses["total_loss"] == pytest.approx(parts, rel=1e-5)
 
 
-def assert_entropy_weight(found, weight):
+def assert_entropy_weight(found: Learned, weight: float) -> None:
     losses = found.losses
     parts = losses["policy_loss"] + 0.5 * losses["vf_loss"] - weight * losses["entropy"]
     assert losses["total_loss"] == pytest.approx(parts, rel=1e-5)
 
 
 @arrives
-def check_entropy_coeff():
+def check_entropy_coeff() -> None:
     plain, changed, _ = updates(entropy_coeff=5.0)
     assert_other_gradients(plain, changed)
     assert_entropy_weight(plain, 0.0)
@@ -213,21 +226,21 @@ def check_entropy_coeff():
 
 
 @arrives
-def check_entropy_coeff_final():
-    values = {"entropy_coeff": 5.0, "entropy_coeff_final": 3.0, "entropy_decay_steps": 2 * ROWS}
+def check_entropy_coeff_final() -> None:
+    values: dict[str, Any] = {"entropy_coeff": 5.0, "entropy_coeff_final": 3.0, "entropy_decay_steps": 2 * ROWS}
     _, changed, _ = updates(**values)
     assert_entropy_weight(changed, 3.0)
 
 
 @arrives
-def check_entropy_decay_steps():
-    values = {"entropy_coeff": 5.0, "entropy_coeff_final": 1.0, "entropy_decay_steps": 4 * ROWS}
+def check_entropy_decay_steps() -> None:
+    values: dict[str, Any] = {"entropy_coeff": 5.0, "entropy_coeff_final": 1.0, "entropy_decay_steps": 4 * ROWS}
     _, changed, _ = updates(**values)
     assert_entropy_weight(changed, 3.0)
 
 
 @arrives
-def check_use_kl_loss():
+def check_use_kl_loss() -> None:
     plain, changed, _ = updates(shared={"use_kl_loss": True, "kl_target": 1e3}, kl_coeff=40.0)
     assert_other_gradients(plain, changed)
     for found, first in ((plain, 0.2), (changed, 40.0)):
@@ -242,7 +255,7 @@ def check_use_kl_loss():
 
 
 @arrives
-def check_kl_coeff():
+def check_kl_coeff() -> None:
     stack = make_stack("CartPole-v1", [{"use_kl_loss": True}, {"use_kl_loss": True, "kl_coeff": 0.7}])
     assert [member.kl_coeff for member in stack.members] == [0.2, 0.7]
     stack.envs.close()
@@ -251,7 +264,7 @@ def check_kl_coeff():
 
 
 @arrives
-def check_kl_target():
+def check_kl_target() -> None:
     for target, factor in ((1e-6, 1.5), (1e3, 0.5)):
         base = {"use_kl_loss": True, "lr": 1e-2, "num_epochs": 4}
         stack = make_stack("CartPole-v1", [base, {**base, "kl_target": target}])
@@ -267,9 +280,12 @@ def check_kl_target():
 # -- the batch
 
 
-def targets_by_definition(values, fragment, row, gamma, gae_lambda):
+def targets_by_definition(
+    values: Sequence[float], fragment: Fragment, row: int, gamma: float, gae_lambda: float
+) -> list[float]:
     """Value targets of a row, from the formula: only for rows of terminated episodes and the fragment's end."""
-    targets, advantage = [], 0.0
+    targets: list[float] = []
+    advantage = 0.0
     for step in reversed(range(len(values) - 1)):
         ended = fragment.ended[step, row]
         following = 0.0 if ended else values[step + 1]
@@ -283,7 +299,7 @@ def targets_by_definition(values, fragment, row, gamma, gae_lambda):
     return targets
 
 
-def check_targets(**values):
+def check_targets(**values: Any) -> None:
     stack = make_stack("CartPole-v1", [{"gamma": 0.5, "gae_lambda": 0.5}, values])
     sampled = sample(stack)
     ((group, batch),) = sampled.groups
@@ -299,29 +315,29 @@ def check_targets(**values):
 
 
 @arrives
-def check_gamma():
+def check_gamma() -> None:
     for gamma in (0.0, 0.3, 1.0):
         check_targets(gamma=gamma)
 
 
 @arrives
-def check_gae_lambda():
+def check_gae_lambda() -> None:
     for gae_lambda in (0.0, 0.3, 1.0):
         check_targets(gae_lambda=gae_lambda)
 
 
-def rows_of_updates(**values):
+def rows_of_updates(**values: Any) -> tuple[PPOStack, list[NDArray[np.float32]], NDArray[np.float32]]:
     """(stack, the advantages of each update's rows of the second member, all advantages) of an iteration."""
     stack = make_stack("CartPole-v1", [values, values])
     sampled = sample(stack)
     ((group, batch),) = sampled.groups
     update, seen = group._update, []
 
-    def reading(outputs, value, minibatch):
+    def reading(outputs: torch.Tensor, value: torch.Tensor, minibatch: Minibatch) -> Any:
         seen.append(minibatch.advantages[1].numpy().copy())
         return update(outputs, value, minibatch)
 
-    group._update = reading
+    group._update = reading  # type: ignore[method-assign, assignment]
     group.learn(batch)
     group.finish()
     stack.envs.close()
@@ -329,7 +345,7 @@ def rows_of_updates(**values):
 
 
 @arrives
-def check_minibatch_size():
+def check_minibatch_size() -> None:
     _, seen, rows = rows_of_updates(minibatch_size=16)
     assert [len(found) for found in seen] == [16] * 4
     # A pass is over every row once.
@@ -341,7 +357,7 @@ def check_minibatch_size():
 
 
 @arrives
-def check_num_epochs():
+def check_num_epochs() -> None:
     stack, seen, rows = rows_of_updates(minibatch_size=32, num_epochs=3)
     assert stack.members[1].num_updates == len(seen) == 6
     orders = [np.concatenate(seen[start : start + 2]) for start in (0, 2, 4)]
@@ -351,7 +367,7 @@ def check_num_epochs():
 
 
 @arrives
-def check_train_batch_size():
+def check_train_batch_size() -> None:
     for size, steps in ((96, 96), (97, 100)):
         stack = make_stack("CartPole-v1", [{"train_batch_size": size}, {"train_batch_size": size}])
         assert [stats.num_env_steps for stats in stack.train_iteration().values()] == [steps] * 2
@@ -361,7 +377,7 @@ def check_train_batch_size():
 
 
 @arrives
-def check_num_envs():
+def check_num_envs() -> None:
     stack = make_stack("CartPole-v1", [{"num_envs": 16}, {"num_envs": 16}])
     fragment = sample(stack).fragment
     assert fragment.rewards.shape == (ROWS // 16, 2 * 16)

@@ -1,35 +1,58 @@
 """One batch of a pack, learnt from by the pack and by RLlib's own Learner, member by member."""
 
+from __future__ import annotations
+
 import copy
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike, NDArray
 
 from policies.envs.make import make_env
 from policies.hyperparams import PPOHyperparams
+from policies.packed.envs.vector import EnvKind
+from policies.packed.member import Member, MemberStats, Weights
+from policies.packed.ppo.group import Batch, PPOGroup
+
+if TYPE_CHECKING:
+    from policies.packed.ppo.stack import Fragment, PPOStack
 
 MODULE = "default_policy"
+PPOMember = Member[PPOHyperparams]
 ROWS = 64
 # A share of the largest value. A gradient is a sum over the rows of what came through three layers of 8 at most: 64 and
 # 3 * 10 roundings in the pack and as many in RLlib, each of half an eps (6e-8); the updates after the first start apart
 # by that, which is as much again. A hyperparameter that acts otherwise moves gradients by more than a thousandth.
 ROUNDING = 4 * (ROWS + 30) * 6e-8
-SMALL = {"hidden_sizes": (8,), "train_batch_size": ROWS, "minibatch_size": ROWS, "num_epochs": 1, "num_envs": 4}
+SMALL: dict[str, Any] = {
+    "hidden_sizes": (8,),
+    "train_batch_size": ROWS,
+    "minibatch_size": ROWS,
+    "num_epochs": 1,
+    "num_envs": 4,
+}
 
 
-def make_stack(env_id, members, env_args=None, seeds=None):
+def make_stack(
+    env_id: str,
+    members: Sequence[dict[str, Any]],
+    env_args: dict[str, Any] | None = None,
+    seeds: Sequence[int] | None = None,
+) -> PPOStack:
     """A stack of PPO members from a few hyperparameters each, fresh."""
     from policies.packed.envs.make import make_packed_envs
     from policies.packed.initial import new_member
     from policies.packed.make import make_stack as make
 
     settings = [PPOHyperparams(**{**SMALL, **values}) for values in members]
-    kind = "vectorised" if env_id == "CartPole-v1" else "scalar"
+    kind: EnvKind = "vectorised" if env_id == "CartPole-v1" else "scalar"
     envs = make_packed_envs(env_id, env_args or {}, settings[0].num_envs, kind=kind)
-    stack = make(settings[0], envs)
+    stack = cast("PPOStack", make(settings[0], envs))
     seeds = range(len(settings)) if seeds is None else seeds
     for index, (hyperparams, seed) in enumerate(zip(settings, seeds, strict=True)):
         member = new_member(f"m{index}", hyperparams, seed, envs.observation_space, envs.action_space)
@@ -37,7 +60,7 @@ def make_stack(env_id, members, env_args=None, seeds=None):
     return stack
 
 
-def kept(member):
+def kept(member: PPOMember) -> PPOMember:
     """A member as it is now."""
     return copy.deepcopy(member)
 
@@ -46,14 +69,14 @@ def kept(member):
 class Sampled:
     """A batch of a whole stack, and its parts."""
 
-    fragment: object
-    groups: list
+    fragment: Fragment
+    groups: list[tuple[PPOGroup, Batch]]
     """(group, its batch)."""
-    observations: np.ndarray
+    observations: NDArray[np.float32]
     """As the envs gave them, (M, R, D)."""
 
 
-def sample(stack):
+def sample(stack: PPOStack) -> Sampled:
     """What the next iteration would learn from."""
     if stack._stale:
         stack._regroup()
@@ -69,7 +92,7 @@ def sample(stack):
     return Sampled(fragment, groups, observations.reshape(len(stack.members), -1, size))
 
 
-def shake(stack, scale=0.1):
+def shake(stack: PPOStack, scale: float = 0.1) -> None:
     """Move all weights a little, so that ratios and divergences are not those of the policy that has sampled."""
     for member in list(stack.members):
         stack.member(member.member_id)
@@ -84,14 +107,14 @@ def shake(stack, scale=0.1):
 class Learned:
     """What one learning phase of a member gave; `last_gradients` are those of its last update, clipped."""
 
-    losses: dict
-    last_gradients: dict
-    weights: dict
-    moments: dict
+    losses: dict[str, float]
+    last_gradients: Weights
+    weights: Weights
+    moments: dict[str, Weights]
     kl_coeff: float
 
 
-def learn_in_pack(stack, sampled):
+def learn_in_pack(stack: PPOStack, sampled: Sampled) -> dict[str, Learned]:
     """Learn, and give what became of each member, by id."""
     stack._regroup()
     found = {}
@@ -102,7 +125,7 @@ def learn_in_pack(stack, sampled):
         group.write_back()
         views = group._networks.views_of(group._networks.gradients)
         for index, member in enumerate(group.members):
-            gradients = {}
+            gradients: Weights = {}
             for number, layout in enumerate(group._rows._layouts[index]):
                 row = number * len(group.members) + index
                 gradients |= layout.read([layer[row] for layer in views], stack._num_inputs)
@@ -115,7 +138,7 @@ def learn_in_pack(stack, sampled):
     return found
 
 
-def parts_of(sampled, member):
+def parts_of(sampled: Sampled, member: PPOMember) -> tuple[int, Batch, NDArray[np.float32]]:
     """(place in its group, batch of the group, observations) of a member."""
     place = 0
     for group, batch in sampled.groups:
@@ -126,7 +149,7 @@ def parts_of(sampled, member):
     raise KeyError(member.member_id)
 
 
-def rllib_batch(sampled, member, *, is_gaussian):
+def rllib_batch(sampled: Sampled, member: PPOMember, *, is_gaussian: bool) -> Any:
     """The member's rows as RLlib's connectors would hand them to the Learner."""
     from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
@@ -135,10 +158,10 @@ def rllib_batch(sampled, member, *, is_gaussian):
     outputs = torch.from_numpy(batch.outputs[index])
     if is_gaussian:
         mean, log_std = outputs.chunk(2, dim=-1)
-        logp = torch.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=-1)
+        logp = torch.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=-1)  # type: ignore[no-untyped-call]
     else:
         actions = actions.argmax(dim=-1)
-        logp = torch.distributions.Categorical(logits=outputs).log_prob(actions)
+        logp = torch.distributions.Categorical(logits=outputs).log_prob(actions)  # type: ignore[no-untyped-call]
     columns = {
         "obs": torch.from_numpy(observations.copy()),
         "actions": actions,
@@ -151,24 +174,24 @@ def rllib_batch(sampled, member, *, is_gaussian):
     return MultiAgentBatch({MODULE: SampleBatch(columns)}, env_steps=len(logp))
 
 
-def learner_of(algorithm):
+def learner_of(algorithm: Any) -> Any:
     return algorithm.learner_group._learner
 
 
-def state_of(learner):
+def state_of(learner: Any) -> tuple[Weights, dict[str, Weights]]:
     """(weights, optimizer's moments by name) of a Learner."""
     module = learner.module[MODULE].unwrapped()
     weights = {name: value.numpy().copy() for name, value in module.state_dict().items()}
     (_, optimizer), *others = learner.get_optimizers_for_module(MODULE)
     assert not others
-    moments = {}
+    moments: dict[str, Weights] = {}
     for name, param in module.named_parameters():
         for moment, value in optimizer.state.get(param, {}).items():
             moments.setdefault(moment, {})[name] = value.numpy().copy()
     return weights, moments
 
 
-def learn_in_rllib(member, env_id, batch):
+def learn_in_rllib(member: PPOMember, env_id: str, batch: Any) -> Learned:
     """The same with RLlib's Learner, from the same weights and moments; its own `update` does all."""
     from policies.packed.to_rllib import to_algorithm
 
@@ -177,7 +200,7 @@ def learn_in_rllib(member, env_id, batch):
     module, applied = learner.module[MODULE].unwrapped(), []
     apply_gradients = learner.apply_gradients
 
-    def applying(gradients):
+    def applying(gradients: dict[Any, torch.Tensor]) -> None:
         applied.append({id(learner._params[reference]): value.clone() for reference, value in gradients.items()})
         apply_gradients(gradients)
 
@@ -209,13 +232,13 @@ LOSSES = {
 """A pack's name -> RLlib's."""
 
 
-def difference(ours, theirs):
+def difference(ours: ArrayLike, theirs: ArrayLike) -> float:
     """The largest, relative to what is larger of 1 and the largest value."""
     ours, theirs = np.asarray(ours, dtype=np.float64), np.asarray(theirs, dtype=np.float64)
     return float(np.abs(ours - theirs).max() / max(1.0, np.abs(theirs).max()))
 
 
-def differences(ours, theirs):
+def differences(ours: Learned, theirs: Learned) -> dict[str, float]:
     """Of losses, gradients, weights, moments and the KL weight."""
     assert set(ours.weights) == set(theirs.weights)
     assert set(ours.last_gradients) == set(theirs.last_gradients)
@@ -241,7 +264,14 @@ def differences(ours, theirs):
     }
 
 
-def compare(env_id, members, *, seeds=None, num_epochs=1, before=None):
+def compare(
+    env_id: str,
+    members: Sequence[dict[str, Any]],
+    *,
+    seeds: Sequence[int] | None = None,
+    num_epochs: int = 1,
+    before: Callable[[PPOStack], None] | None = None,
+) -> tuple[list[tuple[Learned, Learned]], PPOStack, Sampled]:
     """Sample once, learn in the pack and in RLlib.
 
     Args:
@@ -274,13 +304,13 @@ def compare(env_id, members, *, seeds=None, num_epochs=1, before=None):
     return pairs, stack, sampled
 
 
-def assert_same_stats(ours, theirs):
+def assert_same_stats(ours: MemberStats, theirs: MemberStats) -> None:
     """But for the last bits: two rows of one product may lie at other places of a vector register."""
     assert (ours.num_env_steps, ours.episodes) == (theirs.num_env_steps, theirs.episodes)
     assert ours.learner == pytest.approx(theirs.learner, rel=1e-4, abs=1e-5)
 
 
-def episodes_of(fragment, row, env_id, final):
+def episodes_of(fragment: Fragment, row: int, env_id: str, final: NDArray[np.float32]) -> list[Any]:
     """The chunks of one row of a fragment as RLlib's episodes; `final` stands for what terminated episodes ended in."""
     from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
@@ -308,5 +338,5 @@ def episodes_of(fragment, row, env_id, final):
                 len_lookback_buffer=0,
             ).to_numpy()
         )
-    env.close()
+    env.close()  # type: ignore[no-untyped-call]
     return episodes

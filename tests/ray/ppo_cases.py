@@ -1,11 +1,16 @@
 """The cases of PPO's hyperparameters; see `rllib_cases`."""
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from rllib_cases import (
     MODULE,
     SMALL,
+    Build,
     count_updates,
     env_steps,
     learner_of,
@@ -19,7 +24,7 @@ from torch import nn
 from policies.hyperparams import PPOHyperparams
 
 
-def ppo_loss(algo, hyperparams):
+def ppo_loss(algo: Any, hyperparams: PPOHyperparams) -> tuple[float, float]:
     """(RLlib's loss, the loss by its definition) of one batch whose ratios and values are beyond every clip."""
     learner, module = learner_of(algo), module_of(algo)
     rng = torch.Generator().manual_seed(0)
@@ -36,19 +41,20 @@ def ppo_loss(algo, hyperparams):
         theirs = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=batch, fwd_out=out)
         now = torch.distributions.Categorical(logits=out["action_dist_inputs"])
         then = torch.distributions.Categorical(logits=batch["action_dist_inputs"])
-        ratio = torch.exp(now.log_prob(batch["actions"]) - batch["action_logp"])
+        ratio = torch.exp(now.log_prob(batch["actions"]) - batch["action_logp"])  # type: ignore[no-untyped-call]
         clipped = torch.clamp(ratio, 1 - hyperparams.clip_param, 1 + hyperparams.clip_param)
         loss = -torch.min(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
         value_loss = (module.compute_values(batch) - batch["value_targets"]) ** 2
         if hyperparams.vf_clip_param is not None:
             value_loss = value_loss.clamp(0, hyperparams.vf_clip_param)
-        loss += hyperparams.vf_loss_coeff * value_loss.mean() - hyperparams.entropy_coeff * now.entropy().mean()
+        entropy = now.entropy().mean()  # type: ignore[no-untyped-call]
+        loss += hyperparams.vf_loss_coeff * value_loss.mean() - hyperparams.entropy_coeff * entropy
         if hyperparams.use_kl_loss:
             loss += hyperparams.kl_coeff * torch.distributions.kl_divergence(then, now).mean()
     return float(theirs), float(loss)
 
 
-def check_loss(build, **values):
+def check_loss(build: Build, **values: Any) -> None:
     """The loss is the one these values define, and not the one without them."""
     fixed = {key: value for key, value in values.items() if key == "use_kl_loss"} if len(values) > 1 else {}
     losses = []
@@ -61,37 +67,37 @@ def check_loss(build, **values):
 
 
 @reaches("ppo", field="clip_param")
-def check_clip_param(build, _):
+def check_clip_param(build: Build, _: object) -> None:
     check_loss(build, clip_param=0.03)
 
 
 @reaches("ppo", field="vf_clip_param")
-def check_vf_clip_param(build, _):
+def check_vf_clip_param(build: Build, _: object) -> None:
     check_loss(build, vf_clip_param=2.5)
 
 
 @reaches("ppo", field="vf_loss_coeff")
-def check_vf_loss_coeff(build, _):
+def check_vf_loss_coeff(build: Build, _: object) -> None:
     check_loss(build, vf_loss_coeff=0.2)
 
 
 @reaches("ppo", field="entropy_coeff")
-def check_entropy_coeff(build, _):
+def check_entropy_coeff(build: Build, _: object) -> None:
     check_loss(build, entropy_coeff=0.3)
 
 
 @reaches("ppo", field="use_kl_loss")
-def check_use_kl_loss(build, _):
+def check_use_kl_loss(build: Build, _: object) -> None:
     check_loss(build, use_kl_loss=True)
 
 
 @reaches("ppo", field="kl_coeff")
-def check_kl_coeff(build, _):
+def check_kl_coeff(build: Build, _: object) -> None:
     check_loss(build, use_kl_loss=True, kl_coeff=0.9)
 
 
 @reaches("ppo", field="kl_target")
-def check_kl_target(build, _):
+def check_kl_target(build: Build, _: object) -> None:
     for target, factor in ((0.01, 1.5), (0.03, 1.0), (0.2, 0.5)):
         algo = build("ppo", use_kl_loss=True, kl_coeff=0.4, kl_target=target)
         learner = learner_of(algo)
@@ -100,7 +106,7 @@ def check_kl_target(build, _):
 
 
 @reaches("ppo", field="vf_share_layers")
-def check_vf_share_layers(build, _):
+def check_vf_share_layers(build: Build, _: object) -> None:
     names = {share: set(module_of(build("ppo", vf_share_layers=share)).state_dict()) for share in (False, True)}
     assert {name.split(".")[1] for name in names[False] if name.startswith("encoder")} == {
         "actor_encoder",
@@ -109,7 +115,7 @@ def check_vf_share_layers(build, _):
     assert {name.split(".")[1] for name in names[True] if name.startswith("encoder")} == {"encoder"}
 
 
-def advantages(algo, rewards, values_are_zero=True):
+def advantages(algo: Any, rewards: Sequence[float], values_are_zero: bool = True) -> NDArray[Any]:
     """Advantages and value targets of one terminated episode, from the learner's own pipeline."""
     from ray.rllib.core.learner.training_data import TrainingData
     from ray.rllib.env.single_agent_episode import SingleAgentEpisode
@@ -132,8 +138,9 @@ def advantages(algo, rewards, values_are_zero=True):
     return np.asarray(batch["value_targets"])[:length]
 
 
-def expected_targets(rewards, gamma, gae_lambda):
-    advantage, targets = 0.0, []
+def expected_targets(rewards: Sequence[float], gamma: float, gae_lambda: float) -> list[float]:
+    advantage = 0.0
+    targets: list[float] = []
     for step in reversed(range(len(rewards))):
         following = 0.0 if step == len(rewards) - 1 else 1.0
         advantage = rewards[step] + gamma * following - 1.0 + gamma * gae_lambda * advantage
@@ -142,21 +149,21 @@ def expected_targets(rewards, gamma, gae_lambda):
 
 
 @reaches("ppo", field="gamma")
-def check_ppo_gamma(build, _):
+def check_ppo_gamma(build: Build, _: object) -> None:
     for gamma in (0.0, 0.6):
         found = advantages(build("ppo", gamma=gamma), [1.0, 5.0, 2.0])
         np.testing.assert_allclose(found, expected_targets([1.0, 5.0, 2.0], gamma, 0.95), rtol=1e-5)
 
 
 @reaches("ppo", field="gae_lambda")
-def check_gae_lambda(build, _):
+def check_gae_lambda(build: Build, _: object) -> None:
     for gae_lambda in (0.0, 0.3):
         found = advantages(build("ppo", gae_lambda=gae_lambda), [1.0, 5.0, 2.0])
         np.testing.assert_allclose(found, expected_targets([1.0, 5.0, 2.0], 0.99, gae_lambda), rtol=1e-5)
 
 
 @reaches("ppo", field="train_batch_size")
-def check_ppo_train_batch_size(build, _):
+def check_ppo_train_batch_size(build: Build, _: object) -> None:
     algo = build("ppo", train_batch_size=96)
     steps = [env_steps(algo.train()) for _ in range(3)]
     # All sub-environments step together, and one may only reset in the last step.
@@ -164,7 +171,7 @@ def check_ppo_train_batch_size(build, _):
 
 
 @reaches("ppo", field="minibatch_size")
-def check_minibatch_size(build, _):
+def check_minibatch_size(build: Build, _: object) -> None:
     algo = build("ppo", minibatch_size=16)
     sizes = count_updates(algo)
     algo.train()
@@ -172,7 +179,7 @@ def check_minibatch_size(build, _):
 
 
 @reaches("ppo", field="num_epochs")
-def check_num_epochs(build, _):
+def check_num_epochs(build: Build, _: object) -> None:
     counts = {}
     for num_epochs in (1, 4):
         algo = build("ppo", num_epochs=num_epochs)
@@ -188,7 +195,7 @@ def check_num_epochs(build, _):
 # -- schedules
 
 
-def entropy_weight(algo):
+def entropy_weight(algo: Any) -> float:
     """What the loss multiplies the entropy by: the loss of rows without anything else to gain."""
     learner, module = learner_of(algo), module_of(algo)
     rows = {
@@ -203,16 +210,17 @@ def entropy_weight(algo):
         rows["value_targets"] = module.compute_values(rows)
         out = module.forward_train(rows)
         loss = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=rows, fwd_out=out)
-        entropy = torch.distributions.Categorical(logits=out["action_dist_inputs"]).entropy().mean()
+        found = torch.distributions.Categorical(logits=out["action_dist_inputs"])
+        entropy = found.entropy().mean()  # type: ignore[no-untyped-call]
     return float(-loss / entropy)
 
 
-def in_first_updates(algo, read):
+def in_first_updates(algo: Any, read: Callable[[], float]) -> list[tuple[int, float]]:
     """(env steps, what `read` gives in the phase's first update), for three iterations."""
     learner = learner_of(algo)
     update, seen = learner._update, []
 
-    def reading(batch, *args, **kwargs):
+    def reading(batch: Any, *args: Any, **kwargs: Any) -> Any:
         seen.append(read())
         return update(batch, *args, **kwargs)
 
@@ -225,7 +233,7 @@ def in_first_updates(algo, read):
     return found
 
 
-def check_schedule(build, read, values):
+def check_schedule(build: Build, read: Callable[[Any], float], values: dict[str, float]) -> None:
     """A value moves from the first update on, along the line that the three hyperparameters draw, and then stays."""
     first, final, decay_steps = values.values()
     algo = build("ppo", **values)
@@ -235,30 +243,30 @@ def check_schedule(build, read, values):
     assert share == 1.0
 
 
-def current_lr(algo):
+def current_lr(algo: Any) -> float:
     (group,) = learner_of(algo).get_optimizer(MODULE).param_groups
-    return group["lr"]
+    return float(group["lr"])
 
 
 @reaches("ppo", field="lr_final")
-def check_lr_final(build, _):
+def check_lr_final(build: Build, _: object) -> None:
     check_schedule(build, current_lr, {"lr": 4e-3, "lr_final": 1e-3, "lr_decay_steps": 150})
 
 
 @reaches("ppo", field="lr_decay_steps")
-def check_lr_decay_steps(build, _):
+def check_lr_decay_steps(build: Build, _: object) -> None:
     check_schedule(build, current_lr, {"lr": 4e-3, "lr_final": 0.0, "lr_decay_steps": 100})
 
 
 @reaches("ppo", field="entropy_coeff_final")
-def check_entropy_coeff_final(build, _):
+def check_entropy_coeff_final(build: Build, _: object) -> None:
     check_schedule(
         build, entropy_weight, {"entropy_coeff": 0.2, "entropy_coeff_final": 0.05, "entropy_decay_steps": 150}
     )
 
 
 @reaches("ppo", field="entropy_decay_steps")
-def check_entropy_decay_steps(build, _):
+def check_entropy_decay_steps(build: Build, _: object) -> None:
     check_schedule(
         build, entropy_weight, {"entropy_coeff": 0.2, "entropy_coeff_final": 0.0, "entropy_decay_steps": 100}
     )

@@ -3,15 +3,23 @@
 A case is a function that builds an Algorithm and raises AssertionError unless its hyperparameter acts.
 """
 
+from collections.abc import Callable
+from typing import Any, cast
+
 import pytest
 import torch
 from torch import nn
 
 from policies.activations import ACTIVATIONS
+from policies.hyperparams import Algorithm
+from policies.replay import Transitions
 
 MODULE = "default_policy"
+Build = Callable[..., Any]
+"""An algorithm's name and hyperparameters -> the Algorithm."""
+Case = Callable[[Build, Algorithm], None]
 # Small, so that a case takes a tenth of a second; a case changes what it is about.
-SMALL = {
+SMALL: dict[str, dict[str, Any]] = {
     "ppo": {"hidden_sizes": (8,), "train_batch_size": 64, "minibatch_size": 32, "num_epochs": 1, "num_envs": 2},
     "dqn": {
         "hidden_sizes": (8,),
@@ -22,13 +30,13 @@ SMALL = {
         "updates_per_env_step": 1.0,
     },
 }
-CASES = {}
+CASES: dict[tuple[Algorithm, str], Case] = {}
 
 
-def reaches(*algorithms, field):
+def reaches(*algorithms: Algorithm, field: str) -> Callable[[Case], Case]:
     """Make a function the case of a field."""
 
-    def add(check):
+    def add(check: Case) -> Case:
         for algorithm in algorithms:
             assert (algorithm, field) not in CASES
             CASES[algorithm, field] = check
@@ -40,39 +48,40 @@ def reaches(*algorithms, field):
 # -- what the cases look at
 
 
-def learner_of(algo):
+def learner_of(algo: Any) -> Any:
     return algo.learner_group._learner
 
 
-def module_of(algo):
+def module_of(algo: Any) -> Any:
     return learner_of(algo).module[MODULE]
 
 
-def modules_of(algo):
+def modules_of(algo: Any) -> tuple[Any, Any]:
     """The network that learns, and the one that acts."""
     return module_of(algo), algo.env_runner.module
 
 
-def loss_config(algo):
+def loss_config(algo: Any) -> Any:
     return learner_of(algo).config.get_config_for_module(MODULE)
 
 
-def linears(module):
+def linears(module: nn.Module) -> list[nn.Linear]:
     return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
 
 
-def optimizer_of(algo):
-    return learner_of(algo).get_optimizer(MODULE)
+def optimizer_of(algo: Any) -> torch.optim.Optimizer:
+    optimizer: torch.optim.Optimizer = learner_of(algo).get_optimizer(MODULE)
+    return optimizer
 
 
-def count_updates(algo):
+def count_updates(algo: Any) -> list[int]:
     """A list to which each gradient step from now on adds the number of its rows."""
     sizes = []
     learner = learner_of(algo)
     if hasattr(learner, "update_from_transitions"):
         update_one = learner.update_from_transitions
 
-        def counted_rows(rows, optimizer):
+        def counted_rows(rows: Transitions, optimizer: torch.optim.Optimizer) -> Any:
             sizes.append(len(rows.obs))
             return update_one(rows, optimizer)
 
@@ -80,7 +89,7 @@ def count_updates(algo):
         return sizes
     update = learner._update
 
-    def counted(batch, *args, **kwargs):
+    def counted(batch: Any, *args: Any, **kwargs: Any) -> Any:
         sizes.append(len(batch[MODULE]["obs"]))
         return update(batch, *args, **kwargs)
 
@@ -88,7 +97,23 @@ def count_updates(algo):
     return sizes
 
 
-def env_steps(result):
+def sampled_rows(algo: Any, num_iterations: int = 1) -> list[Transitions]:
+    """What DQN's loss was computed from, update by update."""
+    rows = []
+    learner = learner_of(algo)
+    update = learner.update_from_transitions
+
+    def spied(batch: Transitions, optimizer: torch.optim.Optimizer) -> Any:
+        rows.append(batch)
+        return update(batch, optimizer)
+
+    learner.update_from_transitions = spied
+    for _ in range(num_iterations):
+        algo.train()
+    return rows
+
+
+def env_steps(result: dict[str, Any]) -> int:
     return int(result["env_runners"]["num_env_steps_sampled_lifetime"])
 
 
@@ -96,7 +121,7 @@ def env_steps(result):
 
 
 @reaches("ppo", "dqn", field="hidden_sizes")
-def check_hidden_sizes(build, algorithm):
+def check_hidden_sizes(build: Build, algorithm: Algorithm) -> None:
     for sizes in ((7,), (12, 5, 9)):
         for module in modules_of(build(algorithm, hidden_sizes=sizes)):
             encoders = [module.encoder]
@@ -112,7 +137,7 @@ def check_hidden_sizes(build, algorithm):
 
 
 @reaches("ppo", "dqn", field="activation")
-def check_activation(build, algorithm):
+def check_activation(build: Build, algorithm: Algorithm) -> None:
     expected = {"linear": None, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "elu": nn.ELU, "gelu": nn.GELU}
     assert set(expected) == set(ACTIVATIONS)
     for activation, kind in expected.items():
@@ -125,7 +150,7 @@ def check_activation(build, algorithm):
 
 
 @reaches("ppo", "dqn", field="lr")
-def check_lr(build, algorithm):
+def check_lr(build: Build, algorithm: Algorithm) -> None:
     algo = build(algorithm, lr=1.7e-3)
     for _ in range(2):
         assert [group["lr"] for group in optimizer_of(algo).param_groups] == [1.7e-3]
@@ -134,18 +159,18 @@ def check_lr(build, algorithm):
 
 
 @reaches("ppo", field="grad_clip")
-def check_grad_clip(build, algorithm):
+def check_grad_clip(build: Build, algorithm: Algorithm) -> None:
     for clip in (None, 0.25):
         learner = learner_of(build(algorithm, grad_clip=clip))
         gradients = {reference: torch.full_like(param, 3.0) for reference, param in learner._params.items()}
-        before = torch.sqrt(sum((value**2).sum() for value in gradients.values()))
+        before = torch.sqrt(cast("torch.Tensor", sum((value**2).sum() for value in gradients.values())))
         after = torch.sqrt(sum((value**2).sum() for value in learner.postprocess_gradients(gradients).values()))
         assert float(before) > 10
         assert float(after) == pytest.approx(float(before) if clip is None else clip, rel=1e-3)
 
 
 @reaches("ppo", "dqn", field="num_envs")
-def check_num_envs(build, algorithm):
+def check_num_envs(build: Build, algorithm: Algorithm) -> None:
     for env_id in ("CartPole-v1", "Acrobot-v1"):  # physics of its own, and a loop over envs
         runner = build(algorithm, env_id, num_envs=5).env_runner
         assert runner.num_envs == runner.env.num_envs == 5

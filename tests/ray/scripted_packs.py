@@ -1,18 +1,30 @@
 """Packs whose members do as scripts say, run by Ray Tune as a sweep runs its own: no training, a few seconds."""
 
+from __future__ import annotations
+
 import signal
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 from unittest import mock
 
 from analysis.records import SweepRecord, TrialRecord
+from policies.acting.evaluate import Episodes, Evaluator
+from policies.acting.policy import NetworkPolicy, Policy
+from policies.portable.file import PortablePolicy
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.spec.file import load_spec
+from tune_jobs.store.record_keeper import Listener
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.training.protocol import IterationStats, PackEngine, TrialTask
+
+if TYPE_CHECKING:
+    from tune_jobs.ray_tune.pack_trainable import PackTrainable
 
 STEPS = 100
 
 
-def make_sweep(folder: Path, num_trials: int, **changes) -> SweepStore:
+def make_sweep(folder: Path, num_trials: int, **changes: Any) -> SweepStore:
     """The folder of a sweep that has not begun; an iteration is 100 env steps."""
     spec = load_spec(
         {
@@ -40,7 +52,7 @@ def make_sweep(folder: Path, num_trials: int, **changes) -> SweepStore:
     return store
 
 
-def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 (a class in a function)
+def scripted_trainable(scripts: dict[str, dict[str, Any]], pause_s: float) -> type[PackTrainable]:  # noqa: C901 (a class in a function)
     """A `PackTrainable` whose members do as scripts say.
 
     Args:
@@ -63,22 +75,23 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
     action_space = describe_space(gym.spaces.Discrete(2))
 
     class Engine:
-        def __init__(self):
-            self.tasks, self.iterations = {}, {}
+        def __init__(self) -> None:
+            self.tasks: dict[str, TrialTask] = {}
+            self.iterations: dict[str, int] = {}
 
-        def add(self, task, checkpoint):
+        def add(self, task: TrialTask, checkpoint: Path | None) -> None:
             assert task.trial_id not in self.tasks
             self.tasks[task.trial_id] = task
             self.iterations[task.trial_id] = 0
             if checkpoint is not None:
                 self.iterations[task.trial_id] = int((checkpoint / "state.txt").read_text())
 
-        def train_iteration(self):
+        def train_iteration(self) -> dict[str, IterationStats | Exception]:
             import os
             import time
 
             time.sleep(pause_s)
-            results = {}
+            results: dict[str, IterationStats | Exception] = {}
             for trial_id, task in self.tasks.items():
                 self.iterations[trial_id] += 1
                 iteration, script = self.iterations[trial_id], scripts.get(trial_id, {})
@@ -100,7 +113,7 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
                     results[trial_id] = IterationStats(iteration * steps, ((1.0, 5),))
             return results
 
-        def policy(self, trial_id):
+        def policy(self, trial_id: str) -> PortablePolicy:
             layer = Layer(np.zeros((2, 4), np.float32), np.zeros(2, np.float32), "linear")
             return PortablePolicy(
                 network=PolicyNetwork("categorical", (layer,)), algorithm="ppo", env_id="CartPole-v1", env_args={},
@@ -108,28 +121,37 @@ def scripted_trainable(scripts: dict[str, dict], pause_s: float):  # noqa: C901 
                 training={"trial_id": trial_id, "iteration": self.iterations[trial_id]},
             )  # fmt: skip
 
-        def save(self, trial_id, folder):
+        def save(self, trial_id: str, folder: Path) -> None:
             (folder / "state.txt").write_text(str(self.iterations[trial_id]))
 
-        def remove(self, trial_id):
+        def remove(self, trial_id: str) -> None:
             del self.tasks[trial_id], self.iterations[trial_id]
 
-        def close(self):
+        def close(self) -> None:
             pass
 
     class Scripted(PackTrainable):
-        def make_engine(self):
+        def make_engine(self) -> PackEngine:
             return Engine()
 
-        def evaluate(self, evaluator, policies):
-            told = [policy.portable.training for policy in policies]
+        def evaluate(self, evaluator: Evaluator, policies: Sequence[Policy]) -> list[Episodes]:
+            told = [cast("NetworkPolicy", policy).portable.training for policy in policies]
             scores = [scripts.get(one["trial_id"], {}).get("score", float(one["iteration"])) for one in told]
             return [Episodes((1,), (float(score),), (5,)) for score in scores]
 
     return Scripted
 
 
-def run_packs(store: SweepStore, scripts=None, *, num_packs=2, slots=2, pause_s=0.0, listener=None, trial_ids=None):
+def run_packs(
+    store: SweepStore,
+    scripts: dict[str, dict[str, Any]] | None = None,
+    *,
+    num_packs: int = 2,
+    slots: int = 2,
+    pause_s: float = 0.0,
+    listener: Listener | None = None,
+    trial_ids: tuple[str, ...] | None = None,
+) -> list[TrialRecord]:
     """Run the trials of a sweep that have not ended, in packs; returns their records."""
     from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 

@@ -1,15 +1,25 @@
 """Trials whose scores are known beforehand, run by Ray Tune under a sweep's scheduler: no training, a second or two."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ray import tune
 
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
+from tune_jobs.spec.sections import SchedulerSpec
 
 STEPS = 100
 
 
-def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_every=1):
+def run_scripted(
+    folder: Path,
+    scheduler: SchedulerSpec,
+    scores: Sequence[float | None],
+    *,
+    max_env_steps: int,
+    evaluate_every: int = 1,
+) -> list[int]:
     """Run one trial a score, one after another where the scheduler lets them; returns the env steps each came to.
 
     Args:
@@ -27,7 +37,7 @@ def run_scripted(folder: Path, scheduler, scores, *, max_env_steps, evaluate_eve
     grace, steps = grace_env_steps(scheduler, max_env_steps), STEPS
 
     class Scripted(TrialTrainable):
-        def step(self):
+        def step(self) -> dict[str, Any]:
             path = Path(self._trial[0]) / f"{self._trial[1]}.txt"
             count = 1 + (int(path.read_text()) if path.exists() else 0)
             path.write_text(str(count))

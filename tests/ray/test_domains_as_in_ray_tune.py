@@ -22,7 +22,7 @@ pytestmark = pytest.mark.ray
         ("loguniform", [1e-4, 1.0]),
     ],
 )
-def test_values_have_the_bounds_and_quantiles_of_ray_tunes(kind, numbers):
+def test_values_have_the_bounds_and_quantiles_of_ray_tunes(kind: str, numbers: list[float]) -> None:
     from ray import tune
 
     theirs = getattr(tune, kind)(*numbers)

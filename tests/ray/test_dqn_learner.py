@@ -1,5 +1,7 @@
 """The short path of `DQNLearner` computes what RLlib's own learner computes."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -10,14 +12,14 @@ pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 MODULE = "default_policy"
 
 
-def make(**values):
+def make(**values: Any) -> Any:
     from policies.rllib.config import build_algorithm_config
 
     hyperparams = DQNHyperparams(hidden_sizes=(8,), gamma=0.9, **values)
     return build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=3).build_algo()
 
 
-def random_batch(size, *, seed):
+def random_batch(size: int, *, seed: int) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     terminated = torch.rand(size, generator=generator) < 0.3
     n_step = torch.randint(1, 4, (size,), generator=generator).float()
@@ -31,7 +33,7 @@ def random_batch(size, *, seed):
     return batch, terminated, n_step
 
 
-def rllib_forward_train(module, batch):
+def rllib_forward_train(module: Any, batch: dict[str, torch.Tensor]) -> Any:
     """What RLlib's default module gives its learner, from our module's networks."""
     from ray.rllib.algorithms.dqn.torch.default_dqn_torch_rl_module import DefaultDQNTorchRLModule
 
@@ -41,7 +43,7 @@ def rllib_forward_train(module, batch):
 @pytest.mark.parametrize("double_q", [True, False])
 @pytest.mark.parametrize("td_loss", ["huber", "mse"])
 @pytest.mark.parametrize("dueling", [True, False])
-def test_loss_and_gradients_are_rllibs(double_q, td_loss, dueling):
+def test_loss_and_gradients_are_rllibs(double_q: bool, td_loss: str, dueling: bool) -> None:
     from ray.rllib.algorithms.dqn.torch.dqn_torch_learner import DQNTorchLearner
 
     algo = make(double_q=double_q, td_loss=td_loss, dueling=dueling)
@@ -52,9 +54,9 @@ def test_loss_and_gradients_are_rllibs(double_q, td_loss, dueling):
         for weight in module.encoder.parameters():
             weight.add_(0.3 * torch.randn(weight.shape))  # or online and target network would be the same
 
-    def gradients(loss):
+    def gradients(loss: torch.Tensor) -> list[torch.Tensor]:
         learner.get_optimizer(MODULE).zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         return [param.grad.clone() for param in learner.get_optimizer(MODULE).param_groups[0]["params"]]
 
     ours, td_errors, _ = learner.loss({**batch, "discounts": 0.9**n_step * ~terminated}, module._forward_train(batch))
@@ -77,7 +79,7 @@ def test_loss_and_gradients_are_rllibs(double_q, td_loss, dueling):
     algo.stop()
 
 
-def test_a_loss_that_is_no_number_is_not_hidden():
+def test_a_loss_that_is_no_number_is_not_hidden() -> None:
     """RLlib's learner zeroes NaN gradients and goes on as if nothing was wrong; the trial must fail instead."""
     algo = make(learning_starts=0, env_steps_per_iteration=40)
     with torch.no_grad():

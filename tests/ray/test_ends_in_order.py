@@ -10,14 +10,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.ray
 
 PROGRAM = str(Path(sys.executable).with_name("tune-jobs"))
+Start = Callable[..., subprocess.Popen[str]]
 # Trials that would take hours.
 SPEC = """
 env: CartPole-v1
@@ -47,7 +49,7 @@ def child(pid: int, program: str) -> int | None:
     return next((child for child, line in children(pid).items() if program in line.split(" ")[0]), None)
 
 
-def wait_until(condition: Callable[[], object], process: subprocess.Popen, limit_s: float = 240) -> None:
+def wait_until(condition: Callable[[], object], process: subprocess.Popen[str], limit_s: float = 240) -> None:
     deadline = time.monotonic() + limit_s
     while not condition():
         assert process.poll() is None, "it ended too early"
@@ -56,12 +58,12 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen, limit
 
 
 @pytest.fixture
-def launch(tmp_path: Path):
+def launch(tmp_path: Path) -> Iterator[Start]:
     """Launch the sweep `cut` in a process; whatever is left of it is ended."""
     (tmp_path / "spec.yaml").write_text(SPEC)
     processes = []
 
-    def start(*options: str, **how) -> subprocess.Popen:
+    def start(*options: str, **how: Any) -> subprocess.Popen[str]:
         how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **how}
         process = subprocess.Popen(
             [PROGRAM, "launch", "spec.yaml", "--name", "cut", *options], cwd=tmp_path, text=True, **how
@@ -76,7 +78,7 @@ def launch(tmp_path: Path):
 
 
 def state(folder: Path) -> str:
-    return json.loads((folder / "sweep.json").read_text())["state"]
+    return str(json.loads((folder / "sweep.json").read_text())["state"])
 
 
 def half_made(folder: Path) -> set[str]:
@@ -89,7 +91,7 @@ def has_checkpoint(folder: Path) -> bool:
     return any(folder.glob("trials/*/checkpoints/0*"))
 
 
-def resumes(folder: Path) -> dict:
+def resumes(folder: Path) -> dict[str, Any]:
     """Resume it, and stop it as soon as it has got further; how it was left then."""
     before = {path.name for path in folder.glob("trials/*/checkpoints/0*")}
     process = subprocess.Popen([PROGRAM, "resume", str(folder), "--no-finish"], stderr=subprocess.PIPE, text=True)
@@ -103,7 +105,7 @@ def resumes(folder: Path) -> dict:
     return {path.parent.name: json.loads(path.read_text()) for path in folder.glob("trials/*/trial.json")}
 
 
-def test_a_signal_while_ray_starts(launch, tmp_path: Path) -> None:
+def test_a_signal_while_ray_starts(launch: Start, tmp_path: Path) -> None:
     folder = tmp_path / "sweeps" / "cut"
     process = launch()
     wait_until(lambda: child(process.pid, "gcs_server"), process)
@@ -115,7 +117,7 @@ def test_a_signal_while_ray_starts(launch, tmp_path: Path) -> None:
     assert half_made(folder) == set()
 
 
-def test_a_terminal_that_goes_away(launch, tmp_path: Path) -> None:
+def test_a_terminal_that_goes_away(launch: Start, tmp_path: Path) -> None:
     """As a dropped ssh line: the process gets SIGHUP, and whatever it prints from then on is an error."""
     folder = tmp_path / "sweeps" / "cut"
     ours, theirs = pty.openpty()
@@ -142,7 +144,7 @@ def test_a_terminal_that_goes_away(launch, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("program", "name"), [("gcs_server", "control process (GCS)"), ("raylet", "raylet")])
-def test_a_part_of_ray_that_dies(launch, tmp_path: Path, program: str, name: str) -> None:
+def test_a_part_of_ray_that_dies(launch: Start, tmp_path: Path, program: str, name: str) -> None:
     folder = tmp_path / "sweeps" / "cut"
     process = launch("--set", "max_retries=0")
     wait_until(lambda: has_checkpoint(folder), process)

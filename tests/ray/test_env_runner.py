@@ -1,20 +1,23 @@
 """ArrayEnvRunner gives the episodes that RLlib's own runner gives, to the last bit."""
 
 import threading
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from policies.errors import EnvError
-from policies.hyperparams import DQNHyperparams, PPOHyperparams
+from policies.hyperparams import Algorithm, DQNHyperparams, PPOHyperparams
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 SEED = 5 * 1024
 MODULE = "default_policy"
 # (env id, env args, num_envs, how RLlib makes its vector env). Fragments end in the middle of episodes in all of them.
-ENVS = {
+ENVS: dict[str, tuple[str, dict[str, Any], int, str]] = {
     "cartpole": ("CartPole-v1", {}, 4, "vector_entry_point"),
     "cartpole-one": ("CartPole-v1", {"sutton_barto_reward": True}, 1, "vector_entry_point"),
     "pendulum": ("Pendulum-v1", {}, 3, "sync"),
@@ -24,7 +27,7 @@ ENVS = {
 CASES = [pytest.param("ppo", env, id=env) for env in ENVS]
 
 
-def make_config(algorithm, env):
+def make_config(algorithm: Algorithm, env: str) -> Any:
     from policies.rllib.config import build_algorithm_config
 
     env_id, env_args, num_envs, _ = ENVS[env]
@@ -37,7 +40,7 @@ def make_config(algorithm, env):
     return build_algorithm_config(hyperparams, env_id=env_id, env_args=env_args, seed=SEED)
 
 
-def make_runners(algorithm, env):
+def make_runners(algorithm: Algorithm, env: str) -> tuple[Any, Any]:
     """(ours, RLlib's), with the same weights and seeds."""
     from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
@@ -56,7 +59,7 @@ def make_runners(algorithm, env):
     return ours, theirs
 
 
-def sample(runner, sizes, **kwargs):
+def sample(runner: Any, sizes: Sequence[int], **kwargs: Any) -> list[Any]:
     """Episode lists of several fragments, with the exploration of one seed."""
     torch.manual_seed(1)
     fragments = []
@@ -68,12 +71,12 @@ def sample(runner, sizes, **kwargs):
     return fragments
 
 
-def by_stream(episodes, ids):
+def by_stream(episodes: Sequence[Any], ids: dict[str, int]) -> list[tuple[int, Any]]:
     """Episodes with ids replaced by numbers in order of first sight: ids are random."""
     return [(ids.setdefault(episode.id_, len(ids)), episode) for episode in episodes]
 
 
-def assert_equal_episodes(ours, theirs):
+def assert_equal_episodes(ours: Any, theirs: Any) -> None:
     # The whole object, lookback included: what the learner can see of it.
     assert ours.t_started == theirs.t_started
     assert len(ours) == len(theirs)
@@ -89,18 +92,20 @@ def assert_equal_episodes(ours, theirs):
         rows, other_rows = np.asarray(mine.data), np.asarray(other.data)
         assert rows.shape == other_rows.shape, name
         # RLlib turns discrete actions into int32 on the way; the learner takes any whole numbers.
-        assert rows.dtype == other_rows.dtype or (rows.dtype, other_rows.dtype) == (np.int64, np.int32), name
+        kinds = (rows.dtype, other_rows.dtype)
+        assert rows.dtype == other_rows.dtype or kinds == (np.dtype(np.int64), np.dtype(np.int32)), name
         np.testing.assert_array_equal(rows, other_rows, err_msg=name)
     assert len(ours.infos.data) == len(theirs.infos.data)
 
 
 @pytest.mark.parametrize(("algorithm", "env"), CASES)
-def test_episodes_are_those_of_rllibs_runner(algorithm, env):
+def test_episodes_are_those_of_rllibs_runner(algorithm: Algorithm, env: str) -> None:
     # Sizes that are no multiples of the sub-environments, one of less than an episode, one of a single step.
     sizes = [50, 1, 33, 64, 7]
     ours, theirs = make_runners(algorithm, env)
     mine, others = sample(ours, sizes, explore=True), sample(theirs, sizes, explore=True)
-    my_ids, other_ids = {}, {}
+    my_ids: dict[str, int] = {}
+    other_ids: dict[str, int] = {}
     num_ended = num_continued = 0
     for fragment, (my_list, other_list) in enumerate(zip(mine, others, strict=True)):
         my_pairs, other_pairs = by_stream(my_list, my_ids), by_stream(other_list, other_ids)
@@ -116,7 +121,7 @@ def test_episodes_are_those_of_rllibs_runner(algorithm, env):
     assert ours.num_env_steps_sampled_lifetime == theirs.num_env_steps_sampled_lifetime
 
 
-def test_greedy_sampling_too():
+def test_greedy_sampling_too() -> None:
     ours, theirs = make_runners("ppo", "pendulum")
     mine, others = (sample(runner, [20, 30], explore=False) for runner in (ours, theirs))
     for my_list, other_list in zip(mine, others, strict=True):
@@ -126,14 +131,14 @@ def test_greedy_sampling_too():
             assert_equal_episodes(my_episode, other_episode)
 
 
-def test_random_actions_are_refused():
+def test_random_actions_are_refused() -> None:
     ours, _ = make_runners("ppo", "ticks")
     with pytest.raises(ValueError, match="random actions"):
         ours.sample(num_timesteps=10, random_actions=True)
 
 
 @pytest.mark.parametrize(("algorithm", "env"), CASES)
-def test_the_batches_that_reach_the_learner_are_equal(algorithm, env):
+def test_the_batches_that_reach_the_learner_are_equal(algorithm: Algorithm, env: str) -> None:
     """Both episode lists through the Algorithm's own learner connector, over two fragments."""
     config = make_config(algorithm, env)
     algo = config.build_algo()
@@ -154,7 +159,7 @@ def test_the_batches_that_reach_the_learner_are_equal(algorithm, env):
     algo.stop()
 
 
-def train_batch(algo, algorithm, episodes):
+def train_batch(algo: Any, algorithm: Algorithm, episodes: Sequence[Any]) -> dict[str, Any]:
     """The batch of one module that the loss is computed from."""
     from ray.rllib.core.learner.training_data import TrainingData
 
@@ -163,7 +168,7 @@ def train_batch(algo, algorithm, episodes):
 
 
 @pytest.mark.parametrize("env", [env for env in ENVS if env != "pendulum"])
-def test_transitions_for_replay_are_those_of_rllibs_episodes(env):
+def test_transitions_for_replay_are_those_of_rllibs_episodes(env: str) -> None:
     """Equal seeds, equal weights: each step that RLlib's runner put into an episode, once, and nothing else."""
     sizes = [50, 1, 33, 64, 7]
     ours, theirs = make_runners("dqn", env)
@@ -194,7 +199,7 @@ def test_transitions_for_replay_are_those_of_rllibs_episodes(env):
     assert np.array(sorted(others.pop_finished_episodes())) == pytest.approx(np.array(sorted(whole)))
 
 
-def test_epsilon_is_the_share_of_random_actions():
+def test_epsilon_is_the_share_of_random_actions() -> None:
     ours, _ = make_runners("dqn", "cartpole")
     with torch.no_grad():
         for name, weight in ours.module.named_parameters():
@@ -207,7 +212,7 @@ def test_epsilon_is_the_share_of_random_actions():
     assert np.mean(actions == 1) == pytest.approx(0.25, abs=0.03)
 
 
-def test_no_transition_leads_from_the_end_of_an_episode_to_the_start_of_the_next():
+def test_no_transition_leads_from_the_end_of_an_episode_to_the_start_of_the_next() -> None:
     """The env counts: within an episode, each observation has one tick more than the one before."""
     ours, _ = make_runners("ppo", "ticks")
     num_ends = 0
@@ -225,7 +230,7 @@ def test_no_transition_leads_from_the_end_of_an_episode_to_the_start_of_the_next
     assert num_ends > 10
 
 
-def test_every_env_step_is_in_exactly_one_chunk():
+def test_every_env_step_is_in_exactly_one_chunk() -> None:
     ours, _ = make_runners("ppo", "ticks")
     seen = []
     num_steps = 0
@@ -236,13 +241,13 @@ def test_every_env_step_is_in_exactly_one_chunk():
             num_steps += len(chunk)
     assert len(set(seen)) == len(seen) == num_steps == ours.num_env_steps_sampled_lifetime
     # No gaps: of each episode of each sub-environment, steps 0 to the last one.
-    last_steps = {}
+    last_steps: dict[tuple[float, float], int] = {}
     for stream, episode, step in seen:
         last_steps[stream, episode] = max(step, last_steps.get((stream, episode), 0))
     assert len(seen) == sum(last + 1 for last in last_steps.values())
 
 
-def test_returns_are_of_whole_episodes_over_fragment_boundaries():
+def test_returns_are_of_whole_episodes_over_fragment_boundaries() -> None:
     """Fragments of 5 vector steps, episodes of 4 to 7: nearly all are cut. RLlib's own count sees the chunks."""
     ours, _ = make_runners("ppo", "ticks")
     finished = []
@@ -260,7 +265,7 @@ def test_returns_are_of_whole_episodes_over_fragment_boundaries():
         assert length == 4 + round(number) % 3
 
 
-def test_episodes_are_counted_in_the_order_of_their_ends():
+def test_episodes_are_counted_in_the_order_of_their_ends() -> None:
     """Or the last 100 of an iteration with more would be those of the last sub-environments, early ones among them."""
     ours, _ = make_runners("ppo", "ticks")
     chunks = ours.sample(num_timesteps=90, explore=True)
@@ -270,7 +275,7 @@ def test_episodes_are_counted_in_the_order_of_their_ends():
     assert numbers == sorted(numbers)
 
 
-def test_truncated_episodes_are_whole_too():
+def test_truncated_episodes_are_whole_too() -> None:
     ours, _ = make_runners("ppo", "acrobot-truncated")
     for _ in range(8):
         ours.sample(num_timesteps=12, explore=True)
@@ -279,7 +284,7 @@ def test_truncated_episodes_are_whole_too():
     assert set(finished) == {(-9.0, 9)}
 
 
-def test_a_reset_on_request_drops_the_running_episodes():
+def test_a_reset_on_request_drops_the_running_episodes() -> None:
     ours, _ = make_runners("ppo", "ticks")
     ours.sample(num_timesteps=8, explore=True)
     ours.pop_finished_episodes()
@@ -288,15 +293,15 @@ def test_a_reset_on_request_drops_the_running_episodes():
     assert all(chunk.observations.lookback == 0 for chunk in chunks)
 
 
-def test_whole_episodes_can_be_asked_for():
+def test_whole_episodes_can_be_asked_for() -> None:
     ours, _ = make_runners("ppo", "cartpole")
     episodes = ours.sample(num_episodes=3, explore=True)
     assert len(episodes) == 3
     assert all(episode.is_done and episode.t_started == 0 for episode in episodes)
 
 
-def test_seeds_make_the_episodes():
-    def observations(**reseed):
+def test_seeds_make_the_episodes() -> None:
+    def observations(**reseed: int) -> NDArray[Any]:
         ours, _ = make_runners("ppo", "cartpole")
         for value in reseed.values():
             ours.reseed(value)
@@ -308,7 +313,7 @@ def test_seeds_make_the_episodes():
     assert not np.array_equal(first[0], observations(seed=SEED + 1)[0])
 
 
-def test_neighbouring_env_runners_share_no_environment_seed():
+def test_neighbouring_env_runners_share_no_environment_seed() -> None:
     """RLlib gives worker w, sub-environment i the seed s + w + i: worker 2's first is worker 1's second."""
     from policies.rllib.env_runner import ArrayEnvRunner
 
@@ -322,7 +327,7 @@ def test_neighbouring_env_runners_share_no_environment_seed():
     assert "end with parent" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_what_the_environment_raises_is_raised():
+def test_what_the_environment_raises_is_raised() -> None:
     from policies.rllib.config import build_algorithm_config
     from policies.rllib.env_runner import ArrayEnvRunner
 

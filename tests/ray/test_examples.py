@@ -3,6 +3,7 @@
 import json
 import runpy
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,25 +18,25 @@ SMALL = ["stop.num_env_steps=600", "num_samples=1", "evaluation={num_episodes: 2
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_allowed(monkeypatch):
+def _nothing_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
 
 
-def cells(path):
+def cells(path: Path) -> list[str]:
     """The code cells of a notebook."""
     found = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in found)
     return ["".join(cell["source"]) for cell in found]
 
 
-def test_an_environment_of_ones_own(tmp_path):
+def test_an_environment_of_ones_own(tmp_path: Path) -> None:
     tune_jobs.allow_modules(["maze_envs"])
     result = tune_jobs.launch(EXAMPLES / "own_env" / "maze.yaml", overrides=SMALL, storage=tmp_path, progress="none")
     assert [trial.status for trial in result.trials] == ["completed"] * 2, result.trials[0].error
     assert {"policy", "after_mp4", "report"} <= set(result.artifacts), result.notes
 
 
-def test_a_module_of_ones_own(tmp_path):
+def test_a_module_of_ones_own(tmp_path: Path) -> None:
     tune_jobs.allow_modules(["norm_nets"])
     overrides = [*SMALL, "space.hidden_sizes={grid: [[8]]}"]
     path = EXAMPLES / "own_module" / "norm.yaml"
@@ -43,15 +44,15 @@ def test_a_module_of_ones_own(tmp_path):
     assert [trial.status for trial in result.trials] == ["completed"], result.trials[0].error
 
 
-def test_a_sweep_from_python(tmp_path, capsys):
+def test_a_sweep_from_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main = runpy.run_path(str(EXAMPLES / "from_python.py"))["main"]
     assert main(tmp_path, SMALL) > 0
     assert "one episode of the best policy" in capsys.readouterr().out
 
 
-def test_a_sweep_in_a_notebook(tmp_path):
+def test_a_sweep_in_a_notebook(tmp_path: Path) -> None:
     first, *others = cells(EXAMPLES / "sweep.ipynb")
-    names = {}
+    names: dict[str, Any] = {}
     exec(first, names)
     names |= {"storage": str(tmp_path), "num_env_steps": 600}
     for cell in others:

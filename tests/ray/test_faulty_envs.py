@@ -1,8 +1,11 @@
 """Sweeps in which environments give NaN or end the process: those trials fail, all else goes on and can be read."""
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 
+from tests.narrowing import present
 from tune_jobs.spec.seeds import trial_seeds
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
@@ -19,7 +22,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("engine", ["packed", "rllib"])
-def test_faulty_trials_fail_alone_and_the_sweep_is_read_retried_and_resumed(tmp_path, engine):
+def test_faulty_trials_fail_alone_and_the_sweep_is_read_retried_and_resumed(tmp_path: Path, engine: str) -> None:
     seeds = trial_seeds(0, 5)
     # In the second iteration of 32 vector steps, in the fourth episode.
     troubles = {str(seeds[index]): {"how": how, "at": 36} for index, (how, _) in FAULTS.items()}
@@ -41,7 +44,7 @@ def test_faulty_trials_fail_alone_and_the_sweep_is_read_retried_and_resumed(tmp_
     assert [trial.num_failures for trial in result.trials] == [0, 1, 1, 1, 1]
     for index, (_, words) in FAULTS.items():
         trial = result.trials[index]
-        assert trial.error.startswith(words)
+        assert present(trial.error).startswith(words)
         # One whole iteration and the steps before the fault.
         assert (trial.num_iterations, trial.num_env_steps) == (1, NUM_ENVS * 35)
         assert trial.num_episodes == NUM_ENVS * 3
@@ -50,7 +53,7 @@ def test_faulty_trials_fail_alone_and_the_sweep_is_read_retried_and_resumed(tmp_
     frame = sweeps.dataframe("mine", storage=tmp_path)
     assert isinstance(frame, pd.DataFrame)
     assert list(frame["status"]) == [trial.status for trial in result.trials]
-    assert result.best.checkpoint.trial_id == "t0000"
+    assert present(result.best).checkpoint.trial_id == "t0000"
     assert sweeps.trials("mine", storage=tmp_path) == result.trials
 
     resumed = sweeps.resume("mine", storage=tmp_path, progress="none", finish=False)

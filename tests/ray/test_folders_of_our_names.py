@@ -10,7 +10,7 @@ import pytest
 pytestmark = pytest.mark.ray
 
 
-def test_a_script_beside_folders_of_our_names_runs_on_both_engines(tmp_path):
+def test_a_script_beside_folders_of_our_names_runs_on_both_engines(tmp_path: Path) -> None:
     shutil.copytree(Path(__file__).parent / "project", tmp_path, dirs_exist_ok=True)
     done = subprocess.run(
         [sys.executable, "train.py", "packed", "rllib"], cwd=tmp_path, capture_output=True, text=True, check=False

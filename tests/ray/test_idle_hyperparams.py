@@ -1,10 +1,13 @@
 """What `policies.idle.find` says to be idle is on RLlib's engine too; for packs see `tests/unit/test_acting.py`."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from trials import make_task
 
-from policies.hyperparams import make_hyperparams
+from policies.hyperparams import Algorithm, make_hyperparams
 from policies.idle.find import Limits, idle_rule
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
@@ -26,7 +29,9 @@ CASES = [
 
 
 @pytest.mark.parametrize(("algorithm", "name", "values", "further"), CASES, ids=[f"{one[0]}-{one[1]}" for one in CASES])
-def test_what_is_said_to_be_idle_is_on_rllib(tmp_path, algorithm, name, values, further):
+def test_what_is_said_to_be_idle_is_on_rllib(
+    tmp_path: Path, algorithm: Algorithm, name: str, values: tuple[Any, Any], further: dict[str, Any]
+) -> None:
     from tune_jobs.training.rllib import RLlibEngine
 
     engine, found = RLlibEngine(), []

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,7 +29,7 @@ resources: {max_concurrent: 1}
 """
 
 
-def read(folder: Path) -> list[dict]:
+def read(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("trials/*/trial.json"))]
 
 
@@ -49,7 +50,7 @@ def wait_until_gone(pid: int, limit_s: float = 600) -> None:
 
 
 @pytest.fixture
-def interrupted(tmp_path: Path, request: pytest.FixtureRequest):
+def interrupted(tmp_path: Path, request: pytest.FixtureRequest) -> tuple[Path, int, str]:
     """A sweep that got a signal when its first trial was done and its second had checkpoints; and how it ended."""
     (tmp_path / "spec.yaml").write_text(SPEC)
     folder = tmp_path / "sweeps" / "cut"
@@ -100,7 +101,7 @@ def check_resumes(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("interrupted", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], indirect=True)
-def test_a_signal_saves_and_stops(interrupted) -> None:
+def test_a_signal_saves_and_stops(interrupted: tuple[Path, int, str]) -> None:
     folder, code, output = interrupted
     assert code == 130, output
     assert output.strip().splitlines()[-1].endswith(f"tune-jobs resume {folder.name}"), output
@@ -113,7 +114,7 @@ def test_a_signal_saves_and_stops(interrupted) -> None:
 
 
 @pytest.mark.parametrize("interrupted", [signal.SIGKILL], indirect=True)
-def test_a_kill_loses_no_more_than_the_last_iterations(interrupted) -> None:
+def test_a_kill_loses_no_more_than_the_last_iterations(interrupted: tuple[Path, int, str]) -> None:
     folder, code, _ = interrupted
     assert code == -signal.SIGKILL
     pid = read(folder)[1]["pid"]

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +11,7 @@ pytestmark = pytest.mark.ray
 FORK_FAILURE = "Initialization failure from server:\nRuntimeError: Starting Ray client server failed. See the log."
 
 
-def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path, monkeypatch):
+def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import ray._common.utils
 
     from tune_jobs.ray_tune.address import recorded_cluster
@@ -23,17 +24,19 @@ def test_the_last_cluster_is_recorded_where_ray_records_it(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(("error", "attempts"), [(FORK_FAILURE, 3), ("ray client connection timeout", 1)])
-def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(monkeypatch, error, attempts):
+def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(
+    monkeypatch: pytest.MonkeyPatch, error: str, attempts: int
+) -> None:
     from tune_jobs.ray_tune import cluster
 
     asked = []
 
-    def init(address, **_):
+    def init(address: str, **_: Any) -> None:
         asked.append(address)
         if len(asked) < 3:
             raise ConnectionAbortedError(error)
 
-    monkeypatch.setattr(cluster.ray, "init", init)
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
     if attempts == 1:
         with pytest.raises(ConnectionAbortedError):
             cluster._init_patiently("ray://host:10001")
@@ -42,26 +45,26 @@ def test_only_a_client_server_that_died_in_its_fork_is_asked_for_again(monkeypat
     assert asked == ["ray://host:10001"] * attempts
 
 
-def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch):
+def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     from policies.errors import CannotRunError
     from tune_jobs.ray_tune import cluster
 
-    def init(address, **_):
+    def init(address: str, **_: Any) -> None:
         raise ConnectionAbortedError(FORK_FAILURE)
 
-    monkeypatch.setattr(cluster.ray, "init", init)
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
     with pytest.raises(CannotRunError, match="cannot be joined: Initialization failure from server"):
         cluster._join("ray://host:10001")
 
 
-def test_a_refused_token_is_named(monkeypatch):
+def test_a_refused_token_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from policies.errors import CannotRunError
     from tune_jobs.ray_tune import cluster
 
-    def init(address, **_):
+    def init(address: str, **_: Any) -> None:
         os.write(2, b"W gcs_client.cc:210: Failed to get cluster ID: InvalidAuthToken: token is missing or incorrect\n")
         raise ConnectionError("Failed to connect")
 
-    monkeypatch.setattr(cluster.ray, "init", init)
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
     with pytest.raises(CannotRunError, match="does not accept this machine's token"):
         cluster._join("host:6379")

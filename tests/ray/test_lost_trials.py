@@ -2,6 +2,7 @@
 
 import json
 import types
+from pathlib import Path
 
 import cloudpickle
 import pytest
@@ -18,7 +19,7 @@ from tune_jobs.store.record_keeper import RecordKeeper
 pytestmark = pytest.mark.ray
 
 
-def tune_trial(folder, trial_id, cause):
+def tune_trial(folder: Path, trial_id: str, cause: Exception) -> types.SimpleNamespace:
     """As Tune shows its callbacks one whose process raised."""
     path = folder / f"{trial_id}.pkl"
     path.write_bytes(cloudpickle.dumps(RayTaskError("step", "a traceback", cause)))
@@ -26,13 +27,13 @@ def tune_trial(folder, trial_id, cause):
 
 
 @pytest.mark.parametrize("timeout_s", [1e9, 1e10, 1e300])
-def test_a_limit_of_any_size_can_be_watched(tmp_path, timeout_s):
+def test_a_limit_of_any_size_can_be_watched(tmp_path: Path, timeout_s: float) -> None:
     with (tmp_path / "log").open("wb") as file, watchdog(timeout_s, file):
         pass
 
 
 @pytest.mark.parametrize("event", ["on_trial_recover", "on_trial_error"])
-def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path, event):
+def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path: Path, event: str) -> None:
     store = make_sweep(tmp_path / "mine", 2)
     keeper = RecordKeeper(store, ["t0000", "t0001"], lambda record: None)
     # Of a Ray that lives: no part of it is silent.
@@ -45,13 +46,13 @@ def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path, eve
     assert keeper.record("t0001").num_failures == 1
 
 
-def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path):
+def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path: Path) -> None:
     store = make_sweep(tmp_path / "mine", 1)
     run = store.take()
     store.take()
     store.tune_folder.mkdir()
 
-    def everything():
+    def everything() -> dict[Path, bytes | None]:
         return {path: path.read_bytes() if path.is_file() else None for path in store.folder.rglob("*")}
 
     before = everything()
@@ -61,7 +62,9 @@ def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(("damaged", "fits"), [((), False), (("000004",), False), (("000006",), True)])
-def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(tmp_path, damaged, fits):
+def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(
+    tmp_path: Path, damaged: tuple[str, ...], fits: bool
+) -> None:
     store = make_sweep(tmp_path / "mine", 1)
     pointer = tmp_path / "pointer.json"
     pointer.write_text(json.dumps({"trial_id": "t0000", "iteration": 6}))

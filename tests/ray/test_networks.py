@@ -1,16 +1,19 @@
 """Our RLModules: what they compute, and how their statistics travel."""
 
+from pathlib import Path
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from network_builds import build, observations_of, portable, rllib_outputs
-from rllib_cases import MODULE, learner_of, module_of
+from rllib_cases import MODULE, Build, learner_of, module_of
 
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError, SpecError
-from policies.hyperparams import make_hyperparams
+from policies.hyperparams import Algorithm, DQNHyperparams, PPOHyperparams
 from policies.portable.file import ConvLayer, save_policy
 from tests.rounding import assert_greedy, assert_network
 
@@ -23,8 +26,8 @@ FILTERS = ((6, 4, 2), (4, 2, 1))
 NUM_TERMS = 300
 
 
-IMAGES = {"conv_filters": FILTERS, "initializer": "orthogonal"}
-KINDS = {
+IMAGES: dict[str, Any] = {"conv_filters": FILTERS, "initializer": "orthogonal"}
+KINDS: dict[str, tuple[Algorithm, str, dict[str, Any], dict[str, Any]]] = {
     "ppo conv": ("ppo", "TestShades-v0", {}, {**IMAGES, "activation": "relu"}),
     "ppo conv shared": ("ppo", "TestShades-v0", {}, {**IMAGES, "vf_share_layers": True, "activation": "linear"}),
     "ppo conv float": ("ppo", "TestShades-v0", {"as_bytes": False}, {**IMAGES, "activation": "gelu"}),
@@ -39,7 +42,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_portable_network_computes_what_the_module_computes(build, kind, tmp_path):
+def test_the_portable_network_computes_what_the_module_computes(build: Build, kind: str, tmp_path: Path) -> None:
     algorithm, env_id, env_args, values = KINDS[kind]
     algo, hyperparams = build(algorithm, env_id, env_args, **values)
     algo.train()
@@ -54,27 +57,35 @@ def test_the_portable_network_computes_what_the_module_computes(build, kind, tmp
     expected = rllib_outputs(algo, obs)
     save_policy(portable(algo, hyperparams, env_args), tmp_path)
     policy = load_policy(tmp_path)
-    outputs = policy.outputs(obs)
+    assert isinstance(policy, NetworkPolicy)
+    found = policy.outputs(obs)
     if "dueling" in kind:  # the state value is left out
-        outputs, expected = (array - array.mean(axis=1, keepdims=True) for array in (outputs, expected))
-    assert_network(outputs, expected, num_terms=NUM_TERMS)
+        found, expected = (array - array.mean(axis=1, keepdims=True) for array in (found, expected))
+    assert_network(found, expected, num_terms=NUM_TERMS)
     if isinstance(policy.action_space, gym.spaces.Discrete):
         best = expected.argmax(axis=1)
         assert "dueling" in kind or len(np.unique(best)) > 1
-        assert_greedy(policy.act(obs) - policy.action_space.start, best, expected, num_terms=NUM_TERMS)
+        start = int(policy.action_space.start)
+        assert_greedy(np.asarray(policy.act(obs)) - start, best, expected, num_terms=NUM_TERMS)
     for index in (0, 7, 999):
         np.testing.assert_array_equal(policy.outputs(obs[index : index + 1])[0], policy.outputs(obs)[index])
-        np.testing.assert_array_equal(policy.act(obs[index]), policy.act(obs)[index])
+        np.testing.assert_array_equal(policy.act(obs[index]), np.asarray(policy.act(obs))[index])
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_training_on_images_moves_all_that_learns(build, algorithm):
+def test_training_on_images_moves_all_that_learns(build: Build, algorithm: Algorithm) -> None:
     algo, hyperparams = build(algorithm, "TestShades-v0", conv_filters=FILTERS)
     module = module_of(algo)
     before = {name: value.clone() for name, value in module.state_dict().items()}
-    acting_module, dtypes = algo.env_runner.module, set()
+    acting_module = algo.env_runner.module
+    dtypes: set[torch.dtype] = set()
     prepare = acting_module.prepare
-    acting_module.prepare = lambda obs: dtypes.add(obs.dtype) or prepare(obs)
+
+    def spied(obs: torch.Tensor) -> Any:
+        dtypes.add(obs.dtype)
+        return prepare(obs)
+
+    acting_module.prepare = spied
     algo.train()
     assert dtypes == {torch.uint8}  # a quarter of the memory; the module scales them
     after = module.state_dict()
@@ -89,7 +100,7 @@ def test_training_on_images_moves_all_that_learns(build, algorithm):
     NetworkPolicy(portable(algo, hyperparams)).check_finite()
 
 
-def test_pixels_of_cartpole_train(build):
+def test_pixels_of_cartpole_train(build: Build) -> None:
     for algorithm in ("ppo", "dqn"):
         algo, hyperparams = build(
             algorithm, env_args={"pixels": True}, conv_filters=((8, 8, 4), (8, 3, 2)), activation="relu"
@@ -112,18 +123,20 @@ def test_pixels_of_cartpole_train(build):
         ("TestShades-v0", {"conv_filters": ((4, 8, 1), (4, 3, 1))}, r"conv_filters\[1\]"),
     ],
 )
-def test_networks_that_do_not_go_with_the_observations_are_refused(env_id, values, words):
+def test_networks_that_do_not_go_with_the_observations_are_refused(
+    env_id: str, values: dict[str, Any], words: str
+) -> None:
     from policies.networks.parts import make_encoder
     from policies.networks.rl_modules import module_spec
 
     env = gym.make(env_id)
-    config = module_spec(make_hyperparams("ppo", values)).model_config
+    config = module_spec(PPOHyperparams(**values)).model_config
     with pytest.raises(SpecError, match=words):
         make_encoder(env.observation_space, config)
 
 
 @pytest.mark.parametrize("dueling", [True, False])
-def test_a_target_network_is_a_copy_and_need_not_be(build, dueling):
+def test_a_target_network_is_a_copy_and_need_not_be(build: Build, dueling: bool) -> None:
     module = module_of(build("dqn", initializer="orthogonal", dueling=dueling)[0])
     pairs = module.get_target_network_pairs()
     assert [online for online, _ in pairs] == [module.encoder, module.af, *([module.vf] if dueling else [])]
@@ -142,12 +155,12 @@ def test_a_target_network_is_a_copy_and_need_not_be(build, dueling):
 # -- statistics of observations
 
 
-def statistics(build, **values):
+def statistics(build: Build, **values: Any) -> Any:
     algo, _ = build("ppo", normalize_observations=True, **values)
     return module_of(algo)
 
 
-def test_statistics_of_batches_are_those_of_all_observations(build):
+def test_statistics_of_batches_are_those_of_all_observations(build: Build) -> None:
     module = statistics(build)
     rng = np.random.default_rng(0)
     # Batches of other means, and of one observation; a mean far from 0.
@@ -164,12 +177,12 @@ def test_statistics_of_batches_are_those_of_all_observations(build):
     torch.testing.assert_close(module.prepare(torch.cat([far, -far])), torch.tensor([[10.0] * 4, [-10.0] * 4]))
 
 
-def test_without_observations_nothing_is_shifted(build):
+def test_without_observations_nothing_is_shifted(build: Build) -> None:
     obs = torch.randn(5, 4)
     torch.testing.assert_close(statistics(build).prepare(obs), obs)
 
 
-def test_bytes_are_scaled_before_they_are_counted(build):
+def test_bytes_are_scaled_before_they_are_counted(build: Build) -> None:
     module = statistics(build, env_id="TestShades-v0", conv_filters=FILTERS)
     images = np.random.default_rng(0).integers(0, 256, (30, 12, 9, 2), dtype=np.uint8)
     module.update_observation_statistics(images)
@@ -179,14 +192,14 @@ def test_bytes_are_scaled_before_they_are_counted(build):
     np.testing.assert_allclose(prepared.std(axis=0), 1.0, rtol=1e-3)
 
 
-def test_a_batch_is_trained_with_the_statistics_it_was_sampled_with(build):
+def test_a_batch_is_trained_with_the_statistics_it_was_sampled_with(build: Build) -> None:
     """Or PPO's ratio would not begin at 1."""
     algo, _ = build("ppo", normalize_observations=True)
     algo.train()
     learner, module, differences = learner_of(algo), module_of(algo), []
     update = learner._update
 
-    def spied(batch, *args, **kwargs):
+    def spied(batch: Any, *args: Any, **kwargs: Any) -> Any:
         rows = batch[MODULE]
         with torch.no_grad():
             now = module.forward_train(rows)["action_dist_inputs"]
@@ -204,7 +217,7 @@ def test_a_batch_is_trained_with_the_statistics_it_was_sampled_with(build):
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_statistics_are_in_checkpoints(build, algorithm, tmp_path):
+def test_statistics_are_in_checkpoints(build: Build, algorithm: Algorithm, tmp_path: Path) -> None:
     from policies.rllib.restore import check_weights, restore_algorithm
 
     algo, hyperparams = build(algorithm, normalize_observations=True)
@@ -227,7 +240,7 @@ def test_statistics_are_in_checkpoints(build, algorithm, tmp_path):
     restored.stop()
 
 
-def test_convolutions_of_a_checkpoint_are_checked(build, tmp_path):
+def test_convolutions_of_a_checkpoint_are_checked(build: Build, tmp_path: Path) -> None:
     from dataclasses import replace
 
     from policies.rllib.restore import check_weights
@@ -246,11 +259,11 @@ def test_convolutions_of_a_checkpoint_are_checked(build, tmp_path):
         ({"conv_filters": FILTERS, "normalize_observations": True}, "no weights 'obs_mean'"),
     ):
         with pytest.raises(CheckpointError, match=what):
-            portable(algo, make_hyperparams("ppo", {"hidden_sizes": (16,), **values}))
+            portable(algo, PPOHyperparams(**{"hidden_sizes": (16,), **values}))
 
 
-def test_statistics_that_the_hyperparameters_do_not_name_are_an_error(build):
+def test_statistics_that_the_hyperparameters_do_not_name_are_an_error(build: Build) -> None:
     """Or the policy file would be without them, and act on other numbers."""
     algo, _ = build("dqn", normalize_observations=True)
     with pytest.raises(CheckpointError, match="normalised observations: True"):
-        portable(algo, make_hyperparams("dqn", {"hidden_sizes": (16,)}))
+        portable(algo, DQNHyperparams(hidden_sizes=(16,)))

@@ -16,7 +16,7 @@ OLD_PACK = Path(__file__).parents[1] / "unit" / "samples" / "packed_of_format_2"
 
 @pytest.mark.ray
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_a_sweep_of_before_is_restored_and_trains_on(ray_session, tmp_path, algorithm):
+def test_a_sweep_of_before_is_restored_and_trains_on(ray_session: None, tmp_path: Path, algorithm: str) -> None:
     shutil.copytree(SAMPLES / algorithm, tmp_path / algorithm)
     # Raises unless its weights are those of the policy file beside it.
     algo = restore(tmp_path / algorithm / "t0000")
@@ -29,7 +29,7 @@ def test_a_sweep_of_before_is_restored_and_trains_on(ray_session, tmp_path, algo
 
 
 @pytest.mark.ray
-def test_a_pack_of_before_manifests_named_engines_is_restored_and_trains_on(ray_session, tmp_path):
+def test_a_pack_of_before_manifests_named_engines_is_restored_and_trains_on(ray_session: None, tmp_path: Path) -> None:
     shutil.copytree(OLD_PACK, tmp_path / "pack")
     algo = restore(tmp_path / "pack" / "t0000")
     try:
@@ -40,7 +40,7 @@ def test_a_pack_of_before_manifests_named_engines_is_restored_and_trains_on(ray_
         algo.stop()
 
 
-def test_each_old_name_leads_to_what_it_had():
+def test_each_old_name_leads_to_what_it_had() -> None:
     names = {
         "policies.dqn_algorithm": "ReplayDQN",
         "policies.dqn_learner": "DQNLearner",
@@ -58,9 +58,9 @@ def test_each_old_name_leads_to_what_it_had():
         assert module not in sys.modules
 
 
-def test_a_users_own_module_of_an_old_name_is_theirs_again_afterwards(monkeypatch):
+def test_a_users_own_module_of_an_old_name_is_theirs_again_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
     theirs = type(sys)("policies.exploration")
-    theirs.Curiosity = dict
+    theirs.Curiosity = dict  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "policies.exploration", theirs)
     with old_names():
         assert pickle.loads(b"cpolicies.exploration\nCuriosity\n.") is dict

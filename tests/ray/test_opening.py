@@ -36,7 +36,9 @@ pack._open()
 
 
 @pytest.mark.parametrize("what", OPENED)
-def test_an_env_that_hangs_when_it_is_made_ends_the_process(tmp_path, monkeypatch, what):
+def test_an_env_that_hangs_when_it_is_made_ends_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     tests = str(ROOT / "tests" / "unit")
     monkeypatch.syspath_prepend(tests)

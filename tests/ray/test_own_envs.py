@@ -1,10 +1,14 @@
 """Environments of a user's own and the wrappers around them, in real trials and in Ray's processes."""
 
+from __future__ import annotations
+
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -15,8 +19,14 @@ from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import EnvError
 from policies.portable.file import read_policy
+from policies.replay import Transitions
+from tests.narrowing import present
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.outcome import SweepResult
+
+if TYPE_CHECKING:
+    from tune_jobs.training.rllib import RLlibEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -27,12 +37,12 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_allowed(monkeypatch):
+def _nothing_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
 
 
 @pytest.fixture
-def engine():
+def engine() -> Iterator[RLlibEngine]:
     from tune_jobs.training.rllib import RLlibEngine
 
     engine = RLlibEngine()
@@ -40,14 +50,14 @@ def engine():
     engine.close()
 
 
-def learnt_rewards(engine):
+def learnt_rewards(engine: RLlibEngine) -> list[float]:
     """Every reward of the batches that the learner gets from now on."""
     learner = engine.algorithm.learner_group._learner
     seen = []
     if hasattr(learner, "update_from_transitions"):
         update = learner.update_from_transitions
 
-        def spied(batch, optimizer):
+        def spied(batch: Transitions, optimizer: Any) -> Any:
             seen.extend(np.asarray(batch.rewards).ravel().tolist())
             return update(batch, optimizer)
 
@@ -55,7 +65,7 @@ def learnt_rewards(engine):
     else:
         loss = learner.compute_loss_for_module
 
-        def spied_loss(**kwargs):
+        def spied_loss(**kwargs: Any) -> Any:
             seen.extend(kwargs["batch"]["rewards"].ravel().tolist())
             return loss(**kwargs)
 
@@ -65,11 +75,13 @@ def learnt_rewards(engine):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 @pytest.mark.parametrize("penalty", [None, -100.0])
-def test_a_failure_penalty_reaches_the_learner_and_no_return(engine, tmp_path, algorithm, penalty):
+def test_a_failure_penalty_reaches_the_learner_and_no_return(
+    engine: RLlibEngine, tmp_path: Path, algorithm: str, penalty: float | None
+) -> None:
     task = make_task(tmp_path, algorithm, failure_penalty=penalty)
     engine.build(task, None)
     learnt = learnt_rewards(engine)
-    episodes = []
+    episodes: list[tuple[float, int]] = []
     while len(episodes) < 4:  # more than a fragment each: their returns go over fragments' ends
         episodes += engine.train_iteration().episodes
     # Rows of 0 are RLlib's own, for the value after a chunk's last step, and masked in the loss.
@@ -79,18 +91,18 @@ def test_a_failure_penalty_reaches_the_learner_and_no_return(engine, tmp_path, a
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_no_reported_return_holds_the_penalty(engine, tmp_path, algorithm):
+def test_no_reported_return_holds_the_penalty(engine: RLlibEngine, tmp_path: Path, algorithm: str) -> None:
     task = make_task(tmp_path, algorithm, failure_penalty=-100.0)
     progress = run_trial(task, engine)
-    assert progress.training_return > 0
-    assert progress.evaluation_return > 0
+    assert present(progress.training_return) > 0
+    assert present(progress.evaluation_return) > 0
     saved = read_policy(tmp_path / progress.checkpoints[-1].path)
     assert saved.env_args == {}
     assert min(evaluate_policy(load_policy(tmp_path / progress.checkpoints[-1].path), seeds=[5, 6],
                                env_id="CartPole-v1").returns) > 0  # fmt: skip
 
 
-def test_a_restored_trial_goes_on_with_its_penalty(engine, tmp_path):
+def test_a_restored_trial_goes_on_with_its_penalty(engine: RLlibEngine, tmp_path: Path) -> None:
     task = make_task(tmp_path, "ppo", failure_penalty=-100.0)
     progress = run_trial(task, engine)
     engine.build(task, tmp_path / progress.checkpoints[-1].path)
@@ -99,7 +111,7 @@ def test_a_restored_trial_goes_on_with_its_penalty(engine, tmp_path):
     assert -100.0 in learnt
 
 
-def test_pixels_and_frames_train_and_travel_with_the_policy(engine, tmp_path):
+def test_pixels_and_frames_train_and_travel_with_the_policy(engine: RLlibEngine, tmp_path: Path) -> None:
     env_args = {"pixels": True, "frame_stack": 2}
     task = make_task(
         tmp_path, "ppo", env_args=env_args, conv_filters=((4, 8, 4), (8, 4, 2)), failure_penalty=-1.0, num_envs=2
@@ -113,7 +125,7 @@ def test_pixels_and_frames_train_and_travel_with_the_policy(engine, tmp_path):
     assert np.mean(returns) == progress.evaluation_return
 
 
-def launch(tmp_path, spec, **kwargs):
+def launch(tmp_path: Path, spec: dict[str, Any], **kwargs: Any) -> SweepResult:
     spec = {
         "algorithm": "ppo",
         "hyperparams": {**FAST, "lr": 0.01},
@@ -123,7 +135,7 @@ def launch(tmp_path, spec, **kwargs):
     return sweeps.launch(spec, storage=tmp_path, progress="none", name="own", **kwargs)
 
 
-def test_an_own_env_class_trains_in_rays_processes_and_is_evaluated_without_penalty(tmp_path):
+def test_an_own_env_class_trains_in_rays_processes_and_is_evaluated_without_penalty(tmp_path: Path) -> None:
     from tune_jobs_test_own import Edge
 
     env = {"id": Edge, "args": {"limit": 9}, "frame_stack": 2, "failure_penalty": -50}
@@ -137,12 +149,14 @@ def test_an_own_env_class_trains_in_rays_processes_and_is_evaluated_without_pena
         returns = [number for line in lines for number in line.episode_returns]
         assert returns
         assert all(1 <= number <= 9 for number in returns)
-    assert all(1 <= number <= 9 for number in result.best.confirmation.returns)
-    assert result.best.confirmation.env_args == {"limit": 9, "frame_stack": 2}
+    assert all(1 <= number <= 9 for number in present(result.best).confirmation.returns)
+    assert present(result.best).confirmation.env_args == {"limit": 9, "frame_stack": 2}
     assert {"policy", "after_mp4", "report"} <= set(result.artifacts), result.notes
 
 
-def test_an_env_id_of_an_allowed_module_trains_in_env_runners_too_and_goes_on_without_being_allowed_again(tmp_path):
+def test_an_env_id_of_an_allowed_module_trains_in_env_runners_too_and_goes_on_without_being_allowed_again(
+    tmp_path: Path,
+) -> None:
     spec = {
         "env": f"{OWN}:TestEdge",
         "space": {"gamma": {"uniform": [0.9, 0.99]}},
@@ -167,9 +181,9 @@ def test_an_env_id_of_an_allowed_module_trains_in_env_runners_too_and_goes_on_wi
     assert sweeps.extend("own", 1, storage=tmp_path, finish=False).trials[1].status == "completed"
 
 
-def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path):
+def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path: Path) -> None:
     """With a Ray of its own, whose workers get neither this process's path nor its modules."""
-    source = Path(sys.modules[OWN].__file__ if OWN in sys.modules else ROOT / f"tests/ray/env_plugin/{OWN}.py")
+    source = Path(present(sys.modules[OWN].__file__) if OWN in sys.modules else ROOT / f"tests/ray/env_plugin/{OWN}.py")
     (tmp_path / "here_envs.py").write_text(source.read_text().replace("TestEdge-v0", "HereEdge-v0"))
     (tmp_path / "sweep.yaml").write_text(
         "env: here_envs:HereEdge-v0\nalgorithm: ppo\n"
@@ -178,7 +192,7 @@ def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path):
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     command = [sys.executable, "-P", "-m", "tune_jobs.cli.commands", "launch", "sweep.yaml", "--json", "--no-finish"]
 
-    def run(*options):
+    def run(*options: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [*command, *options], cwd=tmp_path, env=env | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
             check=False,
@@ -191,7 +205,9 @@ def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_own_modules_that_only_this_processs_path_has_are_found_by_the_ray_it_starts(tmp_path, monkeypatch):
+def test_own_modules_that_only_this_processs_path_has_are_found_by_the_ray_it_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from tune_jobs.ray_tune import cluster
 
     (tmp_path / "hidden_own.py").write_text("")

@@ -1,18 +1,21 @@
 """RLModule classes of a user's own: they train, restore by themselves, act, and are imported only where allowed."""
 
 import sys
+from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from network_builds import build, observations_of, portable, rllib_outputs
-from rllib_cases import module_of
+from rllib_cases import Build, module_of
 
 from policies.acting.load import load_policy
 from policies.errors import CheckpointError, SpecError
-from policies.hyperparams import make_hyperparams
+from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.portable.file import read_policy, save_policy
+from tests.narrowing import present
 from tests.rounding import assert_greedy, assert_network
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
@@ -25,7 +28,7 @@ NUM_TERMS = 200
 
 
 @pytest.fixture
-def allowed(monkeypatch):
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The module of test classes may be imported, in this test alone."""
     monkeypatch.setattr("policies.envs.modules._allowed", {MODULES})
 
@@ -40,7 +43,7 @@ OWN = {
 
 @pytest.mark.parametrize("kind", OWN)
 @pytest.mark.usefixtures("allowed")
-def test_a_module_of_ones_own_trains_restores_and_acts(build, kind, tmp_path):
+def test_a_module_of_ones_own_trains_restores_and_acts(build: Build, kind: str, tmp_path: Path) -> None:
     import tune_jobs_test_modules
     from ray.rllib.utils.spaces.space_utils import unsquash_action
 
@@ -56,7 +59,7 @@ def test_a_module_of_ones_own_trains_restores_and_acts(build, kind, tmp_path):
     assert any(not torch.equal(value, before[key]) for key, value in module_of(algo).state_dict().items())
 
     save_policy(portable(algo, hyperparams), tmp_path / "policy")
-    assert read_policy(tmp_path / "policy").network.module.class_path == f"{MODULES}:{name}"
+    assert present(read_policy(tmp_path / "policy").network.module).class_path == f"{MODULES}:{name}"
     algo.save_to_path(str(tmp_path / "rllib"))
     restored = restore_algorithm(tmp_path / "rllib", read_policy(tmp_path / "policy").network)
     assert type(module_of(restored)) is type(restored.env_runner.module) is own_class
@@ -69,17 +72,19 @@ def test_a_module_of_ones_own_trains_restores_and_acts(build, kind, tmp_path):
     policy.check_finite()
     obs = observations_of(algo, num=200, scale=2.0)
     outputs = rllib_outputs(algo, obs)
-    actions = policy.act(obs)
+    actions = np.asarray(policy.act(obs))
     if isinstance(policy.action_space, gym.spaces.Box):
         expected = unsquash_action(outputs[:, :1], policy.action_space)
         assert_network(actions, expected, num_terms=NUM_TERMS)
     else:
         assert_greedy(actions, outputs.argmax(axis=1), outputs, num_terms=NUM_TERMS)
     assert np.array_equal(policy.act(obs[0]), actions[0])
-    assert policy.act(obs[:0]).shape == (0, *policy.action_space.shape)
+    assert np.shape(policy.act(obs[:0])) == (0, *present(policy.action_space.shape))
 
 
-def test_a_module_that_was_not_allowed_is_never_imported(build, allowed, monkeypatch, tmp_path):
+def test_a_module_that_was_not_allowed_is_never_imported(
+    build: Build, allowed: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from policies.rllib.restore import restore_algorithm
 
     algo, hyperparams = build("ppo", rl_module=f"{MODULES}:OwnPPO")
@@ -97,7 +102,9 @@ def test_a_module_that_was_not_allowed_is_never_imported(build, allowed, monkeyp
     assert MODULES not in sys.modules
 
 
-def test_a_module_that_is_gone_is_an_error(build, allowed, monkeypatch, tmp_path):
+def test_a_module_that_is_gone_is_an_error(
+    build: Build, allowed: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """RLlib itself only warns, and goes on with another class."""
     import tune_jobs_test_modules
 
@@ -122,8 +129,10 @@ def test_a_module_that_is_gone_is_an_error(build, allowed, monkeypatch, tmp_path
     ],
 )
 @pytest.mark.usefixtures("allowed")
-def test_classes_that_cannot_be_trained_are_refused(algorithm, values, name, words):
+def test_classes_that_cannot_be_trained_are_refused(
+    algorithm: Algorithm, values: dict[str, Any], name: str, words: str
+) -> None:
     from policies.networks.rl_modules import module_spec
 
     with pytest.raises(SpecError, match=words):
-        module_spec(make_hyperparams(algorithm, values), f"{MODULES}:{name}")
+        module_spec(cast("TrainedHyperparams", make_hyperparams(algorithm, values)), f"{MODULES}:{name}")

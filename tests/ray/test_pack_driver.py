@@ -1,5 +1,9 @@
 """Who trains in which pack, decided without any process: what packs report is made up here."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import pytest
 from scripted_packs import make_sweep
 
@@ -16,10 +20,23 @@ from tune_jobs.training.pack_loop import MemberReport
 pytestmark = pytest.mark.ray
 
 
+Report = MemberReport | tuple[int, float | str]
+"""What a member tells: see `Driven.tell`."""
+
+
 class Driven:
     """A driver whose packs are up, and what they would report."""
 
-    def __init__(self, folder, num_trials, *, num_packs=2, slots=2, choose=None, **spec):
+    def __init__(
+        self,
+        folder: Path,
+        num_trials: int,
+        *,
+        num_packs: int = 2,
+        slots: int = 2,
+        choose: Callable[[str], None] | None = None,
+        **spec: Any,
+    ) -> None:
         self.store = make_sweep(folder / "mine", num_trials, **spec)
         names = [f"t{index:04d}" for index in range(num_trials)]
         self.spec = SweepSpec.model_validate(self.store.read_record().spec)
@@ -32,15 +49,15 @@ class Driven:
         for pack_id in self.driver.pack_ids:
             self.driver.started(pack_id)
 
-    def assigned(self, pack_id="p00"):
+    def assigned(self, pack_id: str = "p00") -> list[int]:
         """Trial numbers in a pack's file."""
         return [int(name[1:]) for name in PackFiles(self.store.folder, pack_id).read().trial_ids]
 
-    def tell(self, pack_id="p00", /, **reports):
+    def tell(self, pack_id: str = "p00", /, **reports: Report) -> bool:
         """Reports of a pack, by trial id: env steps, with a score, or a status, or a failure."""
         return self.driver.take(pack_id, [self.report(*item) for item in reports.items()], node="here", pid=1)
 
-    def report(self, trial_id, what):
+    def report(self, trial_id: str, what: Report) -> MemberReport:
         if isinstance(what, MemberReport):
             return what
         steps, told = what
@@ -51,12 +68,12 @@ class Driven:
         )  # fmt: skip
         return MemberReport(trial_id, progress)
 
-    def status(self, number):
+    def status(self, number: int) -> tuple[str, int]:
         record = self.keeper.record(f"t{number:04d}")
         return record.status, record.num_failures
 
 
-def failure(number, *, retried):
+def failure(number: int, *, retried: bool) -> MemberReport:
     return MemberReport(f"t{number:04d}", error="it broke", retried=retried)
 
 
@@ -67,13 +84,15 @@ def failure(number, *, retried):
     ("num_trials", "slots", "shares"),
     [(5, 64, [[0, 1, 2], [3, 4]]), (9, 2, [[0, 1], [2, 3]]), (1, 8, [[0]]), (2, 1, [[0], [1]])],
 )
-def test_trials_are_spread_evenly_in_their_order(tmp_path, num_trials, slots, shares):
+def test_trials_are_spread_evenly_in_their_order(
+    tmp_path: Path, num_trials: int, slots: int, shares: list[list[int]]
+) -> None:
     driven = Driven(tmp_path, num_trials, slots=slots)
     assert [driven.assigned(pack_id) for pack_id in driven.driver.pack_ids] == shares
     assert not driven.driver.is_finished
 
 
-def test_free_slots_are_filled_until_nobody_waits(tmp_path):
+def test_free_slots_are_filled_until_nobody_waits(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 6)
     assert driven.tell(t0000=(1000, "completed")) is False
     assert driven.assigned() == [1, 4]
@@ -87,8 +106,8 @@ def test_free_slots_are_filled_until_nobody_waits(tmp_path):
     assert [driven.status(number)[0] for number in (0, 3)] == ["completed", "failed"]
 
 
-def test_points_are_chosen_when_trials_are_handed_out_and_once(tmp_path):
-    chosen = []
+def test_points_are_chosen_when_trials_are_handed_out_and_once(tmp_path: Path) -> None:
+    chosen: list[str] = []
     driven = Driven(tmp_path, 6, choose=chosen.append)
     assert chosen == ["t0000", "t0001", "t0002", "t0003"]
     driven.tell(t0000=(1000, "completed"))
@@ -102,7 +121,7 @@ def test_points_are_chosen_when_trials_are_handed_out_and_once(tmp_path):
 ASHA = {"type": "asha", "grace_env_steps": 200, "reduction_factor": 2}
 
 
-def test_who_is_ended_makes_room_before_it_has_left(tmp_path):
+def test_who_is_ended_makes_room_before_it_has_left(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 4, num_packs=1, scheduler=ASHA)
     driven.tell(t0000=(200, 9.0), t0001=(200, 1.0))
     # The pack lets 1 go first; it is no member any more to whoever reads the file.
@@ -114,7 +133,7 @@ def test_who_is_ended_makes_room_before_it_has_left(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["fails", "dies"])
-def test_who_is_ended_and_cannot_save_is_ended_all_the_same(tmp_path, how):
+def test_who_is_ended_and_cannot_save_is_ended_all_the_same(tmp_path: Path, how: str) -> None:
     driven = Driven(tmp_path, 2, num_packs=1, scheduler=ASHA, max_retries=0)
     driven.tell(t0000=(200, 9.0), t0001=(200, 1.0))
     saved = CheckpointRecord(trial_id="t0001", iteration=2, num_env_steps=200, evaluation_return=1.0)
@@ -132,7 +151,7 @@ def test_who_is_ended_and_cannot_save_is_ended_all_the_same(tmp_path, how):
     assert driven.assigned() == [0]
 
 
-def test_whoever_has_ended_is_compared_with_too(tmp_path):
+def test_whoever_has_ended_is_compared_with_too(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 5, num_packs=1, slots=5, scheduler=ASHA)
     # With what it had at its end.
     driven.tell(t0000=(200, "completed"), t0001=(200, 0.5))
@@ -145,7 +164,7 @@ def test_whoever_has_ended_is_compared_with_too(tmp_path):
     assert driven.assigned() == [0]
 
 
-def test_a_report_without_an_evaluation_is_compared_with_nothing(tmp_path):
+def test_a_report_without_an_evaluation_is_compared_with_nothing(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 2, num_packs=1, scheduler=ASHA)
     driven.tell(t0000=(200, 9.0))
     report = driven.report("t0001", (200, 1.0))
@@ -157,7 +176,7 @@ def test_a_report_without_an_evaluation_is_compared_with_nothing(tmp_path):
 # -- failures
 
 
-def test_failures_of_its_own_are_known_to_the_next_process(tmp_path):
+def test_failures_of_its_own_are_known_to_the_next_process(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 2, num_packs=1, max_retries=3)
     driven.tell(t0001=failure(1, retried=True))
     assert driven.status(1) == ("running", 1)
@@ -167,8 +186,8 @@ def test_failures_of_its_own_are_known_to_the_next_process(tmp_path):
     assert driven.assigned() == [0]
 
 
-def test_who_was_in_two_packs_that_died_goes_on_alone(tmp_path):
-    chosen = []
+def test_who_was_in_two_packs_that_died_goes_on_alone(tmp_path: Path) -> None:
+    chosen: list[str] = []
     driven = Driven(tmp_path, 5, num_packs=1, slots=2, max_retries=0, choose=chosen.append)
     driven.driver.died("p00", "killed")
     # Once may be anybody's fault: all are tried again.
@@ -197,7 +216,7 @@ def test_who_was_in_two_packs_that_died_goes_on_alone(tmp_path):
     assert chosen == [f"t000{number}" for number in range(5)]
 
 
-def test_a_pack_of_one_has_the_retries_of_a_trial(tmp_path):
+def test_a_pack_of_one_has_the_retries_of_a_trial(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 1, num_packs=1, max_retries=2)
     statuses = []
     for _ in range(3):
@@ -212,7 +231,7 @@ def test_a_pack_of_one_has_the_retries_of_a_trial(tmp_path):
 # -- the end of the run
 
 
-def test_nobody_is_handed_out_any_more_when_the_sweep_stops(tmp_path):
+def test_nobody_is_handed_out_any_more_when_the_sweep_stops(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 6)
     driven.store.request_stop()
     assert driven.tell(t0000=(300, "paused"), t0001=failure(1, retried=True)) is True
@@ -224,7 +243,7 @@ def test_nobody_is_handed_out_any_more_when_the_sweep_stops(tmp_path):
     assert driven.keeper.running == set()
 
 
-def test_a_member_that_another_process_took_waits_again_and_has_not_failed(tmp_path):
+def test_a_member_that_another_process_took_waits_again_and_has_not_failed(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 3, num_packs=1)
     driven.tell(t0000=(100, 1.0))
     assert not driven.tell(t0000=MemberReport("t0000", lost=True))
@@ -236,7 +255,7 @@ def test_a_member_that_another_process_took_waits_again_and_has_not_failed(tmp_p
     assert driven.status(0) == ("running", 0)
 
 
-def test_a_pack_that_another_process_is_has_not_died(tmp_path):
+def test_a_pack_that_another_process_is_has_not_died(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 2, num_packs=1)
     driven.driver.lost("p00")
     assert driven.assigned() == [0, 1]

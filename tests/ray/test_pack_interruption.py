@@ -4,6 +4,7 @@ import json
 import re
 import signal
 import subprocess
+from pathlib import Path
 
 import pytest
 from test_interruption import PROGRAM, read, wait_until
@@ -25,12 +26,12 @@ resources: {max_concurrent: 4}
 """
 
 
-def has_checkpoint(folder, index):
+def has_checkpoint(folder: Path, index: int) -> bool:
     return any(folder.glob(f"trials/t000{index}/checkpoints/[0-9]*/manifest.json"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_members_go_on_from_their_checkpoints(tmp_path, number):
+def test_members_go_on_from_their_checkpoints(tmp_path: Path, number: signal.Signals) -> None:
     (tmp_path / "spec.yaml").write_text(SPEC)
     folder = tmp_path / "sweeps" / "cut"
     command = [PROGRAM, "launch", "spec.yaml", "--name", "cut", "--no-finish"]

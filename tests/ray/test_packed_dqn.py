@@ -1,15 +1,18 @@
 """A training phase of a DQN pack is that of RLlib's Learner for every member."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from packed_dqn import PHASES, ROUNDING, compare, differences
 
 from policies.activations import ACTIVATIONS
+from tests.narrowing import present
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 # (what the members share, what each has of its own)
-PACKS = {
+PACKS: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {
     "relu, double, dueling, hard": ({}, [
         {"target_update_freq": 10},
         {"hidden_sizes": (5,), "lr": 5e-3, "target_update_freq": 20},
@@ -51,7 +54,7 @@ PACKS = {
 }  # fmt: skip
 
 
-def test_all_activations_and_both_of_each_kind_have_a_pack():
+def test_all_activations_and_both_of_each_kind_have_a_pack() -> None:
     members = [{**shared, **values} for shared, several in PACKS.values() for values in several]
     assert {values.get("activation", "relu") for values in members} == set(ACTIVATIONS)
     for name, default in (("double_q", True), ("dueling", True), ("td_loss", "huber"), ("target_network", True)):
@@ -59,14 +62,14 @@ def test_all_activations_and_both_of_each_kind_have_a_pack():
 
 
 @pytest.mark.parametrize("name", PACKS)
-def test_training_phases_are_rllibs_for_every_member(name):
+def test_training_phases_are_rllibs_for_every_member(name: str) -> None:
     shared, members = PACKS[name]
     pairs, stack = compare([{**shared, **values} for values in members])
     assert len(stack._groups) == len({values.get("activation") for values in members})
     for ours, theirs in pairs:
-        for what, value in differences(ours, theirs).items():
+        for what, value in differences(ours, present(theirs)).items():
             assert value < ROUNDING, what
-        assert ours.num_target_updates == theirs.num_target_updates
+        assert ours.num_target_updates == present(theirs).num_target_updates
         assert len(ours.losses) == sum(num_updates for num_updates, *_ in PHASES)
         # Both sides of Huber's loss.
         errors = np.concatenate(ours.td_errors)

@@ -1,5 +1,11 @@
 """DQN members on disk: what was saved goes on, in a pack or as an RLlib Algorithm; replay memories are filled again."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
 import numpy as np
 import pytest
 from packed_dqn import SMALL, q_values_of
@@ -7,11 +13,17 @@ from packed_rllib import MODULE, learner_of, state_of
 from trials import make_task
 
 from policies.acting.policy import NetworkPolicy
-from policies.portable.file import save_policy
+from policies.packed.dqn.stack import DQNStack
+from policies.packed.member import AnyMember, Weights
+from policies.portable.file import PortablePolicy, save_policy
+from tune_jobs.training.protocol import IterationStats, TrialTask
+
+if TYPE_CHECKING:
+    from tune_jobs.training.packed import PackedEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "adam, hard": {"target_update_freq": 40, "lr": 3e-3, "lr_final": 0.0, "lr_decay_steps": 1000},
     "adam, normalised, prioritized, soft": {
         "normalize_observations": True, "replay": "prioritized", "tau": 0.1, "dueling": False, "activation": "silu"
@@ -23,15 +35,16 @@ VARIANTS = {
     "no target network, no replay": {"target_network": False, "double_q": False, "replay": "none"},
 }  # fmt: skip
 ITERATIONS = 3
+Trained = tuple[Path, TrialTask, PortablePolicy, dict[str, Any]]
 
 
-def task_of(folder, trial_id="t0000", **values):
+def task_of(folder: Path, trial_id: str = "t0000", **values: Any) -> TrialTask:
     # 1.2 updates a phase: some are due and not made.
     return make_task(folder, "dqn", trial_id=trial_id, **{**SMALL, "updates_per_env_step": 0.3, **values})
 
 
 @pytest.fixture
-def engine():
+def engine() -> Iterator[PackedEngine]:
     from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine()
@@ -39,7 +52,7 @@ def engine():
     engine.close()
 
 
-def write_checkpoint(engine, folder, trial_id="t0000"):
+def write_checkpoint(engine: PackedEngine, folder: Path, trial_id: str = "t0000") -> PortablePolicy:
     policy = engine.policy(trial_id)
     save_policy(policy, folder)
     engine.save(trial_id, folder)
@@ -47,7 +60,7 @@ def write_checkpoint(engine, folder, trial_id="t0000"):
 
 
 @pytest.fixture(params=VARIANTS)
-def trained(request, tmp_path, engine):
+def trained(request: pytest.FixtureRequest, tmp_path: Path, engine: PackedEngine) -> Trained:
     """(checkpoint, its task, its policy, the values): of a trial that was trained beside another one."""
     values = VARIANTS[request.param]
     task = task_of(tmp_path, **values)
@@ -63,24 +76,24 @@ def trained(request, tmp_path, engine):
     return folder, task, policy, values
 
 
-def load(folder):
+def load(folder: Path) -> AnyMember:
     from policies.packed.state import load_member
 
     return load_member(folder / "packed", "t0000")
 
 
-def member_of(engine, trial_id="t0000"):
+def member_of(engine: PackedEngine, trial_id: str = "t0000") -> AnyMember:
     (stack,) = engine._stacks.values()
     return stack.member(trial_id)
 
 
-def assert_same_arrays(ours, theirs):
+def assert_same_arrays(ours: Weights, theirs: Weights) -> None:
     assert set(ours) == set(theirs)
     for name, value in theirs.items():
         np.testing.assert_array_equal(ours[name], value, err_msg=name)
 
 
-def assert_same_member(ours, theirs):
+def assert_same_member(ours: AnyMember, theirs: AnyMember) -> None:
     assert_same_arrays(ours.weights, theirs.weights)
     assert set(ours.moments) == set(theirs.moments)
     for name, value in theirs.moments.items():
@@ -91,7 +104,7 @@ def assert_same_member(ours, theirs):
             assert getattr(ours, name) == getattr(theirs, name), name
 
 
-def test_a_trial_goes_on_from_its_checkpoint_and_fills_its_memory_first(trained, engine):
+def test_a_trial_goes_on_from_its_checkpoint_and_fills_its_memory_first(trained: Trained, engine: PackedEngine) -> None:
     folder, task, policy, values = trained
     saved = load(folder)
     assert saved.due > 0
@@ -107,6 +120,7 @@ def test_a_trial_goes_on_from_its_checkpoint_and_fills_its_memory_first(trained,
         counts = []
         for _ in range(3):
             stats = engine.train_iteration()["t0000"]
+            assert isinstance(stats, IterationStats)
             counts.append((stats.num_env_steps, member_of(engine).num_updates))
         ends.append(member_of(engine))
         for name in ("t0000", "t0001")[: 1 + beside_others]:
@@ -125,14 +139,17 @@ def test_a_trial_goes_on_from_its_checkpoint_and_fills_its_memory_first(trained,
 
 
 @pytest.mark.parametrize("trained", [name for name in VARIANTS if "no replay" not in name], indirect=True)
-def test_while_its_memory_is_filled_a_member_explores_and_its_weights_stay(trained, engine):
+def test_while_its_memory_is_filled_a_member_explores_and_its_weights_stay(
+    trained: Trained, engine: PackedEngine
+) -> None:
     folder, task, *_ = trained
     saved = load(folder)
     # A whole iteration long.
     engine.add(task, folder)
-    (stack,) = engine._stacks.values()
+    (stack,) = cast("list[DQNStack]", list(engine._stacks.values()))
     stack._refilled_at["t0000"] = saved.num_env_steps + 65
     stats = engine.train_iteration()["t0000"]
+    assert isinstance(stats, IterationStats)
     member = member_of(engine)
     assert_same_arrays(member.weights, saved.weights)
     assert (member.num_updates, member.due) == (saved.num_updates, saved.due)
@@ -143,7 +160,7 @@ def test_while_its_memory_is_filled_a_member_explores_and_its_weights_stay(train
     assert member_of(engine).num_updates > saved.num_updates
 
 
-def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(trained):
+def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(trained: Trained) -> None:
     from policies.packed.to_rllib import algorithm_from_checkpoint
 
     folder, _, policy, values = trained
@@ -192,7 +209,7 @@ def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(trained):
     algorithm.stop()
 
 
-def test_a_member_that_had_not_learnt_yet_is_restored_as_one(tmp_path, engine):
+def test_a_member_that_had_not_learnt_yet_is_restored_as_one(tmp_path: Path, engine: PackedEngine) -> None:
     """It learns as soon as its env steps and its memory are enough, with no second wait."""
     task = task_of(tmp_path, learning_starts=100)
     engine.add(task, None)
@@ -206,7 +223,7 @@ def test_a_member_that_had_not_learnt_yet_is_restored_as_one(tmp_path, engine):
     assert member_of(engine).num_updates == int(8 * 1.2)
 
 
-def test_restored_again_while_its_memory_is_filled(tmp_path, engine):
+def test_restored_again_while_its_memory_is_filled(tmp_path: Path, engine: PackedEngine) -> None:
     task = task_of(tmp_path, learning_starts=80)
     engine.add(task, None)
     for _ in range(2):

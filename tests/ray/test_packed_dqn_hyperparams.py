@@ -13,10 +13,10 @@ CHECKS = {check.__name__.removeprefix("check_"): check for check in packed_dqn_c
 
 
 @pytest.mark.parametrize("name", sorted(CHECKS))
-def test_every_hyperparameter_of_dqn_acts_in_a_pack(name):
+def test_every_hyperparameter_of_dqn_acts_in_a_pack(name: str) -> None:
     CHECKS[name]()
 
 
-def test_every_hyperparameter_of_dqn_has_a_case():
+def test_every_hyperparameter_of_dqn_has_a_case() -> None:
     """Whoever adds one must hand it on to packs as well, or have the plan leave its trials to RLlib."""
     assert set(packed_dqn_cases.CASES) == set(DQNHyperparams.model_fields)

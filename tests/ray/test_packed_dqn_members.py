@@ -1,12 +1,21 @@
 """DQN members come and go, are saved and restored, go wrong; what becomes of one does not depend on the others."""
 
+from __future__ import annotations
+
 import copy
 import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from packed_dqn import add, make_stack
+from numpy.typing import NDArray
+from packed_dqn import DQNMember, add, make_stack
 from packed_rllib import assert_same_stats
+
+from policies.packed.member import MemberStats
+
+if TYPE_CHECKING:
+    from policies.packed.dqn.stack import DQNStack
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -21,7 +30,7 @@ OTHERS = [
     )
 ]  # fmt: skip
 WATCHED = {"hidden_sizes": (21, 18), "grad_clip": 0.5, "lr": 3e-3, "replay_capacity": 150, "target_update_freq": 50}
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     # 0.6 updates a phase: members that began at other times make theirs in other phases.
     "uniform": {"updates_per_env_step": 0.15},
     "prioritized, three steps": {"replay": "prioritized", "n_step": 3, "updates_per_env_step": 0.4},
@@ -35,7 +44,7 @@ VARIANTS = {
 }
 
 
-def trained_before(**shared):
+def trained_before(**shared: Any) -> DQNMember:
     """A member that has trained elsewhere, and whose replay memory is empty now."""
     stack = make_stack(**shared)
     add(stack, "before", 50, **{**OTHERS[1], **shared})
@@ -48,7 +57,9 @@ def trained_before(**shared):
     return member
 
 
-def in_pack(num_others, *, changes=False, head_start=0, **shared):
+def in_pack(
+    num_others: int, *, changes: bool = False, head_start: int = 0, **shared: Any
+) -> tuple[DQNMember, list[MemberStats], int]:
     """The watched member after 5 iterations beside others, what its iterations gave, and how many groups there were."""
     stack, seen, num_groups = make_stack(**shared), [], 0
     others = [{**found, **shared} for found in OTHERS]
@@ -76,7 +87,7 @@ def in_pack(num_others, *, changes=False, head_start=0, **shared):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_member_does_not_depend_on_the_others(variant):
+def test_a_member_does_not_depend_on_the_others(variant: str) -> None:
     """Weights after 5 iterations; all that differs is what products of padded sizes round otherwise.
 
     Rounding changes a component of a gradient by a share of 1e-4 at most, of those that are a thousandth of the
@@ -104,7 +115,7 @@ def test_a_member_does_not_depend_on_the_others(variant):
             assert getattr(packed, name) == getattr(alone, name), name
 
 
-def test_members_of_one_seed_are_the_same():
+def test_members_of_one_seed_are_the_same() -> None:
     stack = make_stack()
     for name in ("a", "b"):
         add(stack, name, 5)
@@ -116,9 +127,10 @@ def test_members_of_one_seed_are_the_same():
     stack.envs.close()
 
 
-def test_sums_of_fractions_of_updates_are_each_members_own():
+def test_sums_of_fractions_of_updates_are_each_members_own() -> None:
     """They differ by less than what a group is made by, and an update is due to one alone."""
-    shared, found = {"updates_per_env_step": 0.15, "env_steps_per_iteration": 4}, {}
+    shared: dict[str, Any] = {"updates_per_env_step": 0.15, "env_steps_per_iteration": 4}
+    found: dict[tuple[str, ...], dict[str, list[int]]] = {}
     for members in (("a", "b"), ("a",), ("b",)):
         stack = make_stack(**shared)
         for name in members:
@@ -128,7 +140,7 @@ def test_sums_of_fractions_of_updates_are_each_members_own():
         for member in stack.members:
             # 0.6 updates a phase: the second phase from now makes 1.0 of it.
             member.due = 0.8 if member.member_id == "a" else 0.8 - 1e-8
-        counts = {name: [] for name in members}
+        counts: dict[str, list[int]] = {name: [] for name in members}
         stack._stale = True
         for _ in range(5):
             stack.train_iteration()
@@ -144,16 +156,17 @@ def test_sums_of_fractions_of_updates_are_each_members_own():
 # -- what goes wrong
 
 
-def test_a_member_whose_weights_are_no_numbers_touches_no_other():
+def test_a_member_whose_weights_are_no_numbers_touches_no_other() -> None:
     """The others' weights are to the last bit those of a run in which nothing went wrong.
 
     Not across machines: both runs are the same program on this one, with the same shapes, and round alike.
     """
     weights = {}
-    shared = {"replay": "prioritized", "tau": 0.1, "normalize_observations": True}
+    shared: dict[str, Any] = {"replay": "prioritized", "tau": 0.1, "normalize_observations": True}
     for goes_wrong in (False, True):
         stack = make_stack(**shared)
-        for index, values in enumerate(({"grad_clip": 1.0}, {"hidden_sizes": (5,)}, {"lr": 1e-2})):
+        several: list[dict[str, Any]] = [{"grad_clip": 1.0}, {"hidden_sizes": (5,)}, {"lr": 1e-2}]
+        for index, values in enumerate(several):
             add(stack, f"m{index}", index, **{**shared, **values})
         stack.train_iteration()
         if goes_wrong:
@@ -176,17 +189,18 @@ def test_a_member_whose_weights_are_no_numbers_touches_no_other():
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_a_member_whose_env_raises_leaves_the_others_as_they_were(n_step):
+def test_a_member_whose_env_raises_leaves_the_others_as_they_were(n_step: int) -> None:
     """It goes wrong in its first iteration of two that it takes part in, and leaves after them.
 
     To the last bit: both runs are the same program on one machine, with the same shapes, and round alike.
     """
     weights = {}
-    shared = {"n_step": n_step}
+    shared: dict[str, Any] = {"n_step": n_step}
     for how in (None, "raise"):
         troubles = {} if how is None else {str(1024): {"how": how, "at": 30}}
         stack = make_stack("TestTrouble-v0", {"troubles": troubles}, **shared)
-        for index, values in enumerate(({"lr": 1e-2}, {}, {"hidden_sizes": (5,)})):
+        several: list[dict[str, Any]] = [{"lr": 1e-2}, {}, {"hidden_sizes": (5,)}]
+        for index, values in enumerate(several):
             add(stack, f"m{index}", 1024 * index, **{**shared, **values})
         stack.train_iteration()
         assert not stack.envs.errors
@@ -207,7 +221,7 @@ def test_a_member_whose_env_raises_leaves_the_others_as_they_were(n_step):
             np.testing.assert_array_equal(weights["raise"][0][name][key], value)
 
 
-def test_a_member_that_does_not_fit_into_memory_leaves_nothing_behind():
+def test_a_member_that_does_not_fit_into_memory_leaves_nothing_behind() -> None:
     stack = make_stack()
     add(stack, "a", 0)
     stack.train_iteration()
@@ -223,7 +237,9 @@ def test_a_member_that_does_not_fit_into_memory_leaves_nothing_behind():
 # -- what is stored
 
 
-def stored(stack, name):
+def stored(
+    stack: DQNStack, name: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(observations, next observations, rewards, discounts) of a member."""
     (slot,) = stack._replay.slots([name])
     (size,) = stack._replay.sizes(np.array([slot]))
@@ -232,10 +248,10 @@ def stored(stack, name):
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_no_transition_spans_an_episodes_end_and_only_terminations_end_values(n_step):
+def test_no_transition_spans_an_episodes_end_and_only_terminations_end_values(n_step: int) -> None:
     """`TestTicks` tells of each observation which step of which episode it is, and its actions begin at 5."""
     gamma, limit = 0.5, 7
-    shared = {"n_step": n_step, "gamma": gamma}
+    shared: dict[str, Any] = {"n_step": n_step, "gamma": gamma}
     for end in (None, 4):
         stack = make_stack("TestTicks-v0", {} if end is None else {"end": end}, **shared)
         for name, seed in (("a", 10), ("b", 20)):
@@ -261,7 +277,7 @@ def test_no_transition_spans_an_episodes_end_and_only_terminations_end_values(n_
         stack.envs.close()
 
 
-def test_the_failure_penalty_is_learnt_from_and_not_reported():
+def test_the_failure_penalty_is_learnt_from_and_not_reported() -> None:
     stack = make_stack(failure_penalty=-3.0, env_args={"max_episode_steps": 15})
     add(stack, "a", 0)
     episodes = [found for _ in range(4) for found in stack.train_iteration()["a"].episodes]

@@ -1,9 +1,12 @@
 """A slow environment with CPUs to spare: it is planned to run in processes of its own, and does."""
 
+from pathlib import Path
+
 import pytest
 
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
@@ -15,7 +18,9 @@ pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 NUM_ENVS = 4
 
 
-def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(tmp_path, monkeypatch):
+def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
     monkeypatch.setattr(env_modules, "_allowed", set())
@@ -34,7 +39,7 @@ def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(tmp_pa
         }
     )  # fmt: skip
     plan = make_plan(spec, Machine(2))
-    packs = plan.packs
+    packs = present(plan.packs)
     assert (packs.num_packs, packs.env_kind, packs.num_env_processes, packs.cpus_per_pack) == (1, "processes", 1, 2)
     store = SweepStore(tmp_path / "mine")
     store.create()

@@ -9,10 +9,10 @@ pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 
 @pytest.mark.parametrize("field", sorted(packed_ppo_cases.CASES))
-def test_every_hyperparameter_of_ppo_acts_in_a_pack(field):
+def test_every_hyperparameter_of_ppo_acts_in_a_pack(field: str) -> None:
     packed_ppo_cases.CASES[field]()
 
 
-def test_every_hyperparameter_of_ppo_has_a_case():
+def test_every_hyperparameter_of_ppo_has_a_case() -> None:
     """Whoever adds one must hand it on to packs as well, or have the plan leave its trials to RLlib."""
     assert set(packed_ppo_cases.CASES) == set(PPOHyperparams.model_fields)

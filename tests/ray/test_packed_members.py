@@ -1,35 +1,47 @@
 """Members come and go, are saved and restored; what becomes of one does not depend on the others."""
 
+from __future__ import annotations
+
 import copy
 import json
 import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 import torch
-from packed_rllib import MODULE, assert_same_stats, learner_of, state_of
+from packed_rllib import MODULE, PPOMember, assert_same_stats, learner_of, state_of
 from trials import make_task
 
 from policies.acting.policy import NetworkPolicy
 from policies.errors import CheckpointError
 from policies.hyperparams import PPOHyperparams
-from policies.portable.file import save_policy
+from policies.packed.envs.vector import EnvKind
+from policies.packed.member import AnyMember, MemberStats, Weights
+from policies.portable.file import PortablePolicy, save_policy
+from tune_jobs.training.protocol import IterationStats, TrialTask
+
+if TYPE_CHECKING:
+    from policies.packed.ppo.stack import PPOStack
+    from tune_jobs.training.packed import PackedEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 SHARED = {"train_batch_size": 256, "minibatch_size": 64, "num_epochs": 4, "num_envs": 8, "lr": 3e-3}
 
 
-def make_stack(env_id, **shared):
+def make_stack(env_id: str, **shared: Any) -> PPOStack:
     from policies.packed.envs.make import make_packed_envs
     from policies.packed.make import make_stack as make
 
     hyperparams = PPOHyperparams(**{**SHARED, **shared})
-    kind = "vectorised" if env_id == "CartPole-v1" else "scalar"
-    return make(hyperparams, make_packed_envs(env_id, {}, hyperparams.num_envs, kind=kind))
+    kind: EnvKind = "vectorised" if env_id == "CartPole-v1" else "scalar"
+    return cast("PPOStack", make(hyperparams, make_packed_envs(env_id, {}, hyperparams.num_envs, kind=kind)))
 
 
-def add(stack, name, seed, member=None, **values):
+def add(stack: PPOStack, name: str, seed: int, member: PPOMember | None = None, **values: Any) -> None:
     from policies.packed.initial import new_member
 
     if member is None:
@@ -50,7 +62,9 @@ OTHERS = [
 WATCHED = {"hidden_sizes": (21, 18), "grad_clip": 0.5, "entropy_coeff": 0.01}
 
 
-def in_pack(env_id, num_others, *, comings_and_goings=False, **shared):
+def in_pack(
+    env_id: str, num_others: int, *, comings_and_goings: bool = False, **shared: Any
+) -> tuple[PPOMember, list[MemberStats]]:
     """The watched member after 5 iterations beside others, and what its iterations gave."""
     stack, seen = make_stack(env_id, **shared), []
     for index in range(num_others // 2):
@@ -75,7 +89,7 @@ def in_pack(env_id, num_others, *, comings_and_goings=False, **shared):
     ("CartPole-v1", {"vf_share_layers": True, "use_kl_loss": True, "normalize_observations": True}),
     ("Pendulum-v1", {"normalize_observations": True, "train_batch_size": 128}),
 ])  # fmt: skip
-def test_a_member_does_not_depend_on_the_others(env_id, shared):
+def test_a_member_does_not_depend_on_the_others(env_id: str, shared: dict[str, Any]) -> None:
     """Weights after 5 iterations; all that differs is what products of padded sizes round otherwise.
 
     Rounding changes a component of a gradient by a share of 1e-4 at most, of those that are a thousandth of the
@@ -99,7 +113,7 @@ def test_a_member_does_not_depend_on_the_others(env_id, shared):
         assert packed.num_optimizer_steps == alone.num_optimizer_steps
 
 
-def test_members_of_one_seed_are_the_same():
+def test_members_of_one_seed_are_the_same() -> None:
     stack = make_stack("CartPole-v1")
     for name in ("a", "b"):
         add(stack, name, 5)
@@ -113,14 +127,14 @@ def test_members_of_one_seed_are_the_same():
 # -- on disk
 
 
-def assert_same_arrays(ours, theirs):
+def assert_same_arrays(ours: Weights, theirs: Weights) -> None:
     assert set(ours) == set(theirs)
     for name, value in theirs.items():
         assert ours[name].dtype == value.dtype
         np.testing.assert_array_equal(ours[name], value)
 
 
-def assert_same_member(ours, theirs):
+def assert_same_member(ours: AnyMember, theirs: AnyMember) -> None:
     assert_same_arrays(ours.weights, theirs.weights)
     assert set(ours.moments) == set(theirs.moments)
     for name, value in theirs.moments.items():
@@ -133,7 +147,7 @@ def assert_same_member(ours, theirs):
 
 
 @pytest.mark.parametrize("shared", [{}, {"use_kl_loss": True, "normalize_observations": True, "vf_share_layers": True}])
-def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path, shared):
+def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path: Path, shared: dict[str, Any]) -> None:
     from policies.packed.state import load_member, save_member
 
     stack = make_stack("CartPole-v1", **shared)
@@ -145,7 +159,7 @@ def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path, shared)
     assert before.num_optimizer_steps == before.num_updates == 32
     assert set(before.moments) == {"exp_avg", "exp_avg_sq"}
     save_member(before, tmp_path / "packed")
-    loaded = load_member(tmp_path / "packed", "a")
+    loaded = cast("PPOMember", load_member(tmp_path / "packed", "a"))
     assert_same_member(loaded, before)
     ends = []
     for member in (before, loaded):
@@ -161,10 +175,11 @@ def test_a_member_that_was_saved_goes_on_as_if_it_had_not_been(tmp_path, shared)
 
 
 LR = 3e-3
+Saved = tuple[Path, TrialTask, PortablePolicy]
 
 
 @pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory, ray_session):
+def checkpoint(tmp_path_factory: pytest.TempPathFactory, ray_session: None) -> Saved:
     """(a checkpoint of a trial of the packed engine, its task, its policy)."""
     from tune_jobs.training.packed import PackedEngine
 
@@ -186,7 +201,7 @@ def checkpoint(tmp_path_factory, ray_session):
 
 
 @pytest.fixture
-def engine():
+def engine() -> Iterator[PackedEngine]:
     from tune_jobs.training.packed import PackedEngine
 
     engine = PackedEngine()
@@ -194,7 +209,7 @@ def engine():
     engine.close()
 
 
-def test_a_trial_goes_on_from_its_checkpoint(checkpoint, engine):
+def test_a_trial_goes_on_from_its_checkpoint(checkpoint: Saved, engine: PackedEngine) -> None:
     from policies.packed.state import load_member
 
     folder, task, policy = checkpoint
@@ -205,12 +220,13 @@ def test_a_trial_goes_on_from_its_checkpoint(checkpoint, engine):
     for layer, other in zip(engine.policy("t0000").network.layers, policy.network.layers, strict=True):
         np.testing.assert_array_equal(layer.weight, other.weight)
     stats = engine.train_iteration()["t0000"]
+    assert isinstance(stats, IterationStats)
     assert stats.num_env_steps == 4 * 128
     assert stats.learner["lr"] == pytest.approx(LR * (1 - 0.512))
     assert engine.policy("t0000").training["iteration"] == 4
 
 
-def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(checkpoint):
+def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(checkpoint: Saved) -> None:
     from policies.packed.state import load_member
     from policies.packed.to_rllib import algorithm_from_checkpoint
 
@@ -256,12 +272,12 @@ def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(checkpoint):
     algorithm.stop()
 
 
-def cut_short(path):
+def cut_short(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-10])
 
 
-def edit(change):
-    def damage(path):
+def edit(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
         description = json.loads(path.read_text())
         change(description)
         path.write_text(json.dumps(description))
@@ -269,28 +285,28 @@ def edit(change):
     return damage
 
 
-def without_a_weight(path):
+def without_a_weight(path: Path) -> None:
     from safetensors.numpy import load_file, save_file
 
     tensors = load_file(path)
     save_file({name: value for name, value in tensors.items() if name != "weights/pi.bias"}, path)
 
 
-def without_a_moment(path):
+def without_a_moment(path: Path) -> None:
     from safetensors.numpy import load_file, save_file
 
     tensors = load_file(path)
     save_file({name: value for name, value in tensors.items() if name != "exp_avg/pi.bias"}, path)
 
 
-def with_another_shape(path):
+def with_another_shape(path: Path) -> None:
     from safetensors.numpy import load_file, save_file
 
     tensors = load_file(path)
     save_file({**tensors, "exp_avg_sq/pi.bias": np.zeros(3, np.float32)}, path)
 
 
-DAMAGE = {
+DAMAGE: dict[str, tuple[str, Callable[[Path], object]]] = {
     "no tensors": ("state.safetensors", lambda path: path.unlink()),
     "no description": ("state.json", lambda path: path.unlink()),
     "tensors cut short": ("state.safetensors", cut_short),
@@ -317,7 +333,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_state_is_refused(checkpoint, engine, tmp_path, kind):
+def test_a_damaged_state_is_refused(checkpoint: Saved, engine: PackedEngine, tmp_path: Path, kind: str) -> None:
     folder, task, _ = checkpoint
     copied = tmp_path / folder.name
     shutil.copytree(folder, copied)
@@ -332,7 +348,7 @@ def test_a_damaged_state_is_refused(checkpoint, engine, tmp_path, kind):
     assert set(engine.train_iteration()) == {"t0000"}
 
 
-def test_a_checkpoint_of_another_engine_is_refused(checkpoint, engine, tmp_path):
+def test_a_checkpoint_of_another_engine_is_refused(checkpoint: Saved, engine: PackedEngine, tmp_path: Path) -> None:
     _, task, policy = checkpoint
     save_policy(policy, tmp_path / "000001")
     with pytest.raises(CheckpointError, match="not of the packed engine"):

@@ -4,11 +4,14 @@ What may differ is `packed_rllib.ROUNDING`.
 """
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from packed_rllib import MODULE, ROUNDING, compare, differences, episodes_of, learner_of, make_stack, sample
+from numpy.typing import NDArray
+from packed_rllib import MODULE, ROUNDING, PPOMember, compare, differences, episodes_of, learner_of, make_stack, sample
 
 from policies.activations import ACTIVATIONS
 from policies.packed.ppo import stack as ppo_stack
@@ -16,7 +19,7 @@ from policies.packed.ppo import stack as ppo_stack
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 # (env, what the members share, what each has of its own)
-PACKS = {
+PACKS: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
     "tanh": ("CartPole-v1", {}, [
         {},
         {"hidden_sizes": (5,), "clip_param": 0.03, "entropy_coeff": 0.1, "lr": 1e-3},
@@ -53,13 +56,13 @@ PACKS = {
 }  # fmt: skip
 
 
-def test_all_activations_have_a_pack():
+def test_all_activations_have_a_pack() -> None:
     assert {shared.get("activation", "tanh") for _, shared, _ in PACKS.values()} == set(ACTIVATIONS)
 
 
 @pytest.mark.parametrize("num_updates", [1, 3])
 @pytest.mark.parametrize("name", PACKS)
-def test_an_update_is_rllibs_for_every_member(name, num_updates):
+def test_an_update_is_rllibs_for_every_member(name: str, num_updates: int) -> None:
     env_id, shared, members = PACKS[name]
     pairs, stack, _ = compare(env_id, [{**shared, **values} for values in members], num_epochs=num_updates)
     # All in one tensor program.
@@ -72,7 +75,9 @@ def test_an_update_is_rllibs_for_every_member(name, num_updates):
 # -- advantages
 
 
-def rllib_advantages(member, env_id, episodes):
+def rllib_advantages(
+    member: PPOMember, env_id: str, episodes: Sequence[Any]
+) -> list[tuple[NDArray[Any], NDArray[Any]]]:
     """(value targets, advantages before they are standardised) of each episode, from the Learner's own pipeline.
 
     RLlib standardises over the rows it adds, one an episode, as well: what it hands to the loss is another linear
@@ -103,7 +108,7 @@ def rllib_advantages(member, env_id, episodes):
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_advantages_and_value_targets_are_rllibs(monkeypatch, env_id):
+def test_advantages_and_value_targets_are_rllibs(monkeypatch: pytest.MonkeyPatch, env_id: str) -> None:
     """Of episodes that end, are cut by the time limit and are cut by the fragment, in one fragment."""
     monkeypatch.setattr(ppo_stack, "standardise", lambda advantages: advantages)
     members = [
@@ -145,7 +150,7 @@ def test_advantages_and_value_targets_are_rllibs(monkeypatch, env_id):
     {"hidden_sizes": (9, 4), "initializer": "he_uniform", "normalize_observations": True},
 ])  # fmt: skip
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_first_weights_are_those_of_rllibs_learner_with_the_seed(env_id, values):
+def test_first_weights_are_those_of_rllibs_learner_with_the_seed(env_id: str, values: dict[str, Any]) -> None:
     from policies.rllib.config import build_algorithm_config
 
     stack = make_stack(env_id, [values], seeds=[1234])
@@ -162,7 +167,7 @@ def test_first_weights_are_those_of_rllibs_learner_with_the_seed(env_id, values)
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_a_member_whose_weights_are_no_numbers_touches_no_other(env_id):
+def test_a_member_whose_weights_are_no_numbers_touches_no_other(env_id: str) -> None:
     """The others' weights are to the last bit those of a run in which nothing went wrong.
 
     Not across machines: both runs are the same program on this one, with the same shapes, and round alike.

@@ -1,8 +1,10 @@
 """Who of a population goes on from whom, as Ray Tune is told: no process, no training, scores that are drawn."""
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from analysis.records import TrialRecord
 from policies.errors import CheckpointError
 from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 pytestmark = pytest.mark.ray
 
@@ -22,34 +25,34 @@ MAX_ENV_STEPS = 1_600
 class Trial:
     """What is asked of a trial of Tune's."""
 
-    def __init__(self, number):
+    def __init__(self, number: int) -> None:
         self.config = {"trial_id": f"t{number:04d}"}
         self.trial_id, self.experiment_tag, self.status = f"tune-{number}", str(number), "RUNNING"
         manager = SimpleNamespace(checkpoint_config=SimpleNamespace(num_to_keep=None), _latest_checkpoint_result=None)
         self.run_metadata = SimpleNamespace(checkpoint_manager=manager)
 
-    def is_finished(self):
+    def is_finished(self) -> bool:
         return self.status in ("TERMINATED", "ERROR")
 
-    def set_experiment_tag(self, tag):
+    def set_experiment_tag(self, tag: str) -> None:
         pass
 
-    def set_config(self, config):
+    def set_config(self, config: dict[str, str]) -> None:
         assert config == self.config
 
 
 class Saved:
     """What a save will have given; one in five gives nothing."""
 
-    def __init__(self, checkpoint=None, metrics=None):
+    def __init__(self, checkpoint: str | None = None, metrics: dict[str, Any] | None = None) -> None:
         self.checkpoint, self.metrics = checkpoint, metrics
 
 
 class Future:
-    def __init__(self, number, saved):
+    def __init__(self, number: int, saved: Saved | None) -> None:
         self.number, self.saved = number, saved
 
-    def resolve(self):
+    def resolve(self) -> Saved | None:
         return self.saved
 
 
@@ -58,20 +61,21 @@ class Controller:
 
     search_alg = None
 
-    def __init__(self, trials, rng):
-        self.trials, self.rng, self.saves = trials, rng, []
+    def __init__(self, trials: Sequence[Trial], rng: np.random.Generator) -> None:
+        self.trials, self.rng = trials, rng
+        self.saves: list[str] = []
 
-    def get_trials(self):
+    def get_trials(self) -> list[Trial]:
         return list(self.trials)
 
-    def get_live_trials(self):
+    def get_live_trials(self) -> list[Trial]:
         return [trial for trial in self.trials if not trial.is_finished()]
 
-    def pause_trial(self, trial, should_checkpoint):
+    def pause_trial(self, trial: Trial, should_checkpoint: bool) -> None:
         assert should_checkpoint is False
         trial.status = "PAUSED"
 
-    def _schedule_trial_save(self, trial, result):
+    def _schedule_trial_save(self, trial: Trial, result: dict[str, Any]) -> Future | None:
         self.saves.append(trial.config["trial_id"])
         number = len(self.saves)
         draw = self.rng.random()
@@ -80,7 +84,7 @@ class Controller:
         return Future(number, None if draw < 0.2 else Saved(f"checkpoint {number}", {}))
 
 
-def simulated(seed, make):
+def simulated(seed: int, make: Callable[..., Any]) -> list[list[Any]]:
     """Everything that is decided in a random sweep, as JSON.
 
     Args:
@@ -110,10 +114,10 @@ def simulated(seed, make):
         for index in range(num_trials)
     }  # fmt: skip
 
-    def change(trial_id, become):
+    def change(trial_id: str, become: Callable[[TrialRecord], TrialRecord]) -> None:
         records[trial_id] = become(records[trial_id])
 
-    def copy(source, target, iteration):
+    def copy(source: Any, target: Any, iteration: int) -> SimpleNamespace:
         if rng.random() < 0.1:
             raise CheckpointError("It is damaged.")
         return SimpleNamespace(iteration=iteration)
@@ -162,13 +166,13 @@ def simulated(seed, make):
     return found
 
 
-def made(spec, store, read, change):
+def made(spec: SweepSpec, store: Any, read: Callable[[str], TrialRecord], change: Callable[..., None]) -> Any:
     from tune_jobs.ray_tune.population import PopulationScheduler
 
     return PopulationScheduler(spec, store, read, change)
 
 
-def test_a_population_is_judged_as_by_rays_own_population_based_training():
+def test_a_population_is_judged_as_by_rays_own_population_based_training() -> None:
     recorded = json.loads(RECORDED.read_text())
     assert len(recorded) == 15
     copies = 0

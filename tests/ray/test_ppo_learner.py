@@ -1,24 +1,29 @@
 """PPO's schedules and KL weight over iterations and restores; observation statistics over env runners."""
 
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from ppo_cases import current_lr, entropy_weight
-from rllib_cases import MODULE, SMALL, env_steps, learner_of, module_of
+from rllib_cases import MODULE, SMALL, Build, env_steps, learner_of, module_of
 
 from policies.hyperparams import PPOHyperparams
+from policies.packed.member import Weights
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 
 @pytest.fixture
-def build():
+def build() -> Iterator[Build]:
     """Make a PPO Algorithm from a few hyperparameters; all are stopped at the end."""
     from policies.rllib.config import build_algorithm_config
 
     built = []
 
-    def make(num_env_runners=0, **values):
+    def make(num_env_runners: int = 0, **values: Any) -> Any:
         hyperparams = PPOHyperparams(**{**SMALL["ppo"], **values})
         config = build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=7, num_env_runners=num_env_runners)
         built.append(config.build_algo())
@@ -29,7 +34,7 @@ def build():
         algo.stop()
 
 
-def saved_and_restored(algo, folder, make_new):
+def saved_and_restored(algo: Any, folder: Path, make_new: Callable[[], Any]) -> Any:
     """A second Algorithm with the first one's checkpoint."""
     algo.save_to_path(str(folder))
     restored = make_new()
@@ -37,12 +42,12 @@ def saved_and_restored(algo, folder, make_new):
     return restored
 
 
-def in_first_update(algo, read):
+def in_first_update(algo: Any, read: Callable[[Any], float]) -> tuple[int, float]:
     """(env steps, what `read` gives in the first update of the next iteration)."""
     learner, seen = learner_of(algo), []
     update = learner._update
 
-    def reading(*args, **kwargs):
+    def reading(*args: Any, **kwargs: Any) -> Any:
         seen.append(read(algo))
         return update(*args, **kwargs)
 
@@ -56,7 +61,9 @@ def in_first_update(algo, read):
     (current_lr, "lr", "lr_decay_steps"),
     (entropy_weight, "entropy_coeff", "entropy_decay_steps"),
 ])  # fmt: skip
-def test_schedules_go_on_after_a_restore(build, tmp_path, read, name, decay):
+def test_schedules_go_on_after_a_restore(
+    build: Build, tmp_path: Path, read: Callable[[Any], float], name: str, decay: str
+) -> None:
     values = {name: 0.1, f"{name}_final": 0.02, decay: 400}
     algo = build(**values)
     for _ in range(2):
@@ -67,7 +74,7 @@ def test_schedules_go_on_after_a_restore(build, tmp_path, read, name, decay):
     assert value == pytest.approx(0.1 - 0.08 * steps / 400, rel=1e-3)
 
 
-def test_the_kl_weight_moves_in_training_and_is_restored(build, tmp_path):
+def test_the_kl_weight_moves_in_training_and_is_restored(build: Build, tmp_path: Path) -> None:
     values = {"use_kl_loss": True, "kl_coeff": 0.4, "kl_target": 1e-9, "lr": 1e-2, "num_epochs": 4}
     algo = build(**values)
     for iteration in (1, 2):
@@ -81,17 +88,18 @@ def test_the_kl_weight_moves_in_training_and_is_restored(build, tmp_path):
     assert float(learner_of(mutated).curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.6)
 
 
-def first_ratios(algo):
+def first_ratios(algo: Any) -> torch.Tensor:
     """exp(log probability in the first update - in sampling) of the rows that are env steps."""
-    learner, module, ratios = learner_of(algo), module_of(algo), []
+    learner, module = learner_of(algo), module_of(algo)
+    ratios: list[torch.Tensor] = []
     update = learner._update
 
-    def reading(batch, *args, **kwargs):
+    def reading(batch: Any, *args: Any, **kwargs: Any) -> Any:
         if not ratios:
             rows = batch[MODULE]
             with torch.no_grad():
                 logits = module.forward_train(rows)["action_dist_inputs"]
-            now = torch.distributions.Categorical(logits=logits).log_prob(rows["actions"])
+            now = torch.distributions.Categorical(logits=logits).log_prob(rows["actions"])  # type: ignore[no-untyped-call]
             ratios.append(torch.exp(now - rows["action_logp"])[rows["loss_mask"]])
         return update(batch, *args, **kwargs)
 
@@ -101,7 +109,7 @@ def first_ratios(algo):
     return ratios[0]
 
 
-def runner_statistics(algo):
+def runner_statistics(algo: Any) -> list[Weights]:
     return [
         {name: np.asarray(value) for name, value in state.items() if name.startswith("obs_")}
         for state in algo.env_runner_group.foreach_env_runner(
@@ -112,7 +120,7 @@ def runner_statistics(algo):
 
 
 @pytest.mark.parametrize("num_env_runners", [0, 2])
-def test_sampling_and_training_use_the_same_statistics(build, num_env_runners):
+def test_sampling_and_training_use_the_same_statistics(build: Build, num_env_runners: int) -> None:
     algo = build(num_env_runners, normalize_observations=True, lr=1e-2, vf_share_layers=True)
     for _ in range(3):
         # Statistics move by a lot in the first iterations: with newer ones the ratios would be far from 1.
@@ -126,14 +134,14 @@ def test_sampling_and_training_use_the_same_statistics(build, num_env_runners):
                 np.testing.assert_array_equal(found[name], module_of(algo).state_dict()[name].numpy())
 
 
-def test_statistics_are_of_the_env_steps_alone(build):
+def test_statistics_are_of_the_env_steps_alone(build: Build) -> None:
     """RLlib's batch has a row more for each episode chunk, which would be counted twice."""
     algo = build(normalize_observations=True)
     steps = env_steps(algo.train())
     assert int(module_of(algo).obs_count) == steps
 
 
-def test_statistics_are_restored_and_grow_on(build, tmp_path):
+def test_statistics_are_restored_and_grow_on(build: Build, tmp_path: Path) -> None:
     algo = build(normalize_observations=True)
     algo.train()
     before = {name: value.clone() for name, value in module_of(algo).state_dict().items()}

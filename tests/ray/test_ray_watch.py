@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from functools import partial
 
 import pytest
 
@@ -11,17 +12,17 @@ pytestmark = pytest.mark.ray
 class Clock:
     now = 0.0
 
-    def __call__(self):
+    def __call__(self) -> float:
         return self.now
 
 
-def test_a_part_is_dead_when_it_has_been_silent_for_long():
+def test_a_part_is_dead_when_it_has_been_silent_for_long() -> None:
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
 
     clock, answers = Clock(), {"this": True, "that": True}
-    watch = RayWatch({name: lambda name=name: answers[name] for name in answers}, 10.0, clock)
+    watch = RayWatch({name: partial(answers.__getitem__, name) for name in answers}, 10.0, clock)
 
-    def look(at):
+    def look(at: float) -> None:
         clock.now = at
         watch.look()
         watch.check()
@@ -40,7 +41,7 @@ def test_a_part_is_dead_when_it_has_been_silent_for_long():
         look(30.0)
 
 
-def test_what_a_trial_raised_is_not_waited_for():
+def test_what_a_trial_raised_is_not_waited_for() -> None:
     from ray.exceptions import RayTaskError
 
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
@@ -52,12 +53,18 @@ def test_what_a_trial_raised_is_not_waited_for():
     assert not issubclass(RayDiedError, Exception)
 
 
-def test_a_block_that_goes_on_is_stuck():
-    from tune_jobs.ray_tune.processes import RayWatch
+def test_a_block_that_goes_on_is_stuck() -> None:
+    from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
 
-    told, deaths = threading.Event(), []
+    told = threading.Event()
+    deaths: list[str] = []
+
+    def tell(death: RayDiedError) -> None:
+        deaths.append(str(death))
+        told.set()
+
     with RayWatch({"it": lambda: False}, 0.05, stuck_s=0.05) as watch:
-        watch.when_stuck = lambda death: (deaths.append(str(death)), told.set())
+        watch.when_stuck = tell
         assert told.wait(60)
     assert deaths == ["it"]
     with RayWatch({"it": lambda: False}, 0.05, stuck_s=3600) as watch:
@@ -66,7 +73,7 @@ def test_a_block_that_goes_on_is_stuck():
     assert deaths == ["it"]
 
 
-def test_it_looks_by_itself_and_ends_with_its_block():
+def test_it_looks_by_itself_and_ends_with_its_block() -> None:
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, _answers
 
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -74,7 +81,7 @@ def test_it_looks_by_itself_and_ends_with_its_block():
         assert _answers(socket.AF_INET, address)
     looked = threading.Event()
 
-    def probe():
+    def probe() -> bool:
         looked.set()
         return _answers(socket.AF_INET, address)
 

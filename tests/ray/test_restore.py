@@ -2,18 +2,23 @@
 
 import json
 import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from trials import make_task, run_trial
 
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
 from policies.activations import ACTIVATIONS
 from policies.errors import CheckpointError, NotFoundError
-from policies.hyperparams import make_hyperparams
+from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
+from policies.packed.member import Weights
 from policies.portable.file import Layer, PolicyNetwork, read_policy, save_policy
 from tests.rounding import assert_greedy, assert_network
 
@@ -25,7 +30,9 @@ NUM_TERMS = 170
 
 
 @pytest.fixture(scope="module", params=["ppo", "dqn"])
-def trained(request, ray_session, tmp_path_factory):
+def trained(
+    request: pytest.FixtureRequest, ray_session: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Path, Any]]:
     """(checkpoint folder, its Algorithm as it was when it was saved)."""
     from tune_jobs.training.rllib import RLlibEngine
 
@@ -37,14 +44,14 @@ def trained(request, ray_session, tmp_path_factory):
 
 
 @pytest.fixture
-def checkpoint(trained, tmp_path):
+def checkpoint(trained: tuple[Path, Any], tmp_path: Path) -> Path:
     """A copy of the checkpoint, to be damaged."""
     folder = tmp_path / trained[0].name
     shutil.copytree(trained[0], folder)
     return folder
 
 
-def learner_state(algo):
+def learner_state(algo: Any) -> tuple[Weights, Weights]:
     """(weights, optimizer's moments) of the learner, as numpy arrays by name."""
     learner = algo.learner_group._learner
     weights = {name: value.numpy().copy() for name, value in learner.module[MODULE].state_dict().items()}
@@ -52,13 +59,13 @@ def learner_state(algo):
     return weights, {f"{index}.{key}": value.numpy().copy() for index, s in states.items() for key, value in s.items()}
 
 
-def assert_equal_arrays(ours, theirs):
+def assert_equal_arrays(ours: Weights, theirs: Weights) -> None:
     assert set(ours) == set(theirs)
     for name, value in ours.items():
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
 
 
-def test_a_checkpoint_restores_as_the_algorithm_that_was_saved_and_trains_on(trained):
+def test_a_checkpoint_restores_as_the_algorithm_that_was_saved_and_trains_on(trained: tuple[Path, Any]) -> None:
     from tune_jobs.sweeps import verbs as sweeps
 
     folder, saved = trained
@@ -86,7 +93,7 @@ def test_a_checkpoint_restores_as_the_algorithm_that_was_saved_and_trains_on(tra
     algo.stop()
 
 
-def test_any_altered_or_missing_file_is_an_error_that_names_it(checkpoint):
+def test_any_altered_or_missing_file_is_an_error_that_names_it(checkpoint: Path) -> None:
     from tune_jobs.sweeps import verbs as sweeps
 
     files = json.loads((checkpoint / "manifest.json").read_text())["files"]
@@ -109,7 +116,7 @@ def test_any_altered_or_missing_file_is_an_error_that_names_it(checkpoint):
     sweeps.restore(checkpoint).stop()
 
 
-def test_a_folder_that_is_no_checkpoint_is_an_error(checkpoint, tmp_path):
+def test_a_folder_that_is_no_checkpoint_is_an_error(checkpoint: Path, tmp_path: Path) -> None:
     from tune_jobs.sweeps import verbs as sweeps
 
     with pytest.raises(NotFoundError, match="nowhere"):
@@ -122,7 +129,7 @@ def test_a_folder_that_is_no_checkpoint_is_an_error(checkpoint, tmp_path):
         sweeps.restore(checkpoint)
 
 
-def test_what_rllib_cannot_restore_is_an_error(checkpoint):
+def test_what_rllib_cannot_restore_is_an_error(checkpoint: Path) -> None:
     """Also where nobody looked at the hashes."""
     from policies.rllib.restore import restore_algorithm
 
@@ -132,7 +139,7 @@ def test_what_rllib_cannot_restore_is_an_error(checkpoint):
         restore_algorithm(checkpoint / "rllib", read_policy(checkpoint).network)
 
 
-def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint):
+def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint: Path) -> None:
     from policies.rllib.restore import restore_algorithm
 
     (checkpoint / "rllib" / "class_and_ctor_args.pkl").unlink()
@@ -142,7 +149,7 @@ def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint
 
 @pytest.mark.parametrize("part", ["weight", "bias"])
 @pytest.mark.parametrize("number", [0, 1])
-def test_weights_other_than_the_saved_ones_are_an_error(checkpoint, number, part):
+def test_weights_other_than_the_saved_ones_are_an_error(checkpoint: Path, number: int, part: str) -> None:
     """One number of one layer, in the last bit."""
     from policies.rllib.restore import restore_algorithm
 
@@ -156,7 +163,7 @@ def test_weights_other_than_the_saved_ones_are_an_error(checkpoint, number, part
         restore_algorithm(checkpoint / "rllib", PolicyNetwork(network.kind, tuple(layers)))
 
 
-def test_an_env_runner_with_other_weights_than_the_learner_is_an_error(trained):
+def test_an_env_runner_with_other_weights_than_the_learner_is_an_error(trained: tuple[Path, Any]) -> None:
     from policies.rllib.restore import check_weights, restore_algorithm
 
     folder, _ = trained
@@ -172,7 +179,7 @@ def test_an_env_runner_with_other_weights_than_the_learner_is_an_error(trained):
 # -- portable policies
 
 
-def rllib_actions(algo, obs):
+def rllib_actions(algo: Any, obs: NDArray[np.float32]) -> Any:
     """Greedy actions as RLlib computes and sends them to the environment."""
     from ray.rllib.utils.spaces.space_utils import unsquash_action
 
@@ -191,7 +198,7 @@ def rllib_actions(algo, obs):
     return actions.numpy() + space.start
 
 
-def spread_actions(algo, obs):
+def spread_actions(algo: Any, obs: NDArray[np.float32]) -> None:
     """Set weights with which activations saturate, discrete actions differ, and continuous ones reach both bounds."""
     module = algo.learner_group._learner.module[MODULE]
     with torch.no_grad():
@@ -205,7 +212,7 @@ def spread_actions(algo, obs):
     algo.env_runner.module.set_state(module.get_state(inference_only=True))
 
 
-NETWORKS = {
+NETWORKS: dict[str, tuple[Algorithm, str, dict[str, Any]]] = {
     "ppo-separate": ("ppo", "Acrobot-v1", {"vf_share_layers": False}),
     "ppo-shared": ("ppo", "Acrobot-v1", {"vf_share_layers": True}),
     "ppo-discrete-from-5": ("ppo", "TestTicks-v0", {}),
@@ -218,12 +225,13 @@ NETWORKS = {
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("network", NETWORKS)
-def test_greedy_actions_of_the_policy_file_are_rllibs(network, activation, tmp_path):
+def test_greedy_actions_of_the_policy_file_are_rllibs(network: str, activation: str, tmp_path: Path) -> None:
     from policies.rllib.config import build_algorithm_config
     from policies.rllib.restore import portable_policy
 
     algorithm, env_id, values = NETWORKS[network]
-    hyperparams = make_hyperparams(algorithm, {"hidden_sizes": (24, 16), "activation": activation, **values})
+    settings = {"hidden_sizes": (24, 16), "activation": activation, **values}
+    hyperparams = cast("TrainedHyperparams", make_hyperparams(algorithm, settings))
     torch.manual_seed(0)
     algo = build_algorithm_config(hyperparams, env_id=env_id, seed=0).build_algo()
     obs_space = algo.env_runner.env.single_observation_space
@@ -231,9 +239,10 @@ def test_greedy_actions_of_the_policy_file_are_rllibs(network, activation, tmp_p
     spread_actions(algo, obs)
     save_policy(portable_policy(algo, hyperparams, env_id=env_id, env_args={}), tmp_path)
     policy = load_policy(tmp_path)
+    assert isinstance(policy, NetworkPolicy)
     expected = rllib_actions(algo, obs)
     algo.stop()
-    actions = policy.act(obs)
+    actions = np.asarray(policy.act(obs))
     assert len(np.unique(expected)) > 1
     if isinstance(policy.action_space, gym.spaces.Box):
         low, high = policy.action_space.low, policy.action_space.high
@@ -242,35 +251,38 @@ def test_greedy_actions_of_the_policy_file_are_rllibs(network, activation, tmp_p
         # Weights are three times their usual size here, so sums cancel more; stretched to +-2.
         assert_network(actions, expected, num_terms=9 * NUM_TERMS)
     else:
-        start = policy.action_space.start
+        assert isinstance(policy.action_space, gym.spaces.Discrete)
+        start = int(policy.action_space.start)
         assert_greedy(actions - start, expected - start, policy.outputs(obs), num_terms=9 * NUM_TERMS)
     one = policy.act(obs[0])
     assert np.array_equal(one, actions[0])
 
 
-def test_trained_policies_act_as_their_checkpoints(trained):
+def test_trained_policies_act_as_their_checkpoints(trained: tuple[Path, Any]) -> None:
     folder, saved = trained
     obs = np.random.default_rng(2).normal(size=(1_000, 4)).astype(np.float32)
     policy = load_policy(folder)
+    assert isinstance(policy, NetworkPolicy)
     assert_greedy(policy.act(obs), rllib_actions(saved, obs), policy.outputs(obs), num_terms=NUM_TERMS)
 
 
-def test_a_network_other_than_the_hyperparameters_say_is_an_error(trained):
+def test_a_network_other_than_the_hyperparameters_say_is_an_error(trained: tuple[Path, Any]) -> None:
     from policies.rllib.restore import portable_policy
 
     _, saved = trained
-    algorithm = "dqn" if "DQN" in type(saved).__name__ else "ppo"
-    for values, what in (
+    algorithm: Algorithm = "dqn" if "DQN" in type(saved).__name__ else "ppo"
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"hidden_sizes": (8, 8)}, "no weights"),
         ({"hidden_sizes": (9,)}, "hidden layers"),
         *([({"hidden_sizes": (8,), "vf_share_layers": True}, "no weights")] if algorithm == "ppo" else []),
-    ):
-        hyperparams = make_hyperparams(algorithm, values)
+    ]
+    for values, what in cases:
+        hyperparams = cast("TrainedHyperparams", make_hyperparams(algorithm, values))
         with pytest.raises(CheckpointError, match=what):
             portable_policy(saved, hyperparams, env_id="CartPole-v1", env_args={})
 
 
-def test_the_policy_of_a_checkpoint_tells_how_it_was_trained(trained):
+def test_the_policy_of_a_checkpoint_tells_how_it_was_trained(trained: tuple[Path, Any]) -> None:
     folder, _ = trained
     policy = NetworkPolicy(read_policy(folder))
     training = policy.portable.training

@@ -5,6 +5,9 @@ that builds an Algorithm and raises AssertionError unless its hyperparameter act
 field, another fails for a field without one.
 """
 
+from collections.abc import Iterator
+from typing import Any, cast
+
 import dqn_cases  # noqa: F401 (its cases register themselves)
 import network_cases  # noqa: F401
 import numpy as np
@@ -13,6 +16,7 @@ import pytest
 from rllib_cases import (
     CASES,
     SMALL,
+    Build,
     count_updates,
     env_steps,
     linears,
@@ -22,8 +26,10 @@ from torch import nn
 
 from policies.hyperparams import (
     HYPERPARAMS_BY_ALGORITHM,
+    Algorithm,
     DQNHyperparams,
     PPOHyperparams,
+    TrainedHyperparams,
     make_hyperparams,
 )
 from policies.schedules import linear
@@ -34,14 +40,14 @@ TRAINED = {name: HYPERPARAMS_BY_ALGORITHM[name] for name in ("ppo", "dqn")}
 
 
 @pytest.fixture
-def build():
+def build() -> Iterator[Build]:
     """Make an Algorithm from a few hyperparameters; all are stopped at the end."""
     from policies.rllib.config import build_algorithm_config
 
     built = []
 
-    def make(algorithm, env_id="CartPole-v1", num_env_runners=0, **values):
-        hyperparams = make_hyperparams(algorithm, {**SMALL[algorithm], **values})
+    def make(algorithm: Algorithm, env_id: str = "CartPole-v1", num_env_runners: int = 0, **values: Any) -> Any:
+        hyperparams = cast("TrainedHyperparams", make_hyperparams(algorithm, {**SMALL[algorithm], **values}))
         config = build_algorithm_config(hyperparams, env_id=env_id, seed=1024, num_env_runners=num_env_runners)
         built.append(config.build_algo())
         return built[-1]
@@ -52,17 +58,17 @@ def build():
 
 
 @pytest.mark.parametrize(("algorithm", "field"), sorted(CASES))
-def test_every_hyperparameter_acts(build, algorithm, field):
+def test_every_hyperparameter_acts(build: Build, algorithm: Algorithm, field: str) -> None:
     CASES[algorithm, field](build, algorithm)
 
 
-def test_every_hyperparameter_has_a_case():
+def test_every_hyperparameter_has_a_case() -> None:
     """Whoever adds one: build_algorithm_config must hand it on, and a case above must show that it acts."""
     fields = {(name, field) for name, model in TRAINED.items() for field in model.model_fields}
     assert set(CASES) == fields
 
 
-def test_defaults_are_the_ones_of_the_hyperparameters(build):
+def test_defaults_are_the_ones_of_the_hyperparameters(build: Build) -> None:
     """A field that is left out has the default that its description states, not RLlib's."""
     for algorithm, model in TRAINED.items():
         fields = model.model_fields
@@ -73,14 +79,14 @@ def test_defaults_are_the_ones_of_the_hyperparameters(build):
             assert sum(isinstance(layer, kind) for layer in encoder.modules()) == 2
 
 
-def test_the_seed_reaches_environment_and_runner(build):
+def test_the_seed_reaches_environment_and_runner(build: Build) -> None:
     algo = build("ppo")
     assert algo.env_runner.config.seed == 1024
     assert algo.env_runner._seed == 1024
 
 
 @pytest.mark.parametrize("num_env_runners", [0, 2])
-def test_resources_are_what_the_plan_counts(num_env_runners):
+def test_resources_are_what_the_plan_counts(num_env_runners: int) -> None:
     """Trap: RLlib's default of two env runners makes three CPUs a trial, which a laptop of two never has."""
     from policies.rllib.config import build_algorithm_config
 
@@ -97,7 +103,7 @@ def test_resources_are_what_the_plan_counts(num_env_runners):
         assert not config.restart_failed_sub_environments
 
 
-def test_updates_per_env_step_are_the_same_with_env_runners(build):
+def test_updates_per_env_step_are_the_same_with_env_runners(build: Build) -> None:
     # RLlib counts one sampling process too many, and would make twice the updates.
     algo = build("dqn", num_env_runners=2, updates_per_env_step=0.5, env_steps_per_iteration=96, num_envs=4)
     sizes = count_updates(algo)
@@ -106,7 +112,7 @@ def test_updates_per_env_step_are_the_same_with_env_runners(build):
     assert abs(len(sizes) - 0.5 * steps) <= 8
 
 
-def test_rllib_moves_schedules_by_the_same_formula():
+def test_rllib_moves_schedules_by_the_same_formula() -> None:
     from ray.rllib.utils.schedules.scheduler import Scheduler
 
     from policies.rllib.config import _schedule

@@ -1,20 +1,30 @@
 """The RLlib engine: the same trial is the same again in a warm process, and a restored one goes on."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from trials import TRIAL_SEED, make_task, run_trial
 
 from policies.errors import CannotRunError, CheckpointError, NonFiniteWeightsError, NotFoundError
+from policies.packed.member import Weights
 from tune_jobs.spec.sections import StopSpec
+from tune_jobs.training.protocol import IterationStats, TrialTask
+
+if TYPE_CHECKING:
+    from tune_jobs.training.rllib import RLlibEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 
 @pytest.fixture
-def engine():
+def engine() -> Iterator[RLlibEngine]:
     from tune_jobs.training.rllib import RLlibEngine
 
     engine = RLlibEngine()
@@ -22,7 +32,9 @@ def engine():
     engine.close()
 
 
-def weights_after(engine, task, num_iterations=2):
+def weights_after(
+    engine: RLlibEngine, task: TrialTask, num_iterations: int = 2
+) -> tuple[Weights, list[IterationStats]]:
     """The learner's weights of a fresh trial, and what its iterations gave."""
     from policies.rllib.restore import learner_weights
 
@@ -31,12 +43,12 @@ def weights_after(engine, task, num_iterations=2):
     return learner_weights(engine.algorithm), stats
 
 
-def same(ours, theirs):
+def same(ours: Mapping[str, NDArray[Any]], theirs: Mapping[str, NDArray[Any]]) -> bool:
     assert set(ours) == set(theirs)
     return all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def save(engine, folder):
+def save(engine: RLlibEngine, folder: Path) -> Path:
     """A checkpoint as a trial saves it, but without a manifest."""
     from policies.portable.file import save_policy
 
@@ -47,7 +59,7 @@ def save(engine, folder):
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_a_trial_is_the_same_again_in_a_warm_process(engine, tmp_path, algorithm):
+def test_a_trial_is_the_same_again_in_a_warm_process(engine: RLlibEngine, tmp_path: Path, algorithm: str) -> None:
     """However many other numbers the process has drawn, and whatever it trained in between."""
     task = make_task(tmp_path, algorithm)
     first, first_stats = weights_after(engine, task)
@@ -59,7 +71,7 @@ def test_a_trial_is_the_same_again_in_a_warm_process(engine, tmp_path, algorithm
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_trials_of_other_seeds_are_other_trials(engine, tmp_path, algorithm):
+def test_trials_of_other_seeds_are_other_trials(engine: RLlibEngine, tmp_path: Path, algorithm: str) -> None:
     first, first_stats = weights_after(engine, make_task(tmp_path, algorithm))
     other, other_stats = weights_after(engine, make_task(tmp_path, algorithm, seed=TRIAL_SEED + 1024))
     drawn = [name for name in first if not name.endswith("_const")]
@@ -67,7 +79,7 @@ def test_trials_of_other_seeds_are_other_trials(engine, tmp_path, algorithm):
     assert first_stats[0].episodes != other_stats[0].episodes
 
 
-def test_iterations_tell_whole_episodes_and_all_env_steps(engine, tmp_path):
+def test_iterations_tell_whole_episodes_and_all_env_steps(engine: RLlibEngine, tmp_path: Path) -> None:
     _, stats = weights_after(engine, make_task(tmp_path, grad_clip=5.0), 6)
     steps = [item.num_env_steps for item in stats]
     assert all(128 <= after - before < 128 + 4 for before, after in zip([0, *steps], steps, strict=False))
@@ -86,7 +98,7 @@ def test_iterations_tell_whole_episodes_and_all_env_steps(engine, tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
+def test_a_restored_trial_goes_on(engine: RLlibEngine, tmp_path: Path, algorithm: str) -> None:
     from policies.rllib.restore import learner_weights
     from tune_jobs.training.rllib import RLlibEngine
 
@@ -109,7 +121,7 @@ def test_a_restored_trial_goes_on(engine, tmp_path, algorithm):
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path, algorithm):
+def test_two_restores_of_a_checkpoint_are_the_same(engine: RLlibEngine, tmp_path: Path, algorithm: str) -> None:
     """A trial that is retried from a checkpoint goes the same way again; and other ways from other checkpoints."""
     from policies.rllib.restore import learner_weights
 
@@ -127,7 +139,7 @@ def test_two_restores_of_a_checkpoint_are_the_same(engine, tmp_path, algorithm):
     assert results[0][1] != results[2][1]
 
 
-def test_a_restored_trial_does_not_see_its_first_episodes_again(engine, tmp_path):
+def test_a_restored_trial_does_not_see_its_first_episodes_again(engine: RLlibEngine, tmp_path: Path) -> None:
     task = make_task(tmp_path)
     engine.build(task, None)
     drawn = [torch.rand(3)]
@@ -144,7 +156,7 @@ def test_a_restored_trial_does_not_see_its_first_episodes_again(engine, tmp_path
 
 
 @pytest.mark.parametrize("num_env_runners", [0, 1])
-def test_dqn_fills_its_replay_buffer_again(engine, tmp_path, num_env_runners):
+def test_dqn_fills_its_replay_buffer_again(engine: RLlibEngine, tmp_path: Path, num_env_runners: int) -> None:
     """It is not in checkpoints; training on a handful of transitions would undo what was learned."""
     task = make_task(tmp_path, "dqn", learning_starts=50, num_env_runners=num_env_runners)
     weights_after(engine, task, 2)
@@ -166,7 +178,7 @@ def test_dqn_fills_its_replay_buffer_again(engine, tmp_path, num_env_runners):
     assert len(after.replay) == 110
 
 
-def test_dqn_with_env_runners_sends_them_its_weights(engine, tmp_path):
+def test_dqn_with_env_runners_sends_them_its_weights(engine: RLlibEngine, tmp_path: Path) -> None:
     engine.build(make_task(tmp_path, "dqn", num_env_runners=1), None)
     engine.train_iteration()
     engine.train_iteration()
@@ -178,7 +190,7 @@ def test_dqn_with_env_runners_sends_them_its_weights(engine, tmp_path):
     assert same(theirs, {name: ours[name] for name in theirs})
 
 
-def test_a_damaged_checkpoint_is_never_a_fresh_start(engine, tmp_path):
+def test_a_damaged_checkpoint_is_never_a_fresh_start(engine: RLlibEngine, tmp_path: Path) -> None:
     task = make_task(tmp_path)
     weights_after(engine, task, 1)
     folder = save(engine, tmp_path / "000001")
@@ -189,7 +201,7 @@ def test_a_damaged_checkpoint_is_never_a_fresh_start(engine, tmp_path):
         engine.build(task, tmp_path / "000009")
 
 
-def test_nothing_is_left_of_a_closed_trial(engine, tmp_path):
+def test_nothing_is_left_of_a_closed_trial(engine: RLlibEngine, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="build"):
         engine.algorithm  # noqa: B018
     engine.close()
@@ -200,7 +212,7 @@ def test_nothing_is_left_of_a_closed_trial(engine, tmp_path):
         engine.train_iteration()
 
 
-def test_the_policy_is_the_one_that_trains(engine, tmp_path):
+def test_the_policy_is_the_one_that_trains(engine: RLlibEngine, tmp_path: Path) -> None:
     from policies.rllib.restore import learner_weights
 
     task = make_task(tmp_path)
@@ -218,7 +230,7 @@ def test_the_policy_is_the_one_that_trains(engine, tmp_path):
     assert not np.array_equal(engine.policy().network.layers[0].weight, policy.network.layers[0].weight)
 
 
-def test_a_trial_with_env_runners_of_its_own(engine, tmp_path):
+def test_a_trial_with_env_runners_of_its_own(engine: RLlibEngine, tmp_path: Path) -> None:
     """Their episodes are told too; and one that dies ends the trial, which RLlib would not."""
     task = make_task(tmp_path, num_env_runners=1)
     engine.build(task, None)
@@ -237,7 +249,7 @@ def test_a_trial_with_env_runners_of_its_own(engine, tmp_path):
         engine.train_iteration()
 
 
-def test_a_whole_trial_with_this_engine(engine, tmp_path):
+def test_a_whole_trial_with_this_engine(engine: RLlibEngine, tmp_path: Path) -> None:
     """The loop and the engine together; what the loop does is tested without Ray."""
     task = make_task(tmp_path, stop=StopSpec(num_env_steps=300))
     progress = run_trial(task, engine)
@@ -251,14 +263,16 @@ def test_a_whole_trial_with_this_engine(engine, tmp_path):
 # -- training that went wrong
 
 
-def test_gradients_that_are_not_finite_are_an_error_and_not_set_to_0(engine, tmp_path):
+def test_gradients_that_are_not_finite_are_an_error_and_not_set_to_0(engine: RLlibEngine, tmp_path: Path) -> None:
     engine.build(make_task(tmp_path, lr=1e30), None)
     with pytest.raises(NonFiniteWeightsError, match="gradients of an update are NaN or infinite"):
         engine.train_iteration()
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_weights_that_are_not_finite_are_named_where_actions_are_drawn(engine, tmp_path, env_id):
+def test_weights_that_are_not_finite_are_named_where_actions_are_drawn(
+    engine: RLlibEngine, tmp_path: Path, env_id: str
+) -> None:
     engine.build(make_task(tmp_path, env_id=env_id), None)
     module = engine.algorithm.env_runner.module
     with torch.no_grad():
@@ -267,7 +281,7 @@ def test_weights_that_are_not_finite_are_named_where_actions_are_drawn(engine, t
         engine.algorithm.env_runner.sample(num_timesteps=8, explore=True)
 
 
-def test_an_update_by_weights_that_are_not_finite_names_them(engine, tmp_path):
+def test_an_update_by_weights_that_are_not_finite_names_them(engine: RLlibEngine, tmp_path: Path) -> None:
     engine.build(make_task(tmp_path), None)
     learner = engine.algorithm.learner_group._learner
     with torch.no_grad():

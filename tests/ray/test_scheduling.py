@@ -1,14 +1,16 @@
 """Our scheduler protocol decides as Ray Tune's schedulers did before it, on random scores."""
 
 import math
+from collections.abc import Callable, Generator
+from typing import Any
 
 import numpy as np
 import pytest
 from former_schedulers import FakedController, FakedTrial, former
 
 from tune_jobs.ray_tune.early_stopping import TuneScheduler, build_scheduler, build_tune_scheduler
-from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+from tune_jobs.spec.sections import SchedulerSpec, SchedulerType
 
 pytestmark = [
     pytest.mark.ray,
@@ -18,16 +20,19 @@ pytestmark = [
 
 MAX_ENV_STEPS = 1_600
 NAMES = {"CONTINUE": Decision.GO_ON, "STOP": Decision.STOP, "PAUSE": Decision.GIVE_WAY}
+Tell = Callable[[str, dict[str, Any], bool, bool], Decision | CopyFrom]
+"""A trial, what it reports, whether that ends it and whether it is new -> what becomes of it."""
 
 
-def reports(rng):
+def reports(rng: np.random.Generator) -> Generator[tuple[int, dict[str, Any], bool], Decision | CopyFrom | None, None]:
     """What the trials of one sweep tell, in the order in which they are told.
 
     Yields:
         Number of the trial, its report as Tune has it, and whether it has ended by itself.
     """
     num_trials = int(rng.integers(2, 14))
-    waiting, running = list(range(num_trials)), {}
+    waiting = list(range(num_trials))
+    running: dict[int, int] = {}
     slots = int(rng.integers(1, 6))
     while waiting or running:
         while waiting and len(running) < slots:
@@ -45,12 +50,12 @@ def reports(rng):
             del running[number]
 
 
-def settings(rng, kind):
+def settings(rng: np.random.Generator, kind: SchedulerType) -> SchedulerSpec:
     grace = int(rng.choice([1, 100, 200, 400, 1000]))
     return SchedulerSpec(type=kind, grace_env_steps=grace, reduction_factor=int(rng.integers(2, 5)))
 
 
-def played(seed, kind, teller):
+def played(seed: int, kind: SchedulerType, teller: Callable[[SchedulerSpec], Tell]) -> list[Decision | CopyFrom]:
     """Every decision that is made in a random sweep."""
     rng = np.random.default_rng(seed)
     spec = settings(rng, kind)
@@ -68,7 +73,7 @@ def played(seed, kind, teller):
         return found
 
 
-def by_tune(judge, *, seed=0):
+def by_tune(judge: Any, *, seed: int = 0) -> Tell:
     """Tune's calls of its scheduler; now and then others wait for a place."""
     rng = np.random.default_rng(seed)
     waits = {
@@ -77,7 +82,7 @@ def by_tune(judge, *, seed=0):
         2: FakedController((FakedTrial("b", "PAUSED"),)),
     }
 
-    def tell(name, told, over, is_new):
+    def tell(name: str, told: dict[str, Any], over: bool, is_new: bool) -> Decision | CopyFrom:
         controller = waits[int(rng.integers(3))]
         if is_new:
             judge.on_trial_add(controller, FakedTrial(name))
@@ -89,10 +94,10 @@ def by_tune(judge, *, seed=0):
     return tell
 
 
-def in_packs_before(spec):
+def in_packs_before(spec: SchedulerSpec) -> Tell:
     judge = former(spec, MAX_ENV_STEPS)
 
-    def tell(name, told, over, is_new):
+    def tell(name: str, told: dict[str, Any], over: bool, is_new: bool) -> Decision | CopyFrom:
         if is_new:
             judge.on_trial_add(FakedController(), FakedTrial(name))
         decision = "STOP" if over else judge.on_trial_result(FakedController(), FakedTrial(name), told)
@@ -103,10 +108,10 @@ def in_packs_before(spec):
     return tell
 
 
-def in_packs_now(spec):
+def in_packs_now(spec: SchedulerSpec) -> Tell:
     judge = build_scheduler(spec, MAX_ENV_STEPS)
 
-    def tell(name, told, over, is_new):
+    def tell(name: str, told: dict[str, Any], over: bool, is_new: bool) -> Decision | CopyFrom:
         if is_new:
             judge.begins(name)
         standing = Standing(name, told["num_env_steps"], told["score"], told["evaluated"])
@@ -119,7 +124,7 @@ def in_packs_now(spec):
 
 
 @pytest.mark.parametrize("kind", ["asha", "median"])
-def test_members_of_packs_are_judged_as_with_faked_trials(kind):
+def test_members_of_packs_are_judged_as_with_faked_trials(kind: SchedulerType) -> None:
     decisions = []
     for seed in range(40):
         decisions += (now := played(seed, kind, in_packs_now))
@@ -129,7 +134,7 @@ def test_members_of_packs_are_judged_as_with_faked_trials(kind):
 
 
 @pytest.mark.parametrize("kind", ["asha", "median"])
-def test_trials_of_tune_are_judged_as_by_its_own_schedulers(kind):
+def test_trials_of_tune_are_judged_as_by_its_own_schedulers(kind: SchedulerType) -> None:
     decisions = []
     for seed in range(40):
         now = played(seed, kind, lambda spec: by_tune(build_tune_scheduler(spec, MAX_ENV_STEPS)))
@@ -140,13 +145,13 @@ def test_trials_of_tune_are_judged_as_by_its_own_schedulers(kind):
     assert (Decision.GIVE_WAY in decisions) == (kind == "median")
 
 
-def test_without_a_scheduler_everyone_goes_on_to_the_end():
+def test_without_a_scheduler_everyone_goes_on_to_the_end() -> None:
     judge = build_tune_scheduler(SchedulerSpec(type="none"), MAX_ENV_STEPS)
     assert isinstance(judge, TuneScheduler)
     ends = []
     tell = by_tune(judge)
 
-    def noted(name, told, over, is_new):
+    def noted(name: str, told: dict[str, Any], over: bool, is_new: bool) -> Decision | CopyFrom:
         ends.append((over, decision := tell(name, told, over, is_new)))
         return decision
 
@@ -156,12 +161,12 @@ def test_without_a_scheduler_everyone_goes_on_to_the_end():
 
 
 @pytest.mark.parametrize("kind", ["pbt", "hyperband"])
-def test_what_pauses_trials_is_none_for_packs(kind):
+def test_what_pauses_trials_is_none_for_packs(kind: SchedulerType) -> None:
     with pytest.raises(ValueError, match="Tune's own"):
         build_scheduler(SchedulerSpec(type=kind), MAX_ENV_STEPS)
 
 
-def test_a_trial_that_tune_ends_before_its_first_report_is_compared_with_none():
+def test_a_trial_that_tune_ends_before_its_first_report_is_compared_with_none() -> None:
     for kind in ("asha", "median"):
         judge = build_tune_scheduler(SchedulerSpec(type=kind), MAX_ENV_STEPS)
         judge.on_trial_add(None, FakedTrial("t0000"))

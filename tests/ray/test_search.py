@@ -1,15 +1,21 @@
 """Whole sweeps with population based training and TPE: what they do to the trials that run."""
 
 import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
 from test_sweeps import FAST, assert_results_without_gaps, eventually
 
+from analysis.records import ChangeRecord, TrialRecord
 from policies.portable.file import read_policy
+from tests.narrowing import present
 from tune_jobs.spec.domains import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.outcome import SweepResult
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -19,7 +25,7 @@ SLOW = {"id": "TestTrouble-v0", "args": {"pause_s": 0.001}}
 SPACE = {"lr": {"loguniform": [1e-6, 1e-2]}}
 
 
-def launch(tmp_path, **changes):
+def launch(tmp_path: Path, **changes: Any) -> SweepResult:
     spec = {
         "env": SLOW,
         "algorithm": "ppo",
@@ -37,7 +43,7 @@ def launch(tmp_path, **changes):
 PBT = {"num_samples": 4, "scheduler": {"type": "pbt", "perturb_every_env_steps": 256}}
 
 
-def assert_history_acts(store, trials):
+def assert_history_acts(store: SweepStore, trials: Sequence[TrialRecord]) -> None:
     """Each trial trained each iteration with the learning rate its record says it had, and says so in its policies."""
     for trial in trials:
         iterations = store.trial(trial.trial_id).read_iterations()
@@ -52,12 +58,12 @@ def assert_history_acts(store, trials):
 
 
 @pytest.fixture(scope="module")
-def population(ray_session, tmp_path_factory):
+def population(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> SweepResult:
     """A finished sweep; no test may change it."""
     return launch(tmp_path_factory.mktemp("storage"), **PBT)
 
 
-def test_a_mutated_learning_rate_is_the_one_in_the_trials_optimizer(population):
+def test_a_mutated_learning_rate_is_the_one_in_the_trials_optimizer(population: SweepResult) -> None:
     store = SweepStore(population.folder)
     changed = [trial for trial in population.trials if trial.changes]
     assert changed
@@ -72,7 +78,7 @@ def test_a_mutated_learning_rate_is_the_one_in_the_trials_optimizer(population):
             assert 1e-6 <= change.after["lr"] <= 1e-2
 
 
-def test_all_trials_of_a_population_train_to_the_end_and_their_history_is_shown(population):
+def test_all_trials_of_a_population_train_to_the_end_and_their_history_is_shown(population: SweepResult) -> None:
     from tune_jobs.cli.output import show_trials
 
     trials = population.trials
@@ -84,25 +90,25 @@ def test_all_trials_of_a_population_train_to_the_end_and_their_history_is_shown(
     show_trials(trials, as_json=False)
 
 
-def test_worse_trials_go_on_from_better_ones(population):
+def test_worse_trials_go_on_from_better_ones(population: SweepResult) -> None:
     store = SweepStore(population.folder)
     for trial in population.trials:
         own = {record.iteration: record for record in store.trial(trial.trial_id).read_iterations()}
         for change in trial.changes:
             theirs = store.trial(change.source_trial_id).read_iterations()
             scores = [record.evaluation_return for record in theirs if record.evaluation_return is not None]
-            assert max(scores) > own[change.iteration].evaluation_return
+            assert max(scores) > present(own[change.iteration].evaluation_return)
 
 
-def test_a_population_that_is_stopped_goes_on_with_its_newest_values(ray_session, tmp_path):
+def test_a_population_that_is_stopped_goes_on_with_its_newest_values(ray_session: None, tmp_path: Path) -> None:
     store = SweepStore(tmp_path / "mine")
 
-    def changes():
+    def changes() -> list[ChangeRecord]:
         if not store.exists():
             return []
         return [change for trial in store.read_trials() for change in trial.changes]
 
-    def stop():
+    def stop() -> None:
         eventually(lambda: changes() and store.is_driven())
         sweeps.stop(tmp_path / "mine")
 
@@ -124,11 +130,14 @@ def test_a_population_that_is_stopped_goes_on_with_its_newest_values(ray_session
 TPE = {"num_samples": 5, "search": {"type": "tpe", "num_startup_trials": 3}}
 
 
-def most_at_once(trials):
-    return max(sum(other.started_at <= trial.started_at < other.ended_at for other in trials) for trial in trials)
+def most_at_once(trials: Sequence[TrialRecord]) -> int:
+    spans = [(present(trial.started_at), present(trial.ended_at)) for trial in trials]
+    return max(sum(start <= started < end for start, end in spans) for started, _ in spans)
 
 
-def test_tpe_runs_as_many_trials_at_once_as_the_machine_allows_and_goes_on_when_extended(ray_session, tmp_path):
+def test_tpe_runs_as_many_trials_at_once_as_the_machine_allows_and_goes_on_when_extended(
+    ray_session: None, tmp_path: Path
+) -> None:
     pytest.importorskip("optuna")
     # In packs there are more at once; see test_packs.
     result = launch(tmp_path, **TPE, engine="rllib")
@@ -154,7 +163,7 @@ def test_tpe_runs_as_many_trials_at_once_as_the_machine_allows_and_goes_on_when_
     )
 
 
-def test_tpe_and_asha_go_together_and_seeds_of_a_point_share_its_values(ray_session, tmp_path):
+def test_tpe_and_asha_go_together_and_seeds_of_a_point_share_its_values(ray_session: None, tmp_path: Path) -> None:
     pytest.importorskip("optuna")
     scheduler = {"type": "asha", "grace_env_steps": 256, "reduction_factor": 2}
     result = launch(tmp_path, **TPE, scheduler=scheduler, seeds_per_point=2)

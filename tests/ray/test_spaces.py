@@ -1,11 +1,24 @@
 """Observations of any precision and actions with any bounds: both engines, their policies, and what is restored."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
+import torch
 from trials import make_task, run_trial
 
 from policies.acting.evaluate import Evaluator
 from policies.acting.load import load_policy
+from policies.acting.policy import WeightsPolicy
+from tune_jobs.training.protocol import TrialTask
+
+if TYPE_CHECKING:
+    from tune_jobs.training.packed import PackedEngine
+    from tune_jobs.training.rllib import RLlibEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -24,14 +37,14 @@ CASES = {
 BOUNDS = [[0, None], [None, 0.5], [-2, 3], [None, None]]
 
 
-def engines():
+def engines() -> tuple[RLlibEngine, PackedEngine]:
     from tune_jobs.training.packed import PackedEngine
     from tune_jobs.training.rllib import RLlibEngine
 
     return RLlibEngine(), PackedEngine()
 
 
-def train_packed(engine, task):
+def train_packed(engine: PackedEngine, task: TrialTask) -> Path:
     """Two iterations and a checkpoint, as a pack saves them; returns its folder."""
     from policies.portable.file import save_policy
 
@@ -47,7 +60,7 @@ def train_packed(engine, task):
 
 
 @pytest.fixture
-def checkpoints(request, tmp_path):
+def checkpoints(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[TrialTask, list[Path]]]:
     """A trial's newest checkpoint by each engine that can train it."""
     algorithm, values = request.param
     task = make_task(tmp_path, algorithm, env_id="TestPrecise-v0", **values)
@@ -62,7 +75,7 @@ def checkpoints(request, tmp_path):
     packed.close()
 
 
-def train_on(folder):
+def train_on(folder: Path) -> Any:
     """Restore, train an iteration, and return the Algorithm."""
     from policies.packed.to_rllib import algorithm_from_checkpoint
     from policies.rllib.restore import restore_algorithm
@@ -78,13 +91,13 @@ def train_on(folder):
     return algorithm
 
 
-def learner_weights(algorithm):
+def learner_weights(algorithm: Any) -> dict[str, torch.Tensor]:
     module = algorithm.learner_group._learner.module["default_policy"]
     return {name: value.detach().cpu() for name, value in module.named_parameters()}
 
 
 @pytest.mark.parametrize("checkpoints", CASES.values(), ids=CASES, indirect=True)
-def test_observations_of_any_precision(checkpoints):
+def test_observations_of_any_precision(checkpoints: tuple[TrialTask, list[Path]]) -> None:
     task, folders = checkpoints
     for folder in folders:
         with Evaluator(task.env_id, task.env_args, task.evaluation_seeds) as evaluator:
@@ -92,7 +105,7 @@ def test_observations_of_any_precision(checkpoints):
         train_on(folder).stop()
 
 
-def test_statistics_count_every_observation_whatever_the_transitions_wait_for(tmp_path):
+def test_statistics_count_every_observation_whatever_the_transitions_wait_for(tmp_path: Path) -> None:
     task = make_task(tmp_path, "dqn", n_step=7, normalize_observations=True, num_envs=2)
     rllib, packed = engines()
     rllib.build(task, None)
@@ -108,7 +121,7 @@ def test_statistics_count_every_observation_whatever_the_transitions_wait_for(tm
 
 
 @pytest.mark.parametrize("checkpoints", [("ppo", {"env_args": {"bounds": BOUNDS}})], indirect=True)
-def test_no_action_leaves_its_bounds(checkpoints):
+def test_no_action_leaves_its_bounds(checkpoints: tuple[TrialTask, list[Path]]) -> None:
     """The env refuses one that does."""
     task, folders = checkpoints
     for folder in folders:
@@ -121,5 +134,6 @@ def test_no_action_leaves_its_bounds(checkpoints):
         drawn = 3 * np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
         sent = algorithm.env_runner._for_env(drawn)
         np.testing.assert_array_equal(sent[:, 0], np.maximum(drawn[:, 0], 0))
+        assert isinstance(policy, WeightsPolicy)
         np.testing.assert_array_equal(sent, policy._to_actions(np.concatenate([drawn, drawn], axis=1)))
         algorithm.stop()

@@ -8,24 +8,30 @@ import os
 import re
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
 
+from analysis.records import TrialRecord
 from policies.acting.load import load_policy
+from policies.acting.policy import NetworkPolicy
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.portable.file import read_policy
+from tests.narrowing import present
 from tune_jobs.spec.seeds import trial_seeds
 from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.outcome import SweepResult
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
-FAST = {
+FAST: dict[str, Any] = {
     "hidden_sizes": [8],
     "activation": "tanh",
     "num_envs": 4,
@@ -35,7 +41,7 @@ FAST = {
 }
 
 
-def make_spec(**changes):
+def make_spec(**changes: Any) -> dict[str, Any]:
     """A sweep of seconds; `env` is a question a step, learnt within 2,000 env steps by a good learning rate."""
     return {
         "env": {"id": "TestTrouble-v0", "args": {}},
@@ -49,17 +55,17 @@ def make_spec(**changes):
     } | changes
 
 
-def launch(tmp_path, spec, **kwargs):
-    kwargs = {"name": "mine", "finish": False} | kwargs
-    return sweeps.launch(spec, storage=tmp_path, progress="none", **kwargs)
+def launch(tmp_path: Path, spec: dict[str, Any], **kwargs: Any) -> SweepResult:
+    keywords: dict[str, Any] = {"name": "mine", "finish": False} | kwargs
+    return sweeps.launch(spec, storage=tmp_path, progress="none", **keywords)
 
 
-def snapshot(folder):
+def snapshot(folder: Path) -> dict[str, bytes]:
     """Every file below a folder, with its content."""
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def assert_results_without_gaps(store, trial):
+def assert_results_without_gaps(store: SweepStore, trial: TrialRecord) -> None:
     """results.jsonl holds each iteration once, in order, with growing counts."""
     records = store.trial(trial.trial_id).read_iterations()
     assert [record.iteration for record in records] == list(range(1, trial.num_iterations + 1))
@@ -70,7 +76,7 @@ def assert_results_without_gaps(store, trial):
     assert records[-1].num_env_steps == trial.num_env_steps
 
 
-def eventually(condition, timeout_s=600.0):
+def eventually(condition: Callable[[], object], timeout_s: float = 600.0) -> None:
     """Wait until something is so. The time-out only keeps a broken test from waiting for ever."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -78,7 +84,7 @@ def eventually(condition, timeout_s=600.0):
         time.sleep(0.02)
 
 
-def has_checkpoints(storage, name="mine", num_trials=1):
+def has_checkpoints(storage: str | Path, name: str = "mine", num_trials: int = 1) -> bool:
     store = SweepStore(Path(storage) / name)
     return sum(bool(store.trial(f"t000{index}").checkpoints()) for index in range(2)) >= num_trials
 
@@ -87,7 +93,7 @@ def has_checkpoints(storage, name="mine", num_trials=1):
 
 
 @pytest.fixture(scope="module")
-def cartpole(ray_session, tmp_path_factory):
+def cartpole(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResult]:
     """(storage folder, result) of a finished sweep of two trials; no test may change it."""
     storage = tmp_path_factory.mktemp("storage")
     spec = make_spec(
@@ -99,7 +105,7 @@ def cartpole(ray_session, tmp_path_factory):
     return storage, sweeps.launch(spec, storage=storage, progress="none")
 
 
-def test_a_sweep_leaves_records_checkpoints_best_and_report(cartpole):
+def test_a_sweep_leaves_records_checkpoints_best_and_report(cartpole: tuple[Path, SweepResult]) -> None:
     storage, result = cartpole
     folder = storage / "cartpole"
     assert (result.folder, result.exit_code, result.interrupted, result.why_no_best) == (folder, 0, False, None)
@@ -110,19 +116,19 @@ def test_a_sweep_leaves_records_checkpoints_best_and_report(cartpole):
     store = SweepStore(folder)
     for trial in result.trials:
         assert (trial.status, trial.num_failures, trial.error) == ("completed", 0, None)
-        assert trial.stop_reason.startswith("num_env_steps")
+        assert present(trial.stop_reason).startswith("num_env_steps")
         # 256 an iteration, and up to 3 more where sub-environments reset.
         assert 1_000 <= trial.num_env_steps < 1_256 + 4
         assert_results_without_gaps(store, trial)
         # Evaluated at 2 and 4; the latest, the best, and no other.
         kept = {record.iteration for record in trial.checkpoints}
         assert kept == {trial.best_iteration, 4}
-        assert trial.best_evaluation_return == max(r.evaluation_return for r in trial.checkpoints)
+        assert trial.best_evaluation_return == max(present(r.evaluation_return) for r in trial.checkpoints)
         for record in trial.checkpoints:
             assert verify_checkpoint(folder / record.path) == record
         assert (trial.node, trial.pid) != (None, None)
         assert trial.pid != os.getpid()
-        assert trial.started_at < trial.ended_at
+        assert present(trial.started_at) < present(trial.ended_at)
         trial_folder = folder / "trials" / trial.trial_id
         assert (trial_folder / "log.txt").is_file()
         assert list((trial_folder / "tensorboard").glob("events.out.tfevents.*"))
@@ -133,14 +139,15 @@ def test_a_sweep_leaves_records_checkpoints_best_and_report(cartpole):
     assert (folder / "report" / "trials.csv").is_file()
 
 
-def test_the_best_is_chosen_by_evaluation_and_confirmed_on_other_seeds(cartpole):
+def test_the_best_is_chosen_by_evaluation_and_confirmed_on_other_seeds(cartpole: tuple[Path, SweepResult]) -> None:
     storage, result = cartpole
-    best = result.best
-    assert best.selection_score == max(trial.best_evaluation_return for trial in result.trials)
+    best = present(result.best)
+    assert best.selection_score == max(present(trial.best_evaluation_return) for trial in result.trials)
     assert best.confirmation.num_episodes == best.random.num_episodes == 100
     assert set(best.confirmation.seeds).isdisjoint(result.sweep.evaluation_seeds)
     assert best.confirmation.returns != best.random.returns
     policy = load_policy(result.artifacts["policy"])
+    assert isinstance(policy, NetworkPolicy)
     assert policy.act(np.zeros(4)) in {0, 1}
     checkpoint = read_policy(result.folder / best.checkpoint.path)
     np.testing.assert_array_equal(policy.portable.network.layers[0].weight, checkpoint.network.layers[0].weight)
@@ -148,7 +155,7 @@ def test_the_best_is_chosen_by_evaluation_and_confirmed_on_other_seeds(cartpole)
     assert record.returns == best.confirmation.returns[:5]
 
 
-def test_the_best_restores_as_an_algorithm_by_the_sweeps_name(cartpole):
+def test_the_best_restores_as_an_algorithm_by_the_sweeps_name(cartpole: tuple[Path, SweepResult]) -> None:
     from policies.rllib.restore import learner_weights
 
     storage, result = cartpole
@@ -166,7 +173,7 @@ def test_the_best_restores_as_an_algorithm_by_the_sweeps_name(cartpole):
     other.stop()
 
 
-def test_a_finished_sweep_is_told_the_same_by_every_call(cartpole):
+def test_a_finished_sweep_is_told_the_same_by_every_call(cartpole: tuple[Path, SweepResult]) -> None:
     storage, result = cartpole
     status = sweeps.status("cartpole", storage=storage)
     assert (status.counts, status.alive, status.sweep) == ({"completed": 2}, False, result.sweep)
@@ -176,7 +183,7 @@ def test_a_finished_sweep_is_told_the_same_by_every_call(cartpole):
     assert sweeps.stop("cartpole", storage=storage) is False
 
 
-def test_a_name_that_is_taken_starts_nothing(cartpole):
+def test_a_name_that_is_taken_starts_nothing(cartpole: tuple[Path, SweepResult]) -> None:
     storage, _ = cartpole
     before = snapshot(storage / "cartpole")
     with pytest.raises(SpecError, match="cartpole"):
@@ -186,7 +193,7 @@ def test_a_name_that_is_taken_starts_nothing(cartpole):
         sweeps.resume("cartpol", storage=storage)
 
 
-def test_resuming_a_finished_sweep_changes_no_trial(cartpole):
+def test_resuming_a_finished_sweep_changes_no_trial(cartpole: tuple[Path, SweepResult]) -> None:
     storage, result = cartpole
     before = snapshot(result.folder / "trials")
     again = sweeps.resume("cartpole", storage=storage, progress="none", finish=False)
@@ -197,7 +204,7 @@ def test_resuming_a_finished_sweep_changes_no_trial(cartpole):
 # -- more trials
 
 
-def test_extending_adds_the_new_trials_and_touches_no_other(tmp_path):
+def test_extending_adds_the_new_trials_and_touches_no_other(tmp_path: Path) -> None:
     space = {"lr": {"loguniform": [1e-3, 1e-2]}, "gamma": {"grid": [0.9, 0.99]}}
     first = launch(tmp_path, make_spec(num_samples=1, space=space))
     assert [trial.trial_id for trial in first.trials] == ["t0000", "t0001"]
@@ -222,7 +229,7 @@ def test_extending_adds_the_new_trials_and_touches_no_other(tmp_path):
 # -- what goes wrong
 
 
-def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
+def test_each_trial_fails_for_itself_and_is_retried(tmp_path: Path) -> None:
     """One trial after the other, in one process until one of them ends it: well, raises always, raises once, dies,
     hangs. Each is tried twice."""
     seeds = trial_seeds(0, 5)
@@ -238,9 +245,9 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
         iteration_timeout_s=25, engine="rllib",
     )  # fmt: skip
-    told = {}
+    told: dict[str, TrialRecord] = {}
 
-    def note(keeper, trial_id, error, **kwargs):
+    def note(keeper: RecordKeeper, trial_id: str, error: str, **kwargs: Any) -> None:
         failed_as_it_is(keeper, trial_id, error, **kwargs)
         told[trial_id] = keeper.record(trial_id)
 
@@ -251,11 +258,11 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     assert [trial.num_failures for trial in result.trials] == [0, 2, 1, 1, 1]
     assert (result.exit_code, result.sweep.state) == (3, "completed")
     failed = result.trials[1]
-    assert failed.error.startswith(
+    assert present(failed.error).startswith(
         "TestTrouble-v0 raised an error in step(): ZeroDivisionError: the cart left the track"
     )
     # And where, from the end of its log.
-    assert "tune_jobs_test_envs.py" in failed.error
+    assert "tune_jobs_test_envs.py" in present(failed.error)
     assert failed.ended_at is not None
     assert failed.checkpoints == ()
     # In the first iteration: the five steps before it, of four sub-environments each.
@@ -263,7 +270,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     assert failed.time_s > 0
     hung = told["t0004"]
     assert hung.num_env_steps > 60 * FAST["num_envs"]
-    first = hung.error.splitlines()[0]
+    first = present(hung.error).splitlines()[0]
     assert "died: an iteration took longer than iteration_timeout_s (25 s). It hung at " in first
     assert re.search(r"/tune_jobs_test_envs\.py:\d+ in _go_wrong\.$", first)
     store = SweepStore(result.folder)
@@ -279,14 +286,14 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path):
     assert "Timeout (" in logs["t0004"]
     assert "_go_wrong" in logs["t0004"]
     # The winner is one of the others, though the environment cannot be filmed.
-    assert result.best.checkpoint.trial_id != "t0001"
+    assert present(result.best).checkpoint.trial_id != "t0001"
     assert "report" in result.artifacts
     assert "TestTrouble-v0" in " ".join(result.notes)
     html = result.artifacts["report"].read_text()
     assert "the cart left the track" in html
 
 
-def test_a_sweep_in_which_all_fails_says_so(tmp_path):
+def test_a_sweep_in_which_all_fails_says_so(tmp_path: Path) -> None:
     spec = make_spec(
         env={"id": "TestTrouble-v0", "args": {"troubles": {str(trial_seeds(0, 1)[0]): {"how": "raise"}}}},
         num_samples=1, max_retries=0,
@@ -294,7 +301,7 @@ def test_a_sweep_in_which_all_fails_says_so(tmp_path):
     result = launch(tmp_path, spec, finish=True)
     assert (result.exit_code, result.best) == (3, None)
     assert result.trials[0].num_failures == 1
-    assert "the cart left the track" in result.why_no_best
+    assert "the cart left the track" in present(result.why_no_best)
     assert "policy" not in result.artifacts
     assert result.artifacts["report"].is_file()
     # Mended (the env of another machine, say), failed trials can be tried again.
@@ -309,7 +316,7 @@ def test_a_sweep_in_which_all_fails_says_so(tmp_path):
 # -- going on
 
 
-def slow_spec(**changes):
+def slow_spec(**changes: Any) -> dict[str, Any]:
     """Trials of thousands of iterations, unless they are stopped."""
     return make_spec(
         env={"id": "TestTrouble-v0", "args": {"pause_s": 0.0005}},
@@ -320,17 +327,17 @@ def slow_spec(**changes):
     )
 
 
-def shorten(store, num_iterations):
+def shorten(store: SweepStore, num_iterations: int) -> None:
     """Let the trials of a sweep end soon."""
     record = store.read_record()
     record.spec["stop"]["num_iterations"] = num_iterations
     store.write_record(record)
 
 
-def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
+def test_a_stopped_sweep_goes_on_where_it_was(tmp_path: Path) -> None:
     asked = []
 
-    def ask():
+    def ask() -> None:
         eventually(lambda: has_checkpoints(tmp_path, num_trials=2))
         try:
             # Nobody else must run it meanwhile.
@@ -371,7 +378,7 @@ def test_a_stopped_sweep_goes_on_where_it_was(tmp_path):
     assert resumed.sweep.run_time_s > result.sweep.run_time_s
 
 
-def test_a_changed_sweep_is_not_gone_on_with(tmp_path):
+def test_a_changed_sweep_is_not_gone_on_with(tmp_path: Path) -> None:
     """Another seed draws other points: trials would train on with values they did not begin with."""
     result = launch(tmp_path, make_spec(num_samples=1))
     store = SweepStore(result.folder)

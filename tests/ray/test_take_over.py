@@ -1,14 +1,25 @@
 """An Algorithm that takes over another trial's checkpoint, and acts by its own hyperparameters."""
 
+from __future__ import annotations
+
 import dataclasses
+from collections.abc import Sized
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
+import torch
 from trials import make_task
 
 from analysis.records import ChangeRecord
 from policies.errors import CheckpointError
+from policies.packed.member import Weights
 from policies.portable.file import save_policy
+from tune_jobs.training.protocol import TrialTask
+
+if TYPE_CHECKING:
+    from tune_jobs.training.rllib import RLlibEngine
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -17,18 +28,18 @@ CHANGE = ChangeRecord(
 )
 
 
-def learner(engine):
+def learner(engine: RLlibEngine) -> Any:
     return engine.algorithm.learner_group._learner
 
 
-def optimizer(engine):
+def optimizer(engine: RLlibEngine) -> torch.optim.Optimizer:
     from ray.rllib.core import DEFAULT_MODULE_ID
 
     [(_, found)] = learner(engine).get_optimizers_for_module(DEFAULT_MODULE_ID)
-    return found
+    return cast("torch.optim.Optimizer", found)
 
 
-def tensors(engine):
+def tensors(engine: RLlibEngine) -> Weights:
     """Everything the module holds: weights, target networks, observation statistics."""
     from ray.rllib.core import DEFAULT_MODULE_ID
 
@@ -36,19 +47,19 @@ def tensors(engine):
     return {name: value.detach().numpy().copy() for name, value in state.items()}
 
 
-def moments(engine):
+def moments(engine: RLlibEngine) -> list[Weights]:
     return [
         {name: value.detach().numpy().copy() for name, value in state.items()}
         for state in optimizer(engine).state.values()
     ]
 
 
-def assert_same(first, second):
+def assert_same(first: Sized, second: Sized) -> None:
     assert len(first) == len(second) > 0
     np.testing.assert_equal(first, second)
 
 
-def trained(tmp_path, algorithm, **values):
+def trained(tmp_path: Path, algorithm: str, **values: Any) -> tuple[RLlibEngine, Path, TrialTask]:
     """(engine, its checkpoint, its task) after three iterations as trial t0009."""
     from tune_jobs.training.rllib import RLlibEngine
 
@@ -64,7 +75,7 @@ def trained(tmp_path, algorithm, **values):
     return engine, folder, task
 
 
-def taken_over(folder, task, **values):
+def taken_over(folder: Path, task: TrialTask, **values: Any) -> tuple[RLlibEngine, TrialTask]:
     """(engine, its task) of another trial, two iterations and 200 env steps far, that takes the checkpoint over."""
     from tune_jobs.training.rllib import RLlibEngine
 
@@ -90,7 +101,9 @@ def taken_over(folder, task, **values):
         ("dqn", {"optimizer": "rmsprop", "tau": 0.1}, {"rmsprop_rho": 0.5}, {"alpha": 0.5}),
     ],
 )  # fmt: skip
-def test_new_values_act_on_the_copied_weights_moments_and_targets(tmp_path, algorithm, old, new, acting):
+def test_new_values_act_on_the_copied_weights_moments_and_targets(
+    tmp_path: Path, algorithm: str, old: dict[str, Any], new: dict[str, Any], acting: dict[str, Any]
+) -> None:
     source, folder, task = trained(tmp_path, algorithm, lr=1e-3, **old)
     engine, task = taken_over(folder, task, lr=0.02, **new)
     assert_same(tensors(engine), tensors(source))
@@ -110,7 +123,7 @@ def test_new_values_act_on_the_copied_weights_moments_and_targets(tmp_path, algo
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_the_trials_own_counts_go_on_and_do_so_again_after_a_restore(tmp_path, algorithm):
+def test_the_trials_own_counts_go_on_and_do_so_again_after_a_restore(tmp_path: Path, algorithm: str) -> None:
     source, folder, task = trained(tmp_path, algorithm)
     source.close()
     engine, task = taken_over(folder, task, lr=0.02)
@@ -130,7 +143,7 @@ def test_the_trials_own_counts_go_on_and_do_so_again_after_a_restore(tmp_path, a
     engine.close()
 
 
-def test_a_trial_has_random_numbers_of_its_own_after_it_took_over(tmp_path):
+def test_a_trial_has_random_numbers_of_its_own_after_it_took_over(tmp_path: Path) -> None:
     source, folder, task = trained(tmp_path, "ppo")
     first, _ = taken_over(folder, task)
     episodes = first.train_iteration().episodes
@@ -144,7 +157,7 @@ def test_a_trial_has_random_numbers_of_its_own_after_it_took_over(tmp_path):
     source.close()
 
 
-def test_weights_of_another_shape_are_refused(tmp_path):
+def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
     source, folder, task = trained(tmp_path, "ppo")
     source.close()
     with pytest.raises(CheckpointError, match="cannot restore"):

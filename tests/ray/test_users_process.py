@@ -5,22 +5,24 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.ray
 
 SCRIPT = Path(__file__).with_name("a_users_script.py")
+Told = dict[str, dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the script runs."""
     return tmp_path_factory.mktemp("script")
 
 
 @pytest.fixture(scope="module")
-def told(folder):
+def told(folder: Path) -> Told:
     """What the script told of each of its launches."""
     # What "another Ray" is said to listen at.
     with socket.create_server(("127.0.0.1", 0)) as server, (folder / "errors").open("w") as errors:
@@ -48,19 +50,19 @@ def told(folder):
         ("the user's Ray", "exit code 0"),
     ],
 )
-def test_a_launch_leaves_the_process_as_it_was(told, what, came_of_it):
+def test_a_launch_leaves_the_process_as_it_was(told: Told, what: str, came_of_it: str) -> None:
     assert told[what]["came of it"].startswith(came_of_it)
     assert told[what]["changed"] == {}
 
 
-def test_a_created_sweep_that_a_thread_drives_gives_what_a_launch_gives(told, folder):
+def test_a_created_sweep_that_a_thread_drives_gives_what_a_launch_gives(told: Told, folder: Path) -> None:
     assert "two threads" in told
     launched, driven = (what_it_learned(folder / "sweeps" / name) for name in ("one", "created"))
     assert driven == launched
     assert len(launched) == 3
 
 
-def what_it_learned(sweep):
+def what_it_learned(sweep: Path) -> list[Any]:
     """Its records, results and weights, without times and places."""
     trial = sweep / "trials" / "t0000"
     results = [json.loads(line) for line in (trial / "results.jsonl").read_text().splitlines()]

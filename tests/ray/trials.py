@@ -1,13 +1,15 @@
 """Single trials without Ray Tune: what several test modules here run."""
 
 from pathlib import Path
+from typing import Any
 
 from policies.acting.evaluate import Evaluator
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
-from tune_jobs.training.protocol import TrialTask
+from tune_jobs.store.progress import Progress
+from tune_jobs.training.protocol import TrainingEngine, TrialTask
 
 TRIAL_SEED = 9 * 1024
-SMALL = {
+SMALL: dict[str, dict[str, Any]] = {
     "ppo": {"hidden_sizes": (8,), "train_batch_size": 128, "minibatch_size": 64, "num_epochs": 2, "num_envs": 4},
     "dqn": {
         "hidden_sizes": (8,),
@@ -20,7 +22,7 @@ SMALL = {
 }
 
 
-def make_task(folder: Path, algorithm="ppo", **changes):
+def make_task(folder: Path, algorithm: str = "ppo", **changes: Any) -> TrialTask:
     """A trial of a few iterations; hyperparameters by name, other fields of `TrialTask` too."""
     fields = {name: changes.pop(name) for name in list(changes) if name in TrialTask.__dataclass_fields__}
     return TrialTask(
@@ -41,7 +43,7 @@ def make_task(folder: Path, algorithm="ppo", **changes):
     )
 
 
-def run_trial(task, engine):
+def run_trial(task: TrialTask, engine: TrainingEngine) -> Progress:
     """Run a trial to its end; the engine keeps the Algorithm."""
     from tune_jobs.training.trial_loop import TrialLoop
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,7 +20,7 @@ class Maze(gymnasium.Env[NDArray[np.float32], int]):
         render_mode: `rgb_array`, for videos.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 8}
 
     def __init__(self, size: int = 5, render_mode: str | None = None) -> None:
         self.size, self.render_mode = size, render_mode
@@ -53,8 +53,8 @@ class Maze(gymnasium.Env[NDArray[np.float32], int]):
         return picture.repeat(32, axis=0).repeat(32, axis=1)
 
     def _observation(self) -> NDArray[np.float32]:
-        return np.array([self.row, self.column], np.float32) / (self.size - 1)
+        return np.array([self.row, self.column], np.float32) / np.float32(self.size - 1)
 
 
 # With a threshold, reports say whether a policy solves it. `env: maze_envs:Maze` does without this.
-gymnasium.register("Maze-v0", Maze, reward_threshold=0.9)
+gymnasium.register("Maze-v0", Maze, reward_threshold=0.9)  # type: ignore[arg-type]

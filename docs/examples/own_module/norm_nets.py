@@ -9,7 +9,7 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor, nn
 
 
-class NormNet(TorchRLModule, ValueFunctionAPI):
+class NormNet(TorchRLModule, ValueFunctionAPI):  # type: ignore[misc]
     """One trunk for policy and value function; the hyperparameter `hidden_sizes` gives its width."""
 
     def setup(self) -> None:

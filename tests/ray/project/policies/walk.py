@@ -1,8 +1,11 @@
 """The project's environment, which needs a helper from beside it."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 from analysis.rewards import reward_of
+from numpy.typing import NDArray
 
 
 class Walk(gym.Env):
@@ -12,19 +15,21 @@ class Walk(gym.Env):
     observation_space = gym.spaces.Box(0, 1, (2,), np.float32)
     action_space = gym.spaces.Discrete(2)
 
-    def __init__(self, render_mode=None):
+    def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode
         self._num_steps = 0
 
-    def reset(self, *, seed=None, options=None):
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
         self._num_steps = 0
         return np.zeros(2, np.float32), {}
 
-    def step(self, action):
+    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         self._num_steps += 1
         observation = np.full(2, self._num_steps / 10, np.float32)
         return observation, reward_of(action), False, self._num_steps >= 10, {}
 
-    def render(self):
+    def render(self) -> NDArray[np.uint8]:
         return np.zeros((32, 32, 3), np.uint8)
