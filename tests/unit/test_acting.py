@@ -2,19 +2,20 @@
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
-from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, make_hyperparams
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm, Hyperparams, TrainedHyperparams, make_hyperparams
 from policies.idle.find import NO_UPDATE, RULES, Limits, idle_rule
 from policies.packed.envs.make import make_packed_envs
 from policies.packed.initial import new_member
 from policies.packed.make import make_stack
 
-SMALL = {
+SMALL: dict[str, Any] = {
     "ppo": {
         "hidden_sizes": (4,), "num_envs": 4, "train_batch_size": 32, "minibatch_size": 16, "num_epochs": 2, "lr": 1e-2,
     },
@@ -46,7 +47,7 @@ class Case:
     num_iterations: int | None = None
 
 
-def no_update(first, second, **free):
+def no_update(first: bool | float | str | None, second: bool | float | str, **free: Any) -> Case:
     return Case((first, second), {"learning_starts": 1000, **free}, {"learning_starts": 16, **free})
 
 
@@ -180,15 +181,17 @@ ALL = [
 
 
 @functools.cache
-def trained(algorithm, num_iterations, items):
+def trained(
+    algorithm: Algorithm, num_iterations: int, items: tuple[tuple[str, float | str | tuple[int]], ...]
+) -> tuple[NDArray[np.float32], list[tuple[float, int]]]:
     """(online weights, episodes) of a trial in a pack."""
     torch.set_num_threads(1)
-    hyperparams = make_hyperparams(algorithm, dict(items))
+    hyperparams = cast("TrainedHyperparams", make_hyperparams(algorithm, dict(items)))
     env_args = {"max_episode_steps": MAX_EPISODE_STEPS}
     envs = make_packed_envs("CartPole-v1", env_args, hyperparams.num_envs, kind="vectorised")
     stack = make_stack(hyperparams, envs)
     stack.add(new_member("m", hyperparams, 3, envs.observation_space, envs.action_space), 3)
-    episodes = []
+    episodes: list[Any] = []
     for _ in range(num_iterations):
         episodes += stack.train_iteration()["m"].episodes
     member = stack.member("m")
@@ -198,26 +201,26 @@ def trained(algorithm, num_iterations, items):
     return np.concatenate([weights[name].ravel() for name in sorted(weights)]), episodes
 
 
-def largest_difference(algorithm, num_iterations, one, other):
+def largest_difference(algorithm: Algorithm, num_iterations: int, one: dict[str, Any], other: dict[str, Any]) -> float:
     """Of the weights, in learning rates; infinite where the episodes differ."""
     (weights, episodes), (weights2, episodes2) = (
         trained(algorithm, num_iterations, tuple(values.items())) for values in (one, other)
     )
-    return np.abs(weights - weights2).max() / SMALL[algorithm]["lr"] if episodes == episodes2 else np.inf
+    return float(np.abs(weights - weights2).max()) / SMALL[algorithm]["lr"] if episodes == episodes2 else np.inf
 
 
-def limits_of(algorithm, num_iterations):
+def limits_of(algorithm: Algorithm, num_iterations: int) -> Limits:
     num_env_steps = NUM_ENV_STEPS[algorithm] * num_iterations // NUM_ITERATIONS[algorithm]
     return Limits(num_env_steps, num_iterations, MAX_EPISODE_STEPS, is_packed=True)
 
 
 @pytest.mark.parametrize(("algorithm", "name", "number"), ALL)
-def test_what_is_said_to_be_idle_is(algorithm, name, number):
+def test_what_is_said_to_be_idle_is(algorithm: Algorithm, name: str, number: int) -> None:
     rule, case = RULES[algorithm][name][number], CASES[algorithm, name][number]
     most = NUM_ITERATIONS[algorithm]
     num_iterations = case.num_iterations or most
 
-    def holds(values, num_iterations):
+    def holds(values: dict[str, Any], num_iterations: int) -> bool:
         return rule.holds(make_hyperparams(algorithm, values), limits_of(algorithm, num_iterations))
 
     base = SMALL[algorithm] | case.held
@@ -239,14 +242,14 @@ def test_what_is_said_to_be_idle_is(algorithm, name, number):
     assert differs > 0.1 if case.is_close else differs > 0
 
 
-def test_every_hyperparameter_is_in_the_table():
+def test_every_hyperparameter_is_in_the_table() -> None:
     """Whoever adds one must say when it can't act, or that it always does."""
     assert {name: set(table) for name, table in RULES.items()} == {
         name: set(model.model_fields) for name, model in HYPERPARAMS_BY_ALGORITHM.items()
     }
 
 
-def test_every_rule_has_a_case():
+def test_every_rule_has_a_case() -> None:
     assert {key: len(cases) for key, cases in CASES.items()} == {
         (algorithm, name): len(rules) for algorithm, table in RULES.items() for name, rules in table.items() if rules
     }
@@ -255,16 +258,17 @@ def test_every_rule_has_a_case():
 class Recorder:
     """Stands in for hyperparameters, and knows what was asked for."""
 
-    def __init__(self, hyperparams):
-        self.hyperparams, self.seen = hyperparams, set()
+    def __init__(self, hyperparams: Hyperparams) -> None:
+        self.hyperparams = hyperparams
+        self.seen: set[str] = set()
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> float:
         self.seen |= {"target_update_freq", "tau"} if name == "target_update_interval" else {name}
-        return getattr(self.hyperparams, name)
+        return cast("float", getattr(self.hyperparams, name))
 
 
 @pytest.mark.parametrize(("algorithm", "name", "number"), ALL)
-def test_rules_name_what_they_read(algorithm, name, number):
+def test_rules_name_what_they_read(algorithm: Algorithm, name: str, number: int) -> None:
     rule, case = RULES[algorithm][name][number], CASES[algorithm, name][number]
     assert rule.of_value == (name in rule.reads)
     for values in (case.held, case.free or case.held):
@@ -273,7 +277,7 @@ def test_rules_name_what_they_read(algorithm, name, number):
         assert recorder.seen <= set(rule.reads)
 
 
-def test_rules_that_do_not_look_at_the_value_come_first():
+def test_rules_that_do_not_look_at_the_value_come_first() -> None:
     limits = limits_of("dqn", 3)
     values = {**SMALL["dqn"], "learning_starts": 1000, "replay_capacity": 5000}
     assert idle_rule("dqn", "replay_capacity", make_hyperparams("dqn", values), limits) is NO_UPDATE

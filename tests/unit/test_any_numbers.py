@@ -2,29 +2,35 @@
 
 import json
 import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from fake_engine import FakeEngine
 from fake_sweeps import Result, Status
-from synthetic_sweep import make_sweep
+from synthetic_sweep import Synthetic, make_sweep
 from trial_runs import Trial
 
 from analysis.report import build_report
 from analysis.tables import groups_frame, iterations_frame, steps_to_solve_frame, trials_frame
+from tests.narrowing import present
 from tune_jobs.cli.output import show_best, show_evaluation, show_result, show_status, show_sweeps, show_trials
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.live_table import summary_line
 from tune_jobs.sweeps.monitor import SweepMonitor
+from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.status import SweepStatus
 
 VALUES = [math.nan, math.inf, -math.inf, 1.7e308]
 
 
-def spoilt(value):
+def spoilt(value: float) -> Synthetic:
     """A sweep in which every number that may be any is this one."""
     made = make_sweep(points=[{"lr": 0.1}, {"lr": 0.01}], failed=(1,))
 
-    def again(record, **changes):
+    def again(record: Any, **changes: Any) -> Any:
         return type(record).model_validate(record.model_dump() | changes)
 
     scores = {"training_return": value, "evaluation_return": value}
@@ -35,19 +41,19 @@ def spoilt(value):
         for trial in made.trials
     ]
     made.sweep = again(made.sweep, created_at=value, started_at=value, ended_at=value, run_time_s=value)
-    returns = (value, -value, *made.best.confirmation.returns[2:])
-    confirmation = again(made.best.confirmation, returns=returns)
-    random = again(made.best.random, returns=(value,) * len(made.best.random.returns))
+    returns = (value, -value, *present(made.best).confirmation.returns[2:])
+    confirmation = again(present(made.best).confirmation, returns=returns)
+    random = again(present(made.best).random, returns=(value,) * len(present(made.best).random.returns))
     made.best = again(made.best, selection_score=value, confirmation=confirmation, random=random)
     return made
 
 
 @pytest.fixture(params=VALUES, ids=str)
-def made(request):
+def made(request: pytest.FixtureRequest) -> Synthetic:
     return spoilt(request.param)
 
 
-def test_the_report_and_the_tables_are_made(made, tmp_path):
+def test_the_report_and_the_tables_are_made(made: Synthetic, tmp_path: Path) -> None:
     path = build_report(
         tmp_path, target=tmp_path / "report", sweep=made.sweep, trials=made.trials, results=made.results,
         best=made.best, videos={},
@@ -61,16 +67,18 @@ def test_the_report_and_the_tables_are_made(made, tmp_path):
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_everything_is_shown_and_json_is_json(made, tmp_path, capsys, as_json):
+def test_everything_is_shown_and_json_is_json(
+    made: Synthetic, tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
     status = Status(made.sweep, {"completed": 1, "failed": 1}, alive=False)
     result = Result(tmp_path, made.sweep, made.trials, made.best, None, {})
-    shown = [
-        lambda: show_result(result, storage=None, as_json=as_json),
-        lambda: show_sweeps([status], as_json=as_json),
-        lambda: show_status(status, as_json=as_json),
+    shown: list[Callable[[], None]] = [
+        lambda: show_result(cast("SweepResult", result), storage=None, as_json=as_json),
+        lambda: show_sweeps([cast("SweepStatus", status)], as_json=as_json),
+        lambda: show_status(cast("SweepStatus", status), as_json=as_json),
         lambda: show_trials(made.trials, as_json=as_json),
-        lambda: show_best(made.best, as_json=as_json),
-        lambda: show_evaluation(made.best.confirmation, made.best.random, as_json=as_json),
+        lambda: show_best(present(made.best), as_json=as_json),
+        lambda: show_evaluation(present(made.best).confirmation, present(made.best).random, as_json=as_json),
     ]
     for show in shown:
         show()
@@ -80,7 +88,7 @@ def test_everything_is_shown_and_json_is_json(made, tmp_path, capsys, as_json):
             json.loads(out, parse_constant=lambda token: pytest.fail(f"{token} is no JSON"))
 
 
-def test_the_running_sweep_is_shown_and_written_for_tensorboard(made, tmp_path):
+def test_the_running_sweep_is_shown_and_written_for_tensorboard(made: Synthetic, tmp_path: Path) -> None:
     running = [trial.model_copy(update={"status": "running"}) for trial in made.trials]
     monitor = SweepMonitor("mine", running, max_env_steps_per_trial=100_000, max_concurrent=2)
     monitor.update(made.trials[0])
@@ -92,11 +100,11 @@ def test_the_running_sweep_is_shown_and_written_for_tensorboard(made, tmp_path):
     assert list(tmp_path.glob("trials/*/tensorboard/*"))
 
 
-def test_a_trial_with_returns_of_nan_and_infinity_goes_on_and_is_reported(tmp_path):
-    def episodes(iteration):
+def test_a_trial_with_returns_of_nan_and_infinity_goes_on_and_is_reported(tmp_path: Path) -> None:
+    def episodes(iteration: int) -> tuple[float, float]:
         return (VALUES[iteration % 4], 1.0)
 
-    def score(iteration):
+    def score(iteration: int) -> float:
         return VALUES[iteration % 3] if iteration % 2 else float(iteration)
 
     first = Trial(tmp_path, engine=FakeEngine(episodes, raise_at=8), scores=score)

@@ -8,8 +8,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
 
 import apart_runs
 import pytest
@@ -24,18 +27,19 @@ from tune_jobs.process.state import given_back
 from tune_jobs.process.streams import quiet
 from tune_jobs.sweeps import apart
 from tune_jobs.sweeps.interrupted import SweepInterrupted
+from tune_jobs.sweeps.outcome import SweepResult
 
 LIMIT_S = 120
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
-def in_thread(call, *args, **kwargs):
+def in_thread(call: Callable[..., Any], *args: str | Path | dict[str, Any], **kwargs: Any) -> SweepResult:
     """What a call in another thread than the main one returns or raises."""
     with ThreadPoolExecutor(1) as pool:
-        return pool.submit(call, *args, **kwargs).result(LIMIT_S)
+        return cast("SweepResult", pool.submit(call, *args, **kwargs).result(LIMIT_S))
 
 
-def process_state():
+def process_state() -> dict[str, Any]:
     return {
         "descriptors": [os.readlink(f"/proc/self/fd/{number}") for number in range(3)],  # noqa: PTH115
         "environment": dict(os.environ),
@@ -46,14 +50,16 @@ def process_state():
     }
 
 
-def wait_until(condition):
+def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + LIMIT_S
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-def test_a_thread_has_a_sweep_run_by_a_child_and_its_own_process_is_as_before(tmp_path, caplog, monkeypatch):
+def test_a_thread_has_a_sweep_run_by_a_child_and_its_own_process_is_as_before(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # A child that joins a Ray of another test's imports it, and that adds to where it looks for modules.
     monkeypatch.setattr(apart, "address_of_users_ray", lambda: None)
     before = process_state()
@@ -69,7 +75,9 @@ def test_a_thread_has_a_sweep_run_by_a_child_and_its_own_process_is_as_before(tm
     assert caplog.messages == ["one is left out: it"]
 
 
-def test_beside_a_sweep_of_this_process_another_one_has_what_was_there_before(tmp_path, monkeypatch):
+def test_beside_a_sweep_of_this_process_another_one_has_what_was_there_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("RAY_OF_A_SWEEP", "before")
     errors = os.readlink("/proc/self/fd/2")  # noqa: PTH115
     with taking_signals(), given_back(), quiet(tmp_path / "driver.log"):
@@ -82,7 +90,7 @@ def test_beside_a_sweep_of_this_process_another_one_has_what_was_there_before(tm
         assert (seen["variable"], seen["errors"]) == ("before", errors)
 
 
-def test_two_threads_run_their_sweeps_at_the_same_time(tmp_path):
+def test_two_threads_run_their_sweeps_at_the_same_time(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
         one = pool.submit(apart_runs.meets, tmp_path, name="one", other="two")
         two = pool.submit(apart_runs.meets, tmp_path, name="two", other="one")
@@ -100,21 +108,23 @@ def test_two_threads_run_their_sweeps_at_the_same_time(tmp_path):
         ("is killed", CannotRunError, "The process that ran the sweep was ended by signal 9"),
     ],
 )
-def test_what_the_child_raises_is_raised_here(kind, error, message):
+def test_what_the_child_raises_is_raised_here(kind: str, error: type[BaseException], message: str) -> None:
     with pytest.raises(error) as caught:
         in_thread(apart_runs.fails, kind)
     assert type(caught.value) is error
     assert str(caught.value).startswith(message)
     if error is SweepInterrupted:
-        assert caught.value.result == (replace(make_result(), interrupted=True) if kind == "interrupted" else None)
+        assert cast("Any", caught.value).result == (
+            replace(make_result(), interrupted=True) if kind == "interrupted" else None
+        )
 
 
 @pytest.fixture
-def script(tmp_path):
+def script(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
     """Start the script in a group of its own, and wait until its sweeps run."""
     started = []
 
-    def start(how):
+    def start(how: str) -> subprocess.Popen[str]:
         names = ("one", "two", "main")[: 2 + (how == "drives")]
         command = [sys.executable, apart_runs.__file__, str(tmp_path), how]
         process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True)
@@ -130,7 +140,9 @@ def script(tmp_path):
 
 @pytest.mark.parametrize("to_group", [True, False])
 @pytest.mark.parametrize("how", ["waits", "drives"])
-def test_ctrl_c_in_the_main_thread_ends_each_sweep_in_order(script, tmp_path, to_group, how):
+def test_ctrl_c_in_the_main_thread_ends_each_sweep_in_order(
+    script: Callable[[str], subprocess.Popen[str]], tmp_path: Path, to_group: bool, how: str
+) -> None:
     """Once: a terminal sends it to the whole group, which must not be taken for two of them."""
     process = script(how)
     (os.killpg if to_group else os.kill)(process.pid, signal.SIGINT)
@@ -142,7 +154,9 @@ def test_ctrl_c_in_the_main_thread_ends_each_sweep_in_order(script, tmp_path, to
 
 
 @pytest.mark.parametrize("how", ["joins", "ends"])
-def test_sweeps_of_threads_that_nobody_waits_for_end_in_order_with_the_process(script, tmp_path, how):
+def test_sweeps_of_threads_that_nobody_waits_for_end_in_order_with_the_process(
+    script: Callable[[str], subprocess.Popen[str]], tmp_path: Path, how: str
+) -> None:
     """Ctrl-C lets Python forget a thread that is being joined; and threads may be daemons."""
     process = script(how)
     if how == "joins":
@@ -151,7 +165,9 @@ def test_sweeps_of_threads_that_nobody_waits_for_end_in_order_with_the_process(s
     assert {path.name for path in tmp_path.glob("* saved")} == {"one saved", "two saved"}
 
 
-def test_children_end_with_a_parent_that_is_killed(script, tmp_path):
+def test_children_end_with_a_parent_that_is_killed(
+    script: Callable[[str], subprocess.Popen[str]], tmp_path: Path
+) -> None:
     process = script("joins")
     process.kill()
     # The pipe is the children's too: it is closed when all have ended.
@@ -159,10 +175,10 @@ def test_children_end_with_a_parent_that_is_killed(script, tmp_path):
     assert not list(tmp_path.glob("* saved"))
 
 
-def test_what_a_thread_allows_is_that_threads(tmp_path):
+def test_what_a_thread_allows_is_that_threads(tmp_path: Path) -> None:
     inside, may_end = threading.Event(), threading.Event()
 
-    def other():
+    def other() -> tuple[str, ...]:
         with allowed_again():
             allow_modules(["of_the_other"])
             inside.set()
@@ -182,7 +198,7 @@ def test_what_a_thread_allows_is_that_threads(tmp_path):
     assert "of_the_other" not in before
 
 
-def test_a_thread_may_not_launch_a_class_of_the_main_script(tmp_path, monkeypatch):
+def test_a_thread_may_not_launch_a_class_of_the_main_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import gymnasium as gym
 
     walk = type("Walk", (gym.Env,), {"__module__": "__main__"})

@@ -2,6 +2,7 @@
 
 import inspect
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ FUNCTIONS = {name: thing for name in tune_jobs._HOME if inspect.isfunction(thing
 
 # -- what each argument takes, by kinds of values
 
-VALUES = {
+VALUES: dict[str, Any] = {
     "none": [None],
     "flag": [True, False, np.bool_(True)],
     "whole": [3, np.int64(3), np.array(3)],
@@ -68,26 +69,28 @@ CASES = [
 ]
 
 
-def call(name, argument, value):
+def call(name: str, argument: str, value: Any) -> Any:
     function = FUNCTIONS[name]
-    given = {key: "nothing" for key, one in inspect.signature(function).parameters.items() if one.default is one.empty}
+    given: dict[str, Any] = {
+        key: "nothing" for key, one in inspect.signature(function).parameters.items() if one.default is one.empty
+    }
     given |= {"num_samples": 1} if "num_samples" in given else {}
     return function(**{**given, argument: value})
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty folder, in which no sweep is found."""
     monkeypatch.chdir(tmp_path)
 
 
-def test_the_whole_api_is_looked_at():
+def test_the_whole_api_is_looked_at() -> None:
     assert len(FUNCTIONS) == 19
     assert {argument for _, argument in CASES} == set(TAKES)
 
 
 @pytest.mark.parametrize(("name", "argument"), CASES)
-def test_a_value_of_a_wrong_kind_is_refused_by_the_arguments_name(name, argument):
+def test_a_value_of_a_wrong_kind_is_refused_by_the_arguments_name(name: str, argument: str) -> None:
     taken = TAKES[argument] | MORE.get((name, argument), set())
     wrong = [value for kind, values in VALUES.items() if kind not in taken for value in values]
     for value in wrong:
@@ -98,7 +101,7 @@ def test_a_value_of_a_wrong_kind_is_refused_by_the_arguments_name(name, argument
 
 
 @pytest.mark.parametrize(("name", "argument"), CASES)
-def test_a_value_of_the_right_kind_gives_at_most_an_error_of_ours(name, argument):
+def test_a_value_of_the_right_kind_gives_at_most_an_error_of_ours(name: str, argument: str) -> None:
     taken = TAKES[argument] | MORE.get((name, argument), set())
     for kind in sorted(taken - {"class"}):
         for value in VALUES[kind]:
@@ -108,9 +111,9 @@ def test_a_value_of_the_right_kind_gives_at_most_an_error_of_ours(name, argument
                 assert not error.message.startswith("The argument"), value  # noqa: PT017 - any error of ours is right
 
 
-def test_what_is_given_wrong_often_is_told_in_words():
+def test_what_is_given_wrong_often_is_told_in_words() -> None:
     with pytest.raises(SpecError) as caught:
-        tune_jobs.launch(MINIMAL, progress="loud")
+        tune_jobs.launch(MINIMAL, progress="loud")  # type: ignore[arg-type]
     assert str(caught.value) == "The argument progress is 'loud'.\nGive 'auto' or 'none'."
     with pytest.raises(SpecError) as caught:
         tune_jobs.allow_modules("my_envs")
@@ -119,7 +122,7 @@ def test_what_is_given_wrong_often_is_told_in_words():
         tune_jobs.best("x", num_episodes=0)
     assert str(caught.value) == "The argument num_episodes is 0.\nGive a whole number from 1 to 262,144."
     with pytest.raises(SpecError) as caught:
-        tune_jobs.launch(3)
+        tune_jobs.launch(3)  # type: ignore[arg-type]
     path = "a name or path (not empty, each part at most 255 bytes)"
     assert caught.value.hint == f"Give {path} or a mapping or a SweepSpec."
     with pytest.raises(SpecError, match="overrides is 'a=1'"):
@@ -130,26 +133,30 @@ def test_what_is_given_wrong_often_is_told_in_words():
 
 
 @checked
-def example(count: NumEpisodes, seed: Seed | None = None, *, items: "list[int] | None" = None, flag: bool = False):
+def example(
+    count: NumEpisodes, seed: Seed | None = None, *, items: "list[int] | None" = None, flag: bool = False
+) -> tuple[int, int | None, list[int] | None, bool]:
     return count, seed, items, flag
 
 
-def test_numpys_numbers_arrive_as_pythons():
-    given = example(np.int64(3), np.uint8(4), flag=np.bool_(True))
+def test_numpys_numbers_arrive_as_pythons() -> None:
+    given = example(cast("Any", np.int64(3)), cast("Any", np.uint8(4)), flag=cast("Any", np.bool_(True)))
     assert given == (3, 4, None, True)
     assert [type(value) for value in given] == [int, int, type(None), bool]
 
 
-def test_a_checked_function_keeps_its_signature_and_pythons_own_errors():
+def test_a_checked_function_keeps_its_signature_and_pythons_own_errors() -> None:
     assert list(inspect.signature(example).parameters) == ["count", "seed", "items", "flag"]
     with pytest.raises(TypeError, match="count"):
-        example()
+        example()  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="colour"):
-        example(1, colour=2)
+        example(1, colour=2)  # type: ignore[call-arg]
 
 
-def test_numpys_numbers_are_taken_by_the_api(tmp_path):
+def test_numpys_numbers_are_taken_by_the_api(tmp_path: Path) -> None:
     with pytest.raises(TuneJobsError, match="No sweep"):
-        tune_jobs.extend("x", np.int64(3), finish=np.bool_(False))
-    first, _ = tune_jobs.evaluate("random", env_id="CartPole-v1", num_episodes=np.int64(2), first_seed=np.array(5))
+        tune_jobs.extend("x", np.int64(3), finish=np.bool_(False))  # type: ignore[arg-type]
+    first, _ = tune_jobs.evaluate(
+        "random", env_id="CartPole-v1", num_episodes=cast("Any", np.int64(2)), first_seed=cast("Any", np.array(5))
+    )
     assert first.seeds == (5, 6)

@@ -5,10 +5,13 @@ import json
 import math
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from policies.acting.baselines import ConstantPolicy, baseline_policy
 from policies.acting.evaluate import Evaluator, evaluate_policy
@@ -16,22 +19,23 @@ from policies.acting.load import load_policy, policy_from_portable
 from policies.acting.policy import RandomPolicy
 from policies.envs.make import check_env
 from policies.errors import CheckpointError, SpecError
-from policies.hyperparams import ConstantHyperparams, RandomHyperparams
-from policies.portable.file import PolicyNetwork, read_policy, save_policy
+from policies.hyperparams import Algorithm, ConstantHyperparams, RandomHyperparams
+from policies.portable.file import PolicyNetwork, PortablePolicy, read_policy, save_policy
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.store.progress import Progress
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.drive import write_new
 from tune_jobs.training.baseline import BaselineEngine
-from tune_jobs.training.protocol import TrialTask
+from tune_jobs.training.protocol import IterationStats, TrialTask
 from tune_jobs.training.trial_loop import TrialLoop
 
 
-def portable(env_id, hyperparams=None):
+def portable(env_id: str, hyperparams: ConstantHyperparams | RandomHyperparams | None = None) -> PortablePolicy:
     info = check_env(env_id, {})
     return baseline_policy(
         hyperparams or RandomHyperparams(),
@@ -45,15 +49,15 @@ def portable(env_id, hyperparams=None):
 # -- policies
 
 
-def test_a_constant_policy_repeats_its_action_alone_and_in_batches():
+def test_a_constant_policy_repeats_its_action_alone_and_in_batches() -> None:
     policy = ConstantPolicy.for_env("CartPole-v1", {}, 1)
     assert policy.act(np.zeros(4)) == 1
-    assert policy.act(np.zeros((3, 4))).tolist() == [1, 1, 1]
+    assert cast("NDArray[Any]", policy.act(np.zeros((3, 4)))).tolist() == [1, 1, 1]
     box = ConstantPolicy.for_env("Pendulum-v1", {}, (-0.5,))
     action = box.act(np.zeros(3))
-    assert action.dtype == np.float32
-    assert action.tolist() == [-0.5]
-    assert box.act(np.zeros((2, 3))).tolist() == [[-0.5], [-0.5]]
+    assert cast("NDArray[Any]", action).dtype == np.float32
+    assert cast("NDArray[Any]", action).tolist() == [-0.5]
+    assert cast("NDArray[Any]", box.act(np.zeros((2, 3)))).tolist() == [[-0.5], [-0.5]]
 
 
 @pytest.mark.parametrize(
@@ -68,17 +72,19 @@ def test_a_constant_policy_repeats_its_action_alone_and_in_batches():
         ("Pendulum-v1", (math.nan,), "[nan] is none"),
     ],
 )
-def test_an_action_that_the_env_does_not_have_is_refused(env_id, action, words):
+def test_an_action_that_the_env_does_not_have_is_refused(
+    env_id: str, action: int | tuple[float, ...], words: str
+) -> None:
     with pytest.raises(SpecError) as caught:
         ConstantPolicy.for_env(env_id, {}, action)
     assert words in caught.value.message
     assert env_id in caught.value.message
 
 
-def test_the_bounds_themselves_are_actions():
+def test_the_bounds_themselves_are_actions() -> None:
     space = gym.spaces.Box(-0.1, 0.1, (2,), np.float32)  # 0.1 in 32 bits is more than in 64
     assert (
-        ConstantPolicy(space, space, (0.1, -0.1), env_id="x").act(np.zeros(2)).tolist()
+        cast("NDArray[Any]", ConstantPolicy(space, space, (0.1, -0.1), env_id="x").act(np.zeros(2))).tolist()
         == space.high.tolist()[:1] + space.low.tolist()[1:]
     )
 
@@ -92,7 +98,9 @@ def test_the_bounds_themselves_are_actions():
         ("Pendulum-v1", ConstantHyperparams(action=[1.25])),
     ],
 )
-def test_a_baseline_survives_its_file(tmp_path, env_id, hyperparams):
+def test_a_baseline_survives_its_file(
+    tmp_path: Path, env_id: str, hyperparams: ConstantHyperparams | RandomHyperparams
+) -> None:
     saved = portable(env_id, hyperparams)
     save_policy(saved, tmp_path)
     loaded = load_policy(tmp_path)
@@ -104,13 +112,13 @@ def test_a_baseline_survives_its_file(tmp_path, env_id, hyperparams):
     assert (env_id, read_policy(tmp_path).network.layers) == (loaded.env_id, ())
 
 
-def test_random_play_is_the_random_policy_to_the_last_action():
+def test_random_play_is_the_random_policy_to_the_last_action() -> None:
     seeds = range(10)
     ours = evaluate_policy(policy_from_portable(portable("CartPole-v1")), env_id="CartPole-v1", seeds=seeds)
     assert ours == evaluate_policy(RandomPolicy.for_env("CartPole-v1"), env_id="CartPole-v1", seeds=seeds)
 
 
-def test_pushing_left_for_ever_fails_sooner_than_random_play():
+def test_pushing_left_for_ever_fails_sooner_than_random_play() -> None:
     left, random = (
         evaluate_policy(policy, env_id="CartPole-v1", seeds=range(100)).mean_return
         for policy in (ConstantPolicy.for_env("CartPole-v1", {}, 0), RandomPolicy.for_env("CartPole-v1"))
@@ -127,12 +135,12 @@ def test_pushing_left_for_ever_fails_sooner_than_random_play():
         (PolicyNetwork("random", (), action=1), "has the action 1"),
     ],
 )
-def test_a_baseline_that_cannot_act_is_not_written(tmp_path, network, words):
+def test_a_baseline_that_cannot_act_is_not_written(tmp_path: Path, network: PolicyNetwork, words: str) -> None:
     with pytest.raises(CheckpointError, match=words):
         save_policy(dataclasses.replace(portable("CartPole-v1"), network=network), tmp_path)
 
 
-def test_layers_of_a_baseline_are_refused(tmp_path):
+def test_layers_of_a_baseline_are_refused(tmp_path: Path) -> None:
     from policy_factory import make_portable
 
     layers = make_portable("CartPole-v1").network.layers
@@ -143,8 +151,8 @@ def test_layers_of_a_baseline_are_refused(tmp_path):
 # -- trials
 
 
-def make_task(folder, algorithm="random", **changes):
-    values = {
+def make_task(folder: Path, algorithm: Algorithm = "random", **changes: Any) -> TrialTask:
+    values: dict[str, Any] = {
         "hyperparams": {"env_steps_per_iteration": 50},
         "env_id": "CartPole-v1",
         "stop": StopSpec(num_iterations=6),
@@ -157,14 +165,16 @@ def make_task(folder, algorithm="random", **changes):
     )  # fmt: skip
 
 
-def play(task, checkpoint=None, iterations=6):
+def play(
+    task: TrialTask, checkpoint: Path | None = None, iterations: int = 6
+) -> tuple[BaselineEngine, list[IterationStats]]:
     engine = BaselineEngine()
     engine.build(task, checkpoint)
     stats = [engine.train_iteration() for _ in range(iterations)]
     return engine, stats
 
 
-def run_trial(task):
+def run_trial(task: TrialTask) -> Progress:
     with Evaluator(task.env_id, task.env_args, task.evaluation_seeds) as evaluator:
         loop = TrialLoop(task, BaselineEngine(), evaluator)
         loop.open()
@@ -174,7 +184,7 @@ def run_trial(task):
 
 
 @pytest.mark.parametrize("num_envs", [1, 4])
-def test_the_episodes_are_whole_and_their_steps_are_all_counted(tmp_path, num_envs):
+def test_the_episodes_are_whole_and_their_steps_are_all_counted(tmp_path: Path, num_envs: int) -> None:
     task = make_task(tmp_path, hyperparams={"env_steps_per_iteration": 200, "num_envs": num_envs})
     _, stats = play(task, iterations=20)
     episodes = [episode for item in stats for episode in item.episodes]
@@ -187,30 +197,32 @@ def test_the_episodes_are_whole_and_their_steps_are_all_counted(tmp_path, num_en
     assert [item.learner for item in stats] == [{}] * 20
 
 
-def test_the_same_seed_plays_the_same_episodes(tmp_path):
+def test_the_same_seed_plays_the_same_episodes(tmp_path: Path) -> None:
     assert play(make_task(tmp_path))[1] == play(make_task(tmp_path))[1]
     other = dataclasses.replace(make_task(tmp_path), seed=6 * 1024)
     assert play(other)[1] != play(make_task(tmp_path))[1]
 
 
-def test_the_actions_are_drawn_from_the_trials_seed(tmp_path):
+def test_the_actions_are_drawn_from_the_trials_seed(tmp_path: Path) -> None:
     engine, _ = play(make_task(tmp_path), iterations=0)
     expected = RandomPolicy.for_env("CartPole-v1", seed=5 * 1024)
     batch = np.zeros((64, 4))
-    assert engine._policy.act(batch).tolist() == expected.act(batch).tolist()
+    assert (
+        cast("NDArray[Any]", engine._policy.act(batch)).tolist() == cast("NDArray[Any]", expected.act(batch)).tolist()
+    )
 
 
-def test_a_failure_penalty_never_shows_in_the_returns(tmp_path):
+def test_a_failure_penalty_never_shows_in_the_returns(tmp_path: Path) -> None:
     assert play(make_task(tmp_path, failure_penalty=-100.0))[1] == play(make_task(tmp_path))[1]
 
 
-def test_constant_play_repeats_its_action(tmp_path):
+def test_constant_play_repeats_its_action(tmp_path: Path) -> None:
     engine, stats = play(make_task(tmp_path, "constant", hyperparams={"env_steps_per_iteration": 100, "action": 1}))
     assert engine.policy().network.action == 1
     assert {length for item in stats for _, length in item.episodes} <= {8, 9, 10, 11}
 
 
-def test_a_restored_trial_goes_on_with_other_episodes(tmp_path):
+def test_a_restored_trial_goes_on_with_other_episodes(tmp_path: Path) -> None:
     engine, before = play(make_task(tmp_path), iterations=3)
     folder = tmp_path / "3"
     folder.mkdir()
@@ -225,7 +237,7 @@ def test_a_restored_trial_goes_on_with_other_episodes(tmp_path):
         BaselineEngine().build(make_task(tmp_path), folder)
 
 
-def test_a_trial_ends_with_its_last_wanted_episode(tmp_path):
+def test_a_trial_ends_with_its_last_wanted_episode(tmp_path: Path) -> None:
     progress = run_trial(
         make_task(tmp_path, hyperparams={"env_steps_per_iteration": 8}, stop=StopSpec(num_episodes=12))
     )
@@ -237,7 +249,7 @@ def test_a_trial_ends_with_its_last_wanted_episode(tmp_path):
 # -- sweeps
 
 
-def finished_sweep(tmp_path, algorithm, **hyperparams):
+def finished_sweep(tmp_path: Path, algorithm: Algorithm, **hyperparams: int) -> SweepStore:
     """A sweep of one trial, run without Ray Tune."""
     spec = load_spec(
         {
@@ -266,7 +278,7 @@ def finished_sweep(tmp_path, algorithm, **hyperparams):
     return store
 
 
-def test_the_best_of_a_baselines_sweep_is_confirmed_filmed_and_reported(tmp_path):
+def test_the_best_of_a_baselines_sweep_is_confirmed_filmed_and_reported(tmp_path: Path) -> None:
     store = finished_sweep(tmp_path, "constant", action=1)
     best = finish.choose_best(store)
     assert 8 <= best.confirmation.mean_return <= 11 < best.random.mean_return
@@ -280,19 +292,19 @@ def test_the_best_of_a_baselines_sweep_is_confirmed_filmed_and_reported(tmp_path
     assert "A constant action on CartPole-v1" in page
 
 
-def test_random_play_scores_as_the_random_policy_does(tmp_path):
+def test_random_play_scores_as_the_random_policy_does(tmp_path: Path) -> None:
     best = finish.choose_best(finished_sweep(tmp_path, "random"))
     assert best.confirmation.returns == best.random.returns
 
 
-def test_a_baseline_is_not_restored_to_rllib(tmp_path):
+def test_a_baseline_is_not_restored_to_rllib(tmp_path: Path) -> None:
     finished_sweep(tmp_path, "random")
     with pytest.raises(CheckpointError, match="is of the baseline random") as caught:
         sweeps.restore("mine/t0000", storage=tmp_path)
     assert "load_policy" in caught.value.hint
 
 
-def test_baselines_are_evaluated_and_filmed_by_name(tmp_path):
+def test_baselines_are_evaluated_and_filmed_by_name(tmp_path: Path) -> None:
     record, random = sweeps.evaluate("constant", env_id="CartPole-v1", num_episodes=5)
     assert record.policy == "constant action 0"
     assert 8 <= record.mean_return <= 11
@@ -315,7 +327,7 @@ def test_baselines_are_evaluated_and_filmed_by_name(tmp_path):
         ({"source": "mysweep", "action": 1}, "only 'constant' takes one"),
     ],
 )
-def test_what_a_baseline_needs_is_asked_for(arguments, words):
+def test_what_a_baseline_needs_is_asked_for(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(SpecError, match=words):
         sweeps.evaluate(**arguments)
 
@@ -330,7 +342,9 @@ def test_what_a_baseline_needs_is_asked_for(arguments, words):
         ("CartPole-v1", {"resources": {"num_env_runners": 1}}, "plays in one process"),
     ],
 )
-def test_a_plan_refuses_a_constant_action_that_the_env_does_not_have(env, changes, words):
+def test_a_plan_refuses_a_constant_action_that_the_env_does_not_have(
+    env: str, changes: dict[str, dict[str, Any]], words: str
+) -> None:
     with pytest.raises(SpecError) as caught:
         make_plan(load_spec({"env": env, "algorithm": "constant", **changes}), Machine(4))
     assert words in caught.value.message
@@ -338,7 +352,7 @@ def test_a_plan_refuses_a_constant_action_that_the_env_does_not_have(env, change
         assert "--set hyperparams.action=[0.0]" in caught.value.hint
 
 
-def test_the_action_can_be_set_and_searched():
+def test_the_action_can_be_set_and_searched() -> None:
     spec = load_spec({"env": "CartPole-v1", "algorithm": "constant"}, ["hyperparams.action=1"])
     assert [trial.hyperparams["action"] for trial in make_plan(spec, Machine(1)).trials] == [1]
     both = load_spec({"env": "CartPole-v1", "algorithm": "constant", "space": {"action": {"grid": [0, 1]}}})
@@ -347,7 +361,7 @@ def test_the_action_can_be_set_and_searched():
     assert json.loads(json.dumps(make_plan(box, Machine(1)).to_json()))["trials"][0]["hyperparams"]["action"] == [-2.0]
 
 
-def test_playing_a_baseline_needs_neither_ray_nor_torch(tmp_path):
+def test_playing_a_baseline_needs_neither_ray_nor_torch(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path\n"
         "import tune_jobs.training.baseline, tune_jobs.training.trial_loop, policies.acting.baselines\n"

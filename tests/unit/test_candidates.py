@@ -3,16 +3,20 @@
 import json
 import logging
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sweep_folders import make_sweep_folder
 
+from analysis.records import CheckpointRecord
 from analysis.selection import NoUsableTrialError
 from policies.errors import CheckpointError
 from tune_jobs.store.candidates import read_trials
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
 
@@ -20,47 +24,51 @@ SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1"
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory):
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_sweep_folder(tmp_path_factory.mktemp("template") / "mine").folder
 
 
 @pytest.fixture
-def store(template, tmp_path):
+def store(template: Path, tmp_path: Path) -> SweepStore:
     return SweepStore(shutil.copytree(template, tmp_path / "mine"))
 
 
 @pytest.fixture
-def old_store(tmp_path):
+def old_store(tmp_path: Path) -> SweepStore:
     """Written by a version without seals."""
     return SweepStore(shutil.copytree(SAMPLE, tmp_path / "old"))
 
 
-def edit(path, *, sealed=False, **changes):
+def edit(path: Path, *, sealed: bool = False, **changes: float) -> None:
     data = json.loads(path.read_text()) | changes
     if sealed:
         data["sha256"] = seal(data)
     path.write_text(json.dumps(data))
 
 
-def manifest(store, trial_id, iteration):
+def manifest(store: SweepStore, trial_id: str, iteration: int) -> Path:
     return store.trial(trial_id).checkpoint_folder(iteration) / "manifest.json"
 
 
-def chosen(store):
+def chosen(store: SweepStore) -> tuple[str, int, float]:
     best = sweeps.best(store.folder, num_episodes=1)
     return best.checkpoint.trial_id, best.checkpoint.iteration, best.selection_score
 
 
-def warnings_of(caplog):
+def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_the_best_of_an_untouched_sweep_is_chosen_without_a_warning(store, caplog):
+def test_the_best_of_an_untouched_sweep_is_chosen_without_a_warning(
+    store: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
     assert chosen(store) == ("t0003", 6, 36.0)
     assert warnings_of(caplog) == []
 
 
-def test_the_best_of_an_old_sweep_is_chosen_without_a_warning(old_store, caplog):
+def test_the_best_of_an_old_sweep_is_chosen_without_a_warning(
+    old_store: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
     assert old_store.read_best().checkpoint.trial_id == "t0001"
     assert chosen(old_store) == ("t0001", 2, 12.0)
     assert warnings_of(caplog) == []
@@ -68,7 +76,9 @@ def test_the_best_of_an_old_sweep_is_chosen_without_a_warning(old_store, caplog)
 
 @pytest.mark.parametrize("sealed", [False, True])
 @pytest.mark.parametrize("changes", [{"evaluation_return": 924.5}, {"evaluation_return": 36.0, "num_env_steps": 1}])
-def test_an_edited_score_does_not_win(store, caplog, sealed, changes):
+def test_an_edited_score_does_not_win(
+    store: SweepStore, caplog: pytest.LogCaptureFixture, sealed: bool, changes: dict[str, Any]
+) -> None:
     """Sealed by somebody who knows how, it contradicts the results."""
     edit(manifest(store, "t0000", 6), sealed=sealed, **changes)
     assert chosen(store) == ("t0003", 6, 36.0)
@@ -77,19 +87,21 @@ def test_an_edited_score_does_not_win(store, caplog, sealed, changes):
     assert [len(trial.checkpoints) for trial in read_trials(store)] == [1, 2, 2, 2]
 
 
-def test_an_edited_score_of_an_old_sweep_does_not_win(old_store, caplog):
+def test_an_edited_score_of_an_old_sweep_does_not_win(old_store: SweepStore, caplog: pytest.LogCaptureFixture) -> None:
     edit(manifest(old_store, "t0000", 2), evaluation_return=924.5)
     assert chosen(old_store) == ("t0001", 2, 12.0)
     (warning,) = warnings_of(caplog)
     assert "says that it scored 924.5 after 200 env steps; results.jsonl says 2.0 after 200" in warning
 
 
-def test_the_others_of_a_trial_still_compete(store):
+def test_the_others_of_a_trial_still_compete(store: SweepStore) -> None:
     edit(manifest(store, "t0003", 6), evaluation_return=924.5)
     assert chosen(store) == ("t0003", 5, 35.0)
 
 
-def test_results_that_were_edited_leave_their_checkpoint_out_too(store, caplog):
+def test_results_that_were_edited_leave_their_checkpoint_out_too(
+    store: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
     path = store.trial("t0003").results_path
     path.write_text(path.read_text().replace('"evaluation_return":36.0', '"evaluation_return":37.0'))
     assert chosen(store) == ("t0003", 5, 35.0)
@@ -97,12 +109,16 @@ def test_results_that_were_edited_leave_their_checkpoint_out_too(store, caplog):
 
 
 @pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"\xff\n[]\n7\n{}\n")])
-def test_results_that_cannot_be_read_contradict_nothing(store, damage):
+def test_results_that_cannot_be_read_contradict_nothing(
+    store: SweepStore, damage: Callable[[Path], int | None]
+) -> None:
     damage(store.trial("t0003").results_path)
     assert chosen(store) == ("t0003", 6, 36.0)
 
 
-def test_a_winner_whose_files_are_damaged_gives_way_to_the_next(store, caplog):
+def test_a_winner_whose_files_are_damaged_gives_way_to_the_next(
+    store: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
     for iteration in (5, 6):
         folder = store.trial("t0003").checkpoint_folder(iteration)
         (folder / "policy.safetensors").write_bytes(b"")
@@ -113,7 +129,7 @@ def test_a_winner_whose_files_are_damaged_gives_way_to_the_next(store, caplog):
     assert "t0003/checkpoints/000006" in text
 
 
-def test_with_nothing_left_there_is_no_best(store, caplog):
+def test_with_nothing_left_there_is_no_best(store: SweepStore, caplog: pytest.LogCaptureFixture) -> None:
     for path in store.folder.glob("trials/*/checkpoints/*/policy.json"):
         path.write_text("{}")
     with pytest.raises(NoUsableTrialError):
@@ -122,7 +138,7 @@ def test_with_nothing_left_there_is_no_best(store, caplog):
 
 
 @pytest.mark.parametrize("changes", [{"point_index": 1}, {"seed_index": 0, "index": 3}, {"point_index": 77}])
-def test_which_point_a_trial_is_of_follows_from_its_number(store, changes):
+def test_which_point_a_trial_is_of_follows_from_its_number(store: SweepStore, changes: dict[str, Any]) -> None:
     before = [(trial.index, trial.point_index, trial.seed_index) for trial in read_trials(store)]
     edit(store.trial("t0001").record_path, **changes)
     assert [(trial.index, trial.point_index, trial.seed_index) for trial in read_trials(store)] == before
@@ -130,7 +146,9 @@ def test_which_point_a_trial_is_of_follows_from_its_number(store, changes):
     assert chosen(store) == ("t0003", 6, 36.0)
 
 
-def test_an_edited_evaluation_of_the_best_is_not_shown_but_made_anew(store, caplog):
+def test_an_edited_evaluation_of_the_best_is_not_shown_but_made_anew(
+    store: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
     sweeps.best(store.folder, num_episodes=1)
     edit(store.best_folder / "evaluation.json", selection_score=924.5)
     with pytest.raises(CheckpointError, match=r"evaluation\.json is not the best record that was written"):
@@ -141,11 +159,13 @@ def test_an_edited_evaluation_of_the_best_is_not_shown_but_made_anew(store, capl
     assert "evaluation.json" in warnings_of(caplog)[0]
 
 
-def test_a_checkpoint_that_is_pruned_meanwhile_is_no_reason_to_warn(store, caplog, monkeypatch):
+def test_a_checkpoint_that_is_pruned_meanwhile_is_no_reason_to_warn(
+    store: SweepStore, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trial = store.trial("t0003")
     real = type(trial).checkpoint
 
-    def pruned(self, iteration):
+    def pruned(self: TrialStore, iteration: int) -> CheckpointRecord:
         if self.trial_id == "t0003" and iteration == 5:
             shutil.rmtree(self.checkpoint_folder(5))
         return real(self, iteration)

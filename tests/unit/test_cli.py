@@ -3,10 +3,11 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from fake_sweeps import SWEEP, TRIALS, Status, evaluation
+from fake_sweeps import SWEEP, TRIALS, FakeSweeps, RunCommand, Status, evaluation
 
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli.commands import cli
@@ -18,7 +19,7 @@ SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\
 HEAVY = ("ray", "torch", "pandas", "matplotlib", "imageio", "PIL")
 
 
-def options(**given):
+def options(**given: Any) -> dict[str, Any]:
     """What the commands that run trials pass on, unless told otherwise."""
     return {"storage": None, "address": None, "finish": True, "progress": "auto", **given}
 
@@ -63,19 +64,23 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize(("arguments", "call"), COMMANDS)
-def test_commands_pass_their_arguments_on(run, sweeps, arguments, call):
+def test_commands_pass_their_arguments_on(
+    run: RunCommand, sweeps: FakeSweeps, arguments: str, call: tuple[str, tuple[int | str, ...], dict[str, Any]]
+) -> None:
     result = run(*arguments.split())
     assert sweeps.calls == [call]
     assert result.exit_code == (3 if call[0] in ("launch", "resume", "extend") else 0)
 
 
 @pytest.mark.parametrize("arguments", [arguments for arguments, _ in COMMANDS])
-def test_json_is_one_document_on_standard_output_whatever_else_is_printed(run, sweeps, arguments):
+def test_json_is_one_document_on_standard_output_whatever_else_is_printed(
+    run: RunCommand, sweeps: FakeSweeps, arguments: str
+) -> None:
     result = run(*arguments.split(), "--json")
     json.loads(result.stdout, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
 
 
-def test_the_document_of_a_launch_holds_everything(run, sweeps):
+def test_the_document_of_a_launch_holds_everything(run: RunCommand, sweeps: FakeSweeps) -> None:
     document = json.loads(run("launch", "x", "--json").stdout)
     assert document["exit_code"] == 3
     assert document["trials"][1]["training_return"] is None
@@ -85,13 +90,15 @@ def test_the_document_of_a_launch_holds_everything(run, sweeps):
     assert document["artifacts"]["report"].endswith("index.html")
 
 
-def test_numbers_that_json_lacks_become_null():
+def test_numbers_that_json_lacks_become_null() -> None:
     record = to_json(evaluation("x", float("nan"), float("inf")))
     assert record["returns"] == [None, None]
     assert record["mean_return"] is None
 
 
-def test_a_launch_tells_the_winner_the_failures_and_where_all_lies(run, sweeps, tmp_path):
+def test_a_launch_tells_the_winner_the_failures_and_where_all_lies(
+    run: RunCommand, sweeps: FakeSweeps, tmp_path: Path
+) -> None:
     output = run("launch", "x").stdout
     for part in (
         "2 trials: 1 completed, 1 failed",
@@ -110,7 +117,7 @@ def test_a_launch_tells_the_winner_the_failures_and_where_all_lies(run, sweeps, 
         assert part in output
 
 
-def test_an_interrupted_launch_says_how_to_resume_on_its_last_line(run, sweeps):
+def test_an_interrupted_launch_says_how_to_resume_on_its_last_line(run: RunCommand, sweeps: FakeSweeps) -> None:
     sweeps.answers["launch"] = dataclasses.replace(
         sweeps.answers["launch"],
         best=None,
@@ -124,7 +131,7 @@ def test_an_interrupted_launch_says_how_to_resume_on_its_last_line(run, sweeps):
     assert result.stderr.splitlines()[-1].endswith("tune-jobs resume mine --storage 'my sweeps'")
 
 
-def test_trials_are_a_table_in_which_no_value_is_cut_or_taken_for_markup(run, sweeps):
+def test_trials_are_a_table_in_which_no_value_is_cut_or_taken_for_markup(run: RunCommand, sweeps: FakeSweeps) -> None:
     lines = run("trials", "mine").stdout.splitlines()
     failed = next(line for line in lines if "t0000" in line)
     for part in ("failed", "0.1", "64x32", "ValueError: [bold]step[/bold] broke"):
@@ -134,7 +141,7 @@ def test_trials_are_a_table_in_which_no_value_is_cut_or_taken_for_markup(run, sw
         assert part in completed
 
 
-def test_a_sweep_whose_process_is_gone_is_not_called_running(run, sweeps):
+def test_a_sweep_whose_process_is_gone_is_not_called_running(run: RunCommand, sweeps: FakeSweeps) -> None:
     running = SWEEP.model_copy(update={"state": "running"})
     sweeps.answers["status"] = Status(running, {"running": 2}, alive=False)
     assert "interrupted" in run("status", "mine").stdout
@@ -142,12 +149,12 @@ def test_a_sweep_whose_process_is_gone_is_not_called_running(run, sweeps):
     assert "interrupted" not in run("status", "mine").stdout
 
 
-def test_an_empty_storage_is_no_error(run, sweeps):
+def test_an_empty_storage_is_no_error(run: RunCommand, sweeps: FakeSweeps) -> None:
     sweeps.answers["list_sweeps"] = []
     assert "no sweeps" in run("list").stdout
 
 
-def test_evaluations_are_told_beside_random_ones(run, sweeps):
+def test_evaluations_are_told_beside_random_ones(run: RunCommand, sweeps: FakeSweeps) -> None:
     sweeps.answers["evaluate"] = (evaluation("p", 100.0, 190.0), evaluation("random", 20.0))
     output = run("evaluate", "p").stdout
     assert "145.0 ± 45.0 over 2 episodes (100 to 190)" in output
@@ -173,7 +180,7 @@ def test_evaluations_are_told_beside_random_ones(run, sweeps):
         (SweepInterrupted(), 130),
     ],
 )
-def test_errors_end_with_message_hint_and_exit_code(run, sweeps, error, code):
+def test_errors_end_with_message_hint_and_exit_code(run: RunCommand, sweeps: FakeSweeps, error: Any, code: int) -> None:
     sweeps.answers["launch"] = error
     result = run("launch", "x")
     assert result.exit_code == code
@@ -192,7 +199,9 @@ def test_errors_end_with_message_hint_and_exit_code(run, sweeps, error, code):
         ("completed", "Interrupted; all trials are done. Make what is missing with: tune-jobs resume mine"),
     ],
 )
-def test_an_interrupted_sweep_is_shown_as_far_as_it_got(run, sweeps, state, told):
+def test_an_interrupted_sweep_is_shown_as_far_as_it_got(
+    run: RunCommand, sweeps: FakeSweeps, state: str, told: str
+) -> None:
     result = sweeps.answers["launch"]
     sweep = result.sweep.model_copy(update={"state": state})
     result = dataclasses.replace(result, sweep=sweep, interrupted=True, exit_code=130)
@@ -203,7 +212,9 @@ def test_an_interrupted_sweep_is_shown_as_far_as_it_got(run, sweeps, state, told
     assert json.loads(run("launch", "x", "--json").stdout)["exit_code"] == 130
 
 
-def test_an_unexpected_error_is_one_line_and_its_traceback_is_kept(run, sweeps, tmp_path, monkeypatch):
+def test_an_unexpected_error_is_one_line_and_its_traceback_is_kept(
+    run: RunCommand, sweeps: FakeSweeps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     sweeps.answers["best"] = ZeroDivisionError("a bug")
     result = run("best", "mine")
@@ -214,7 +225,7 @@ def test_an_unexpected_error_is_one_line_and_its_traceback_is_kept(run, sweeps, 
     assert "Traceback" in kept.read_text()
 
 
-def test_debug_shows_the_traceback(tmp_path, sweeps):
+def test_debug_shows_the_traceback(tmp_path: Path, sweeps: FakeSweeps) -> None:
     sweeps.answers["best"] = ZeroDivisionError("a bug")
     result = CliRunner().invoke(cli, ["--debug", "best", "mine"])
     assert "Traceback" in result.stderr
@@ -237,7 +248,7 @@ def test_debug_shows_the_traceback(tmp_path, sweeps):
         ["evaluate", "constant", "--env", "CartPole-v1", "--action", "left"],
     ],
 )
-def test_wrong_arguments_are_exit_code_2(run, sweeps, arguments):
+def test_wrong_arguments_are_exit_code_2(run: RunCommand, sweeps: FakeSweeps, arguments: list[str]) -> None:
     result = run(*arguments)
     assert result.exit_code == 2
     assert result.stderr
@@ -245,7 +256,9 @@ def test_wrong_arguments_are_exit_code_2(run, sweeps, arguments):
 
 
 @pytest.mark.parametrize("command", [("trials", "mine"), ("resume", "mine")])
-def test_what_was_damaged_is_told_where_trials_are(run, sweeps, command):
+def test_what_was_damaged_is_told_where_trials_are(
+    run: RunCommand, sweeps: FakeSweeps, command: tuple[str, str]
+) -> None:
     note = "checkpoint 000004 is damaged and kept as damaged/000004; the trial goes on from its start"
     trials = [TRIALS[0], TRIALS[1].model_copy(update={"notes": (note,)})]
     sweeps.answers["trials"] = trials

@@ -7,8 +7,10 @@ import subprocess
 import sys
 import types
 from pathlib import Path
+from typing import Any
 
 import pytest
+from fake_sweeps import RunCommand
 
 from tune_jobs.cli.commands import cli
 from tune_jobs.plan.machine import Machine
@@ -21,7 +23,7 @@ HEAVY = ("ray", "torch", "pandas", "matplotlib", "imageio", "PIL")
 # -- dry runs and bad input, by the real validation
 
 
-def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
+def test_a_dry_run_prints_the_plan_and_writes_nothing(run: RunCommand, tmp_path: Path) -> None:
     result = run("launch", "cartpole-ppo", "--dry-run", "--set", "resources.max_concurrent=1")
     assert result.exit_code == 0
     for part in (
@@ -41,7 +43,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_one_of_a_thing_is_not_called_many(run):
+def test_one_of_a_thing_is_not_called_many(run: RunCommand) -> None:
     one = [f"--set={name}=1" for name in ("stop.num_env_steps", "stop.num_iterations", "stop.num_episodes")]
     Path("one.yaml").write_text("env: CartPole-v1\nalgorithm: ppo\nresources: {max_concurrent: 1}\n")
     lines = run("launch", "one.yaml", "--dry-run", *one).stdout.splitlines()
@@ -49,14 +51,14 @@ def test_one_of_a_thing_is_not_called_many(run):
     assert any("1 episode or 1 env step or 1 iteration or" in line for line in lines)
 
 
-def test_a_dry_run_of_many_trials_shows_the_first_ones(run):
+def test_a_dry_run_of_many_trials_shows_the_first_ones(run: RunCommand) -> None:
     output = run("launch", "cartpole-ppo", "--dry-run", "--set", "num_samples=100").stdout
     assert "t0023" in output
     assert "t0024" not in output
     assert "and 376 more" in output
 
 
-def test_a_dry_run_as_json_holds_spec_and_plan(run):
+def test_a_dry_run_as_json_holds_spec_and_plan(run: RunCommand) -> None:
     document = json.loads(run("launch", "cartpole-ppo", "--dry-run", "--json", "--name", "mine").stdout)
     assert document["spec"]["name"] == "mine"
     assert document["plan"]["num_trials"] == len(document["plan"]["trials"]) == 20
@@ -69,7 +71,7 @@ def test_a_dry_run_as_json_holds_spec_and_plan(run):
     assert packs["trial_ids"][0] == "t0000"
 
 
-def test_a_dry_run_says_what_is_not_packed_and_why(run):
+def test_a_dry_run_says_what_is_not_packed_and_why(run: RunCommand) -> None:
     output = run("launch", "cartpole-ppo", "--dry-run", "--set", "scheduler=hyperband").stdout
     assert "note: No trial is packed, RLlib trains them all: scheduler.type is hyperband" in output
     document = json.loads(run("launch", "cartpole-ppo", "--dry-run", "--json", "--set", "engine=rllib").stdout)
@@ -82,7 +84,7 @@ def test_a_dry_run_says_what_is_not_packed_and_why(run):
 
 
 @pytest.fixture
-def cluster(monkeypatch):
+def cluster(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
     """A stand-in for a cluster, whose machine is `.machine`; `.checked` are the folders its nodes were asked for."""
     found = types.SimpleNamespace(machine=None, checked=[])
     joined = contextlib.nullcontext(found)
@@ -91,13 +93,15 @@ def cluster(monkeypatch):
     return found
 
 
-def test_a_dry_run_says_that_memory_makes_packs_smaller(run, cluster):
+def test_a_dry_run_says_that_memory_makes_packs_smaller(run: RunCommand, cluster: types.SimpleNamespace) -> None:
     cluster.machine = Machine(7, source="the cluster at auto", memory_bytes=2e7)
     output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
     assert "note: Packs are planned smaller: 7 x 3 trials at once may take" in output
 
 
-def test_a_dry_run_for_a_cluster_plans_for_the_clusters_machine(run, cluster, tmp_path):
+def test_a_dry_run_for_a_cluster_plans_for_the_clusters_machine(
+    run: RunCommand, cluster: types.SimpleNamespace, tmp_path: Path
+) -> None:
     cluster.machine = Machine(7, source="the cluster at auto")
     output = run("launch", "cartpole-ppo", "--dry-run", "--address", "auto").stdout
     assert "20 in 7 packs of up to 3, each pack on 1 CPU; the cluster at auto has 7 CPUs" in output
@@ -125,7 +129,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED.values(), ids=REFUSED)
-def test_a_dry_run_refuses_what_a_launch_refuses(run, tmp_path, case):
+def test_a_dry_run_refuses_what_a_launch_refuses(run: RunCommand, tmp_path: Path, case: tuple[str, list[str]]) -> None:
     arguments, parts = case
     for name in ("my sweep.yaml", "übung.yaml", "x.yaml"):
         Path(name).write_text(SMALL)
@@ -143,7 +147,7 @@ def test_a_dry_run_refuses_what_a_launch_refuses(run, tmp_path, case):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_dry_run_leaves_storage_as_it_was(run, tmp_path):
+def test_a_dry_run_leaves_storage_as_it_was(run: RunCommand, tmp_path: Path) -> None:
     Path("x.yaml").write_text(SMALL)
     assert run("launch", "x.yaml", "--dry-run", "--storage", "a/b").exit_code == 0
     Path("sweeps/x").mkdir(parents=True)
@@ -152,7 +156,7 @@ def test_a_dry_run_leaves_storage_as_it_was(run, tmp_path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["sweeps", "x", "x.yaml"]
 
 
-BAD_INPUT = {
+BAD_INPUT: dict[str, tuple[dict[str, Any], int, list[str]]] = {
     "unknown key": (
         {"text": SMALL + "num_sample: 3\n"},
         2,
@@ -207,7 +211,7 @@ BAD_INPUT = {
 
 
 @pytest.mark.parametrize("case", BAD_INPUT)
-def test_bad_input_is_one_clear_message_and_nothing_is_written(run, tmp_path, case):
+def test_bad_input_is_one_clear_message_and_nothing_is_written(run: RunCommand, tmp_path: Path, case: str) -> None:
     given, code, parts = BAD_INPUT[case]
     (tmp_path / "sweep.yaml").write_text(given.get("text", SMALL))
     overrides = ["--set", given["set"]] if "set" in given else []
@@ -223,7 +227,7 @@ def test_bad_input_is_one_clear_message_and_nothing_is_written(run, tmp_path, ca
 # -- presets, schema, speed
 
 
-def test_presets_are_listed_and_printed(run, tmp_path):
+def test_presets_are_listed_and_printed(run: RunCommand, tmp_path: Path) -> None:
     listed = run("presets").stdout
     for word in ("preset", "expected", "env steps", "time on 2 cores"):
         assert word in listed
@@ -241,18 +245,18 @@ def test_presets_are_listed_and_printed(run, tmp_path):
     assert "Did you mean 'cartpole-ppo'?" in missing.stderr
 
 
-def test_the_schema_is_json_with_and_without_asking_for_it(run):
+def test_the_schema_is_json_with_and_without_asking_for_it(run: RunCommand) -> None:
     assert json.loads(run("schema").stdout) == json.loads(run("schema", "--json").stdout)
     assert "properties" in json.loads(run("schema").stdout)
 
 
-def test_every_command_takes_json_and_has_a_one_line_help():
+def test_every_command_takes_json_and_has_a_one_line_help() -> None:
     for name, command in cli.commands.items():
         assert any("--json" in parameter.opts for parameter in command.params), name
         assert command.help, name
 
 
-def test_version_and_help(run):
+def test_version_and_help(run: RunCommand) -> None:
     assert run("--version").stdout.startswith("tune-jobs ")
     assert run("-h").exit_code == 0
     assert "130 interrupted" in " ".join(run("--help").stdout.split())
@@ -262,7 +266,7 @@ def test_version_and_help(run):
     "arguments",
     [["--help"], ["launch", "cartpole-ppo", "--dry-run"], ["launch", "nope", "--dry-run"], ["schema"]],
 )
-def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
+def test_nothing_heavy_is_imported_before_it_is_needed(arguments: list[str]) -> None:
     code = (
         "import sys, tune_jobs.cli.commands\n"
         "try:\n"

@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from signal import Signals
+from typing import TextIO
 
 import pytest
 
@@ -29,7 +31,7 @@ cli.main()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_leaves_nothing_half_made(tmp_path, number):
+def test_a_signal_leaves_nothing_half_made(tmp_path: Path, number: Signals) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, "video", "random", "--env", "CartPole-v1", "--output", str(tmp_path)],
         env={**os.environ, "NUMBER": str(int(number))}, capture_output=True, text=True, check=False,
@@ -39,7 +41,7 @@ def test_a_signal_leaves_nothing_half_made(tmp_path, number):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nohup_means_it(tmp_path):
+def test_nohup_means_it(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, "video", "random", "--env", "CartPole-v1", "--output", str(tmp_path)],
         env={**os.environ, "NUMBER": str(int(signal.SIGHUP))}, capture_output=True, text=True, check=False,
@@ -70,7 +72,7 @@ cli.main()
 """
 
 
-def test_two_hangups_are_one(tmp_path):
+def test_two_hangups_are_one(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", TWICE, "video", "random", "--env", "CartPole-v1", "--output", str(tmp_path)],
         capture_output=True, text=True, check=False,
@@ -100,12 +102,12 @@ cli.main()
 """
 
 
-def run_script(*arguments, stdout):
+def run_script(*arguments: str, stdout: TextIO) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", RUNS, str(Path(__file__).parent), *arguments]
     return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
 
 
-def test_a_sweep_whose_result_nobody_reads_has_not_failed_for_that():
+def test_a_sweep_whose_result_nobody_reads_has_not_failed_for_that() -> None:
     ours, theirs = os.pipe()
     os.close(ours)
     with os.fdopen(theirs, "w") as nobody:
@@ -115,7 +117,7 @@ def test_a_sweep_whose_result_nobody_reads_has_not_failed_for_that():
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
 @pytest.mark.parametrize("command", [["presets"], ["presets", "--json"], ["launch", "cartpole-ppo"]])
-def test_output_that_cannot_be_written_is_said(command):
+def test_output_that_cannot_be_written_is_said(command: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         done = run_script(*command, stdout=full)
     assert done.returncode == 5

@@ -8,7 +8,7 @@ from policies.portable.convolution import convolve, output_shape
 from tests.rounding import assert_rounded
 
 
-def test_a_convolution_by_its_definition():
+def test_a_convolution_by_its_definition() -> None:
     rng = np.random.default_rng(0)
     images = rng.normal(size=(2, 7, 6, 3)).astype(np.float32)
     kernels, bias = rng.normal(size=(4, 3, 3, 3)).astype(np.float32), rng.normal(size=4).astype(np.float32)
@@ -21,19 +21,19 @@ def test_a_convolution_by_its_definition():
         assert_rounded(result[image, row, column, channel], terms.sum(), **limits)
 
 
-def test_sizes_of_a_stack():
+def test_sizes_of_a_stack() -> None:
     # The network of Mnih et al. 2015.
     assert output_shape((84, 84, 4), [(32, 8, 4), (64, 4, 2), (64, 3, 1)]) == (7, 7, 64)
     assert output_shape((5, 9, 1), []) == (5, 9, 1)
 
 
 @pytest.mark.parametrize("shape", [(4,), (), (84, 84), (1, 2, 3, 4)])
-def test_convolutions_need_images(shape):
+def test_convolutions_need_images(shape: tuple[int, ...]) -> None:
     with pytest.raises(SpecError, match=r"conv_filters .*\[\[8, 3, 1\]\].*need images") as caught:
         output_shape(shape, [(8, 3, 1)])
     assert str(tuple(shape)) in caught.value.message
 
 
-def test_a_kernel_larger_than_its_input_is_named():
+def test_a_kernel_larger_than_its_input_is_named() -> None:
     with pytest.raises(SpecError, match=r"conv_filters\[1\] has kernels of 8 x 8.* only 7 x 9"):
         output_shape((16, 20, 3), [(8, 4, 2), (8, 8, 1)])

@@ -4,13 +4,18 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 import pytest
+from click.testing import Result
 
 import tune_jobs
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import drive as driving
 from tune_jobs.sweeps import verbs
@@ -32,11 +37,11 @@ print(json.dumps([created.name, str(created.folder), "ray" in sys.modules, "torc
 
 
 @pytest.fixture
-def runs(monkeypatch):
+def runs(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What would be run in place of trials: the sweeps as they stand when Ray would start."""
     seen = []
 
-    def run_sweep(store, plan, **settings):
+    def run_sweep(store: SweepStore, plan: SweepPlan, **settings: Any) -> SweepResult:
         seen.append((store.read_record(), store.read_trials(), plan, settings))
         return SweepResult(store.folder, store.read_record(), store.read_trials())
 
@@ -45,7 +50,7 @@ def runs(monkeypatch):
     return seen
 
 
-def test_creating_writes_a_sweep_and_starts_nothing(tmp_path):
+def test_creating_writes_a_sweep_and_starts_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, json.dumps(SPEC), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     folder = tmp_path / "mine"
@@ -55,7 +60,7 @@ def test_creating_writes_a_sweep_and_starts_nothing(tmp_path):
     assert [status.sweep.started_at, status.sweep.run_time_s] == [None, 0.0]
 
 
-def test_a_created_sweep_is_listed_and_shown_as_not_begun(tmp_path, run):
+def test_a_created_sweep_is_listed_and_shown_as_not_begun(tmp_path: Path, run: Callable[..., Result]) -> None:
     tune_jobs.create(SPEC, name="mine", storage=tmp_path)
     assert [status.sweep.state for status in tune_jobs.list_sweeps(tmp_path)] == ["created"]
     for command in (("status", "mine"), ("list",)):
@@ -65,7 +70,9 @@ def test_a_created_sweep_is_listed_and_shown_as_not_begun(tmp_path, run):
 
 
 @pytest.mark.parametrize("begin", [tune_jobs.drive, tune_jobs.resume])
-def test_driving_a_created_sweep_begins_what_a_launch_would(tmp_path, runs, begin):
+def test_driving_a_created_sweep_begins_what_a_launch_would(
+    tmp_path: Path, runs: list[Any], begin: Callable[..., Any]
+) -> None:
     tune_jobs.launch(SPEC, name="mine", storage=tmp_path / "launched", progress="none")
     created = tune_jobs.create(SPEC, name="mine", storage=tmp_path)
     begin(created.folder, progress="none")
@@ -76,7 +83,9 @@ def test_driving_a_created_sweep_begins_what_a_launch_would(tmp_path, runs, begi
     assert launched[0].state == "running"
 
 
-def test_a_sweep_is_driven_where_it_was_created_for_unless_somebody_says_where(tmp_path, monkeypatch):
+def test_a_sweep_is_driven_where_it_was_created_for_unless_somebody_says_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = []
     monkeypatch.setattr(verbs, "resume", lambda _, **settings: asked.append(settings["address"]))
     monkeypatch.setattr(driving, "connected", lambda *_: pytest.fail("nothing is joined"))
@@ -91,15 +100,15 @@ def test_a_sweep_is_driven_where_it_was_created_for_unless_somebody_says_where(t
         tune_jobs.create(SPEC, storage=tmp_path, address="nonsense")
 
 
-def test_a_cluster_does_not_change_the_trials(tmp_path):
+def test_a_cluster_does_not_change_the_trials(tmp_path: Path) -> None:
     folders = [tune_jobs.create(SPEC, storage=tmp_path, address=address).folder for address in (None, "auto")]
     here, there = (SweepStore(folder).read_trials() for folder in folders)
     assert here == there
 
 
 @pytest.mark.parametrize("error", [SpecError, CannotRunError, KeyboardInterrupt])
-def test_what_cannot_be_created_leaves_nothing(tmp_path, monkeypatch, error):
-    def write(*_):
+def test_what_cannot_be_created_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type) -> None:
+    def write(*_: object) -> None:
         raise error("broken")
 
     monkeypatch.setattr("tune_jobs.sweeps.create.write_new", write)
@@ -108,7 +117,7 @@ def test_what_cannot_be_created_leaves_nothing(tmp_path, monkeypatch, error):
     assert not (tmp_path / "sweeps").exists()
 
 
-def test_a_machine_that_is_too_small_is_refused_at_once(tmp_path, monkeypatch):
+def test_a_machine_that_is_too_small_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tune_jobs.sweeps.create.machine_here", lambda: Machine(0))
     with pytest.raises(CannotRunError, match="has 0"):
         tune_jobs.create(SPEC, storage=tmp_path / "sweeps")
@@ -116,8 +125,10 @@ def test_a_machine_that_is_too_small_is_refused_at_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("error", "begins"), [(CannotRunError("no"), True), (SweepInterrupted(), False)])
-def test_a_launch_in_a_thread_leaves_nothing_if_nothing_began(tmp_path, monkeypatch, error, begins):
-    def drive(folder, **_):
+def test_a_launch_in_a_thread_leaves_nothing_if_nothing_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: CannotRunError | SweepInterrupted, begins: bool
+) -> None:
+    def drive(folder: Path, **_: object) -> None:
         store = SweepStore(folder)
         if begins:
             store.write_record(store.read_record().model_copy(update={"state": "interrupted"}))
@@ -129,7 +140,7 @@ def test_a_launch_in_a_thread_leaves_nothing_if_nothing_began(tmp_path, monkeypa
     assert (tmp_path / "mine").exists() == begins
 
 
-def test_threads_create_sweeps_of_one_name_beside_each_other(tmp_path):
+def test_threads_create_sweeps_of_one_name_beside_each_other(tmp_path: Path) -> None:
     before = dict(os.environ)
     with ThreadPoolExecutor(3) as pool:
         made = list(pool.map(lambda _: tune_jobs.create(SPEC, storage=tmp_path), range(3)))

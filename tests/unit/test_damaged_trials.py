@@ -4,6 +4,9 @@ import errno
 import json
 import math
 import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_engine import FakeClock, FakeEngine
@@ -11,18 +14,20 @@ from trial_runs import Trial
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError
+from tests.narrowing import present
 from tune_jobs.store import record_files
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.trial_store import TrialStore
+from tune_jobs.training.protocol import TrialTask
 
 
-def flip_a_bit(path):
+def flip_a_bit(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
-DAMAGES = {
+DAMAGES: dict[str, Callable[[Path], object]] = {
     "one bit": flip_a_bit,
     "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "empty": lambda path: path.write_bytes(b""),
@@ -32,7 +37,9 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("name", ["engine.json", "policy.safetensors", "manifest.json"])
-def test_a_damaged_latest_checkpoint_is_set_aside_and_the_one_before_is_taken(tmp_path, name, damage):
+def test_a_damaged_latest_checkpoint_is_set_aside_and_the_one_before_is_taken(
+    tmp_path: Path, name: str, damage: str
+) -> None:
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(6)
     store = TrialStore(tmp_path, "t0000")
     bad = store.checkpoint_folder(6)
@@ -55,7 +62,7 @@ def test_a_damaged_latest_checkpoint_is_set_aside_and_the_one_before_is_taken(tm
     assert again.kept[-1] == 8
 
 
-def test_a_trial_all_of_whose_checkpoints_are_damaged_begins_again_and_says_so(tmp_path):
+def test_a_trial_all_of_whose_checkpoints_are_damaged_begins_again_and_says_so(tmp_path: Path) -> None:
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
     store = TrialStore(tmp_path, "t0000")
     for iteration in store.checkpoint_iterations():
@@ -68,7 +75,7 @@ def test_a_trial_all_of_whose_checkpoints_are_damaged_begins_again_and_says_so(t
     assert all("the trial goes on from its start" in note for note in notes)
 
 
-def test_a_checkpoint_set_aside_twice_is_kept_twice(tmp_path):
+def test_a_checkpoint_set_aside_twice_is_kept_twice(tmp_path: Path) -> None:
     for _ in range(2):
         trial = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3})
         trial.run_to(4)
@@ -78,12 +85,12 @@ def test_a_checkpoint_set_aside_twice_is_kept_twice(tmp_path):
     assert trial.store.latest_damaged() == 4
 
 
-def test_a_whole_checkpoint_that_does_not_restore_is_an_error_and_no_older_one_is_taken(tmp_path):
+def test_a_whole_checkpoint_that_does_not_restore_is_an_error_and_no_older_one_is_taken(tmp_path: Path) -> None:
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
 
     class OfOtherValues(FakeEngine):
-        def build(self, task, checkpoint):
-            raise CheckpointError(f"{checkpoint.name} is of other hyperparameters.")
+        def build(self, task: TrialTask, checkpoint: Path | None) -> None:
+            raise CheckpointError(f"{present(checkpoint).name} is of other hyperparameters.")
 
     with pytest.raises(CheckpointError, match="000004 is of other hyperparameters"):
         Trial(tmp_path, engine=OfOtherValues())
@@ -97,7 +104,7 @@ def test_a_whole_checkpoint_that_does_not_restore_is_an_error_and_no_older_one_i
 
 @pytest.mark.parametrize("junk", [b'{"iterat{"iteration": 3}', b"\x00\xff\x80", b'{"score": 1}', b"7"])
 @pytest.mark.parametrize("place", [1, 3, 4, 6])
-def test_a_line_that_cannot_be_read_is_set_aside_and_the_trial_goes_on(tmp_path, place, junk):
+def test_a_line_that_cannot_be_read_is_set_aside_and_the_trial_goes_on(tmp_path: Path, place: int, junk: bytes) -> None:
     """Before the checkpoint, at it, after it, at the end: the rest of the curve stays."""
     first = Trial(tmp_path, scores=lambda i: -float(i), checkpoints={"every_iterations": 4, "keep": 1})
     first.run_to(6)
@@ -122,7 +129,9 @@ def test_a_line_that_cannot_be_read_is_set_aside_and_the_trial_goes_on(tmp_path,
 
 
 @pytest.mark.parametrize("steps", [399, 10**12])
-def test_a_trial_goes_on_from_the_env_steps_of_its_checkpoint_whatever_the_line_of_it_says(tmp_path, steps):
+def test_a_trial_goes_on_from_the_env_steps_of_its_checkpoint_whatever_the_line_of_it_says(
+    tmp_path: Path, steps: int
+) -> None:
     """Else it would be over at once."""
     first = Trial(tmp_path, checkpoints={"every_iterations": 4, "keep": 1})
     first.run_to(4)
@@ -136,7 +145,7 @@ def test_a_trial_goes_on_from_the_env_steps_of_its_checkpoint_whatever_the_line_
 
 
 @pytest.mark.parametrize("time_s", [math.nan, math.inf, -1e9])
-def test_a_time_that_is_none_neither_ends_a_trial_nor_keeps_it_from_ending(tmp_path, time_s):
+def test_a_time_that_is_none_neither_ends_a_trial_nor_keeps_it_from_ending(tmp_path: Path, time_s: float) -> None:
     first = Trial(tmp_path, clock=FakeClock(1.0), checkpoints={"every_iterations": 4, "keep": 1})
     first.run_to(4)
     *before, last = first.results
@@ -147,7 +156,7 @@ def test_a_time_that_is_none_neither_ends_a_trial_nor_keeps_it_from_ending(tmp_p
     assert before[-1].time_s < progress.time_s < 1_000
 
 
-def test_results_that_are_gone_leave_a_hole_and_no_other_count(tmp_path):
+def test_results_that_are_gone_leave_a_hole_and_no_other_count(tmp_path: Path) -> None:
     first = Trial(tmp_path, checkpoints={"every_iterations": 4, "keep": 1})
     first.run_to(4)
     first.store.results_path.unlink()
@@ -157,13 +166,15 @@ def test_results_that_are_gone_leave_a_hole_and_no_other_count(tmp_path):
     assert [(record.iteration, record.num_env_steps) for record in again.results] == [(5, 500), (6, 600)]
 
 
-def fill(path):
+def fill(path: Path) -> None:
     path.touch()
     os.truncate(path, 2**31)
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, fill])
-def test_results_that_are_no_file_are_set_aside_and_the_trial_goes_on(tmp_path, make):
+def test_results_that_are_no_file_are_set_aside_and_the_trial_goes_on(
+    tmp_path: Path, make: Callable[[Path], Any]
+) -> None:
     first = Trial(tmp_path, checkpoints={"every_iterations": 4, "keep": 1})
     first.run_to(4)
     path = first.store.results_path
@@ -177,13 +188,13 @@ def test_results_that_are_no_file_are_set_aside_and_the_trial_goes_on(tmp_path, 
     assert (path.parent / "damaged" / "results.jsonl").exists()
 
 
-def rewritten(folder, **changes):
+def rewritten(folder: Path, **changes: int) -> None:
     """A manifest that says something else, with its seal."""
     manifest = json.loads((folder / "manifest.json").read_text()) | changes
     (folder / "manifest.json").write_text(json.dumps(manifest | {"sha256": seal(manifest)}))
 
 
-def test_a_checkpoint_of_a_newer_version_is_not_damaged(tmp_path):
+def test_a_checkpoint_of_a_newer_version_is_not_damaged(tmp_path: Path) -> None:
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
     store = TrialStore(tmp_path, "t0000")
     rewritten(store.checkpoint_folder(4), format_version=FORMAT_VERSION + 1)
@@ -197,7 +208,7 @@ def test_a_checkpoint_of_a_newer_version_is_not_damaged(tmp_path):
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, fill])
-def test_a_checkpoint_whose_manifest_is_no_file_is_damaged(tmp_path, make):
+def test_a_checkpoint_whose_manifest_is_no_file_is_damaged(tmp_path: Path, make: Callable[[Path], Any]) -> None:
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
     manifest = TrialStore(tmp_path, "t0000").checkpoint_folder(4) / "manifest.json"
     manifest.unlink()
@@ -205,12 +216,12 @@ def test_a_checkpoint_whose_manifest_is_no_file_is_damaged(tmp_path, make):
     assert Trial(tmp_path).engine.builds == ["000003"]
 
 
-def test_a_checkpoint_that_cannot_be_read_now_is_not_set_aside(tmp_path, monkeypatch):
+def test_a_checkpoint_that_cannot_be_read_now_is_not_set_aside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk or a network that fails for a moment is no damage: the retry may find it whole."""
     Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3}).run_to(4)
-    store, read = TrialStore(tmp_path, "t0000"), record_files.read_regular
+    store, read = TrialStore(tmp_path, "t0000"), record_files.read_regular  # type: ignore[attr-defined]
 
-    def fails(path):
+    def fails(path: Path) -> bytes:
         if path == store.checkpoint_folder(4) / "manifest.json":
             raise OSError(errno.EIO, "Input/output error")
         return read(path)

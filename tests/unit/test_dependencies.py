@@ -4,9 +4,14 @@ import ast
 import re
 import sys
 import tomllib
+from collections.abc import Sequence
 from importlib.metadata import packages_distributions
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
+
+from tests.narrowing import present
 
 OWN = {"policies", "analysis", "tune_jobs"}
 # Why something is required that nothing here imports; by distribution.
@@ -23,19 +28,19 @@ NOT_IMPORTED = {
 
 
 @pytest.fixture(scope="module")
-def project(pytestconfig):
-    return tomllib.loads((pytestconfig.rootpath / "pyproject.toml").read_text())["project"]
+def project(pytestconfig: pytest.Config) -> dict[str, Any]:
+    return cast("dict[str, Any]", tomllib.loads((pytestconfig.rootpath / "pyproject.toml").read_text())["project"])
 
 
-def normal(name):
+def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def distributions(requirements):
-    return {normal(re.match(r"[\w.-]+", text).group()) for text in requirements}
+def distributions(requirements: Sequence[str]) -> set[str]:
+    return {normal(present(re.match(r"[\w.-]+", text)).group()) for text in requirements}
 
 
-def imported(folder, names):
+def imported(folder: Path, names: Sequence[str] | set[str]) -> set[str]:
     """Distributions of other people's that the Python files of some folders import at their top level or anywhere."""
     tops = set()
     for path in [path for name in names for path in (folder / name).rglob("*.py")]:
@@ -43,7 +48,7 @@ def imported(folder, names):
             if isinstance(node, ast.Import):
                 tops |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
-                tops.add(node.module.partition(".")[0])
+                tops.add(present(node.module).partition(".")[0])
             elif isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip":
                 tops.add(ast.literal_eval(node.args[0]).partition(".")[0])
     local = {path.stem for path in (folder / "tests").rglob("*.py")} | {"tests"} | OWN
@@ -52,14 +57,16 @@ def imported(folder, names):
     return {normal(known[top][0]) if top in known else normal(top) for top in others}
 
 
-def test_the_code_imports_what_it_requires_and_requires_what_it_imports(project, pytestconfig):
+def test_the_code_imports_what_it_requires_and_requires_what_it_imports(
+    project: dict[str, Any], pytestconfig: pytest.Config
+) -> None:
     required = distributions(project["dependencies"])
     optional = project["optional-dependencies"]
     used = imported(pytestconfig.rootpath, OWN)
     assert used - distributions([*optional["tpe"], *optional["box2d"]]) == required
 
 
-def test_the_extras_are_what_the_tests_import(project, pytestconfig):
+def test_the_extras_are_what_the_tests_import(project: dict[str, Any], pytestconfig: pytest.Config) -> None:
     optional = project["optional-dependencies"]
     extras = distributions([text for name in ("test", "docs", "bench", "box2d", "tpe") for text in optional[name]])
     used = imported(pytestconfig.rootpath, ["tests"])
@@ -67,7 +74,7 @@ def test_the_extras_are_what_the_tests_import(project, pytestconfig):
     assert extras - used == set(NOT_IMPORTED)
 
 
-def test_the_constraints_pin_everything_that_is_required(project, pytestconfig):
+def test_the_constraints_pin_everything_that_is_required(project: dict[str, Any], pytestconfig: pytest.Config) -> None:
     lines = (pytestconfig.rootpath / "constraints.txt").read_text().splitlines()
     pinned = {normal(line.partition("==")[0]) for line in lines if "==" in line}
     optional = project["optional-dependencies"]

@@ -5,10 +5,13 @@ import shutil
 import signal
 import sys
 from pathlib import Path
+from signal import Signals
+from typing import Any, cast
 
 import pytest
 
 from policies.errors import CannotRunError
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.process.interruption import current
@@ -26,7 +29,7 @@ SPEC = {"env": "CartPole-v1", "algorithm": "ppo", "space": {"lr": {"uniform": [1
 
 
 @pytest.fixture
-def store(tmp_path):
+def store(tmp_path: Path) -> SweepStore:
     """A sweep whose trials are all done, two days ago."""
     spec = load_spec(SPEC)
     store = SweepStore(tmp_path / "mine")
@@ -39,14 +42,14 @@ def store(tmp_path):
     return store
 
 
-def test_a_finished_sweep_is_not_written_anew_when_nothing_is_run(store):
+def test_a_finished_sweep_is_not_written_anew_when_nothing_is_run(store: SweepStore) -> None:
     before = {path: path.read_bytes() for path in store.folder.rglob("*.json")}
     result = sweeps.resume(store.folder, finish=False, progress="none")
     assert (result.interrupted, result.exit_code, result.sweep.ended_at) == (False, 0, 2_000.0)
     assert {path: path.read_bytes() for path in store.folder.rglob("*.json")} == before
 
 
-def test_finishing_anew_changes_no_times(store, monkeypatch):
+def test_finishing_anew_changes_no_times(store: SweepStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finish, "make_report", lambda store, _: store.report_folder / "index.html")
     before = store.record_path.read_bytes()
     # No trial has a checkpoint: there is no winner, and the report says so.
@@ -56,12 +59,13 @@ def test_finishing_anew_changes_no_times(store, monkeypatch):
 
 
 def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with_all_of_its_trials(
-    store, tmp_path, monkeypatch
-):
+    store: SweepStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What a kill leaves is what is there before each write."""
-    write, left = sweep_store.write_atomic, []
+    write = sweep_store.write_atomic  # type: ignore[attr-defined]
+    left: list[Path] = []
 
-    def watched(path, data):
+    def watched(path: Path, data: str) -> None:
         left.append(shutil.copytree(store.folder, tmp_path / f"killed-{len(left)}" / "mine"))
         write(path, data)
 
@@ -69,11 +73,11 @@ def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with
     with monkeypatch.context() as patch:
         for module in (sweep_store, trial_store):
             patch.setattr(module, "write_atomic", watched)
-        all_ids = sweeps.extend(store.folder, 2, progress="none")
+        all_ids = cast("Any", sweeps.extend(store.folder, 2, progress="none"))
     assert all_ids == ["t0000", "t0001", "t0002", "t0003"]
     assert len(left) >= 3
     before, *during = left
-    assert sweeps.resume(before, progress="none") == all_ids[:2]
+    assert cast("Any", sweeps.resume(before, progress="none")) == all_ids[:2]
     for folder in during:
         assert sweeps.resume(folder, progress="none") == all_ids
         record = SweepStore(folder).read_record()
@@ -83,10 +87,12 @@ def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("step", ["choose_best", "make_report"])
-def test_a_signal_while_the_rest_is_made_ends_it_and_keeps_the_state(store, monkeypatch, number, step):
+def test_a_signal_while_the_rest_is_made_ends_it_and_keeps_the_state(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch, number: Signals, step: str
+) -> None:
     made = []
 
-    def interrupt(*_):
+    def interrupt(*_: object) -> None:
         os.kill(os.getpid(), number)
         made.append("more")
 
@@ -95,14 +101,14 @@ def test_a_signal_while_the_rest_is_made_ends_it_and_keeps_the_state(store, monk
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.resume(store.folder, progress="none")
     assert made == []
-    assert caught.value.result.exit_code == 130
-    assert "report" not in caught.value.result.artifacts
+    assert present(caught.value.result).exit_code == 130
+    assert "report" not in present(caught.value.result).artifacts
     assert (store.read_record().state, store.read_record().ended_at) == ("completed", 2_000.0)
     assert not store.is_driven()
 
 
-def test_stop_ends_what_comes_after_the_trials_too(store, monkeypatch):
-    def choose(store, **_):
+def test_stop_ends_what_comes_after_the_trials_too(store: SweepStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    def choose(store: SweepStore, **_: object) -> None:
         store.request_stop()
         raise CannotRunError("No best.")
 
@@ -114,7 +120,7 @@ def test_stop_ends_what_comes_after_the_trials_too(store, monkeypatch):
     assert not store.stop_requested()
 
 
-def pend(store):
+def pend(store: SweepStore) -> None:
     """Let a trial wait, and the sweep say that it runs: its driver was killed."""
     trial = store.read_trials()[1]
     store.trial(trial.trial_id).write_record(trial.model_copy(update={"status": "running"}))
@@ -122,10 +128,12 @@ def pend(store):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(store, monkeypatch, number):
+def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch, number: Signals
+) -> None:
     pend(store)
 
-    def connect(*_):
+    def connect(*_: object) -> None:
         os.kill(os.getpid(), number)  # the first one asks
         assert store.stop_requested()
         os.kill(os.getpid(), signal.SIGTERM if number == signal.SIGHUP else number)  # a SIGHUP is never the second
@@ -133,7 +141,7 @@ def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(store, monkeypat
     monkeypatch.setattr(driving, "connected", connect)
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.resume(store.folder, progress="none")
-    assert caught.value.result.interrupted
+    assert present(caught.value.result).interrupted
     assert store.read_record().state == "interrupted"
     assert store.read_record().ended_at is not None
     assert [trial.status for trial in store.read_trials()] == ["completed", "paused"]
@@ -142,10 +150,12 @@ def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(store, monkeypat
 
 
 @pytest.mark.parametrize("error", [CannotRunError("no Ray"), ValueError("a bug")])
-def test_a_run_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch, error):
+def test_a_run_that_fails_leaves_no_sweep_that_says_it_runs(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch, error: ValueError | CannotRunError
+) -> None:
     pend(store)
 
-    def connect(*_):
+    def connect(*_: object) -> None:
         raise error
 
     monkeypatch.setattr(driving, "connected", connect)
@@ -155,7 +165,9 @@ def test_a_run_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch, 
     assert not store.is_driven()
 
 
-def test_a_plan_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch):
+def test_a_plan_that_fails_leaves_no_sweep_that_says_it_runs(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pend(store)
     monkeypatch.setattr("tune_jobs.sweeps.resume.machine_here", lambda: Machine(0))
     with pytest.raises(CannotRunError, match="has 0"):
@@ -163,8 +175,8 @@ def test_a_plan_that_fails_leaves_no_sweep_that_says_it_runs(store, monkeypatch)
     assert store.read_record().state == "interrupted"
 
 
-def test_a_signal_before_a_new_sweep_is_there_leaves_nothing(tmp_path, monkeypatch):
-    def plan(*_, **__):
+def test_a_signal_before_a_new_sweep_is_there_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def plan(*_: object, **__: object) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(sweeps, "make_plan", plan)
@@ -174,7 +186,9 @@ def test_a_signal_before_a_new_sweep_is_there_leaves_nothing(tmp_path, monkeypat
     assert not (tmp_path / "storage").exists()
 
 
-def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(tmp_path, monkeypatch):
+def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sweeps, "write_new", lambda *_: os.kill(os.getpid(), signal.SIGHUP))
     with pytest.raises(SweepInterrupted):
         sweeps.launch(SPEC, name="new", storage=tmp_path / "storage", progress="none")
@@ -183,11 +197,13 @@ def test_a_signal_while_a_new_sweeps_records_are_written_leaves_nothing(tmp_path
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("where", ["SweepStore.take", "SweepMonitor", "connected"])
-def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp_path, monkeypatch, number, where):
+def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: Signals, where: str
+) -> None:
     """Before the trials are prepared, too: "nothing was kept" would be wrong."""
     original = SweepStore.take if where == "SweepStore.take" else getattr(driving, where)
 
-    def interrupt(*args, **kwargs):
+    def interrupt(*args: Any, **kwargs: Any) -> Any:
         if current()._ask is not None:
             os.kill(os.getpid(), number)  # the first one asks
             raise KeyboardInterrupt
@@ -204,21 +220,25 @@ def test_a_signal_once_a_new_sweeps_records_are_written_keeps_it_and_says_so(tmp
     assert SweepStore(tmp_path / "new").read_record().state == "interrupted"
 
 
-def test_a_signal_while_a_sweeps_new_trials_are_written_is_not_forgotten(store, monkeypatch):
+def test_a_signal_while_a_sweeps_new_trials_are_written_is_not_forgotten(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pend(store)
     monkeypatch.setattr("tune_jobs.sweeps.resume._add_trials", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(driving, "connected", lambda *_: pytest.fail("the trials must not begin"))
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.resume(store.folder, progress="none")
-    assert caught.value.result.sweep.state == "interrupted"
+    assert present(caught.value.result).sweep.state == "interrupted"
 
 
 @pytest.mark.parametrize("error", [CannotRunError("no Ray"), KeyboardInterrupt()])
-def test_a_run_leaves_no_file_of_its_sweep_open(store, monkeypatch, error):
+def test_a_run_leaves_no_file_of_its_sweep_open(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch, error: KeyboardInterrupt | CannotRunError
+) -> None:
     """Also while somebody holds what was raised, or nobody has collected garbage."""
     pend(store)
 
-    def connect(*_):
+    def connect(*_: object) -> None:
         raise error
 
     monkeypatch.setattr(driving, "connected", connect)
@@ -229,11 +249,11 @@ def test_a_run_leaves_no_file_of_its_sweep_open(store, monkeypatch, error):
     assert caught.value is not None
 
 
-def test_a_loop_over_launches_stops_at_the_first_signal(store, monkeypatch):
+def test_a_loop_over_launches_stops_at_the_first_signal(store: SweepStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finish, "choose_best", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
     runs = []
 
-    def loop():
+    def loop() -> None:
         for _ in range(3):
             runs.append(1)
             try:
@@ -246,18 +266,18 @@ def test_a_loop_over_launches_stops_at_the_first_signal(store, monkeypatch):
     assert runs == [1]
 
 
-def test_the_plan_asks_the_ray_that_is_there(monkeypatch):
+def test_the_plan_asks_the_ray_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without importing ray where nobody has."""
     monkeypatch.delitem(sys.modules, "ray", raising=False)
     here = driving.machine_here()
     assert here.source == "this machine"
-    ray = type(sys)("ray")
+    ray: Any = type(sys)("ray")
     monkeypatch.setitem(sys.modules, "ray", ray)
     assert driving.machine_here().source == "this machine"  # it is only being imported
     ray.is_initialized = lambda: False
     assert driving.machine_here().source == "this machine"
     ray.is_initialized = lambda: True
-    connected_ray = type(sys)("tune_jobs.ray_tune.connected_ray")
+    connected_ray: Any = type(sys)("tune_jobs.ray_tune.connected_ray")
     connected_ray.is_of_a_sweep = lambda: False
     connected_ray.connected_machine = lambda: Machine(1, source="the connected one")
     monkeypatch.setitem(sys.modules, "tune_jobs.ray_tune.connected_ray", connected_ray)
@@ -267,14 +287,14 @@ def test_the_plan_asks_the_ray_that_is_there(monkeypatch):
 @pytest.mark.parametrize(
     ("cpus", "hint"), [(1, "Set resources.num_cpus to at most 1, or free some."), (0, "Free some.")]
 )
-def test_a_hint_asks_for_no_trial_without_a_cpu(cpus, hint):
+def test_a_hint_asks_for_no_trial_without_a_cpu(cpus: int, hint: str) -> None:
     spec = load_spec({**SPEC, "resources": {"num_cpus": 2}})
     with pytest.raises(CannotRunError) as caught:
         make_plan(spec, Machine(cpus, more="free some"))
     assert caught.value.hint == hint
 
 
-def test_modules_of_a_sweep_are_not_allowed_to_the_next(tmp_path, monkeypatch):
+def test_modules_of_a_sweep_are_not_allowed_to_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A class that was given to a launch is of that sweep alone."""
     import odd_envs
 
@@ -282,7 +302,7 @@ def test_modules_of_a_sweep_are_not_allowed_to_the_next(tmp_path, monkeypatch):
 
     monkeypatch.setattr(env_modules, "_allowed", set())
 
-    def plan(*_, **__):
+    def plan(*_: object, **__: object) -> None:
         raise CannotRunError(str(env_modules.allowed_modules()))
 
     monkeypatch.setattr(sweeps, "make_plan", plan)

@@ -6,13 +6,16 @@ import importlib.util
 import json
 import shutil
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 from pack_plans import plan
 from spec_errors import MINIMAL
 
+from policies.acting.evaluate import Evaluator
 from policies.errors import CheckpointError, SpecError
+from tests.narrowing import present
 from tune_jobs import restore
 from tune_jobs.plan.engine_choice import choose_engines
 from tune_jobs.spec import engines
@@ -32,22 +35,22 @@ OLD = {
 }
 
 
-def named(path):
+def named(path: str) -> list[ast.stmt]:
     """What of a module's own is called so, without running it."""
     module, _, name = path.partition(":")
-    source = Path(importlib.util.find_spec(module).origin).read_text()
+    source = Path(present(present(importlib.util.find_spec(module)).origin)).read_text()
     return [node for node in ast.parse(source).body if getattr(node, "name", None) == name]
 
 
 @pytest.mark.parametrize("engine", ENGINES, ids=lambda engine: engine.name)
-def test_an_entry_names_what_is_there(engine):
+def test_an_entry_names_what_is_there(engine: Engine) -> None:
     for path in filter(None, (engine.constructor, engine.restore)):
         assert len(named(path)) == 1, path
     methods = {node.name for node in named(engine.constructor)[0].body if isinstance(node, ast.FunctionDef)}
     assert ("add" in methods, "build" in methods) == (engine.trains_many, not engine.trains_many)
 
 
-def test_every_algorithm_has_an_engine_that_takes_what_no_other_can():
+def test_every_algorithm_has_an_engine_that_takes_what_no_other_can() -> None:
     for algorithm in ("ppo", "dqn", "random", "constant"):
         assert not engines.engines_for(algorithm)[-1].lacks
 
@@ -55,13 +58,13 @@ def test_every_algorithm_has_an_engine_that_takes_what_no_other_can():
 # -- a fourth one
 
 
-def restored(checkpoint):
+def restored(checkpoint: Path) -> str:
     """What the fourth engine restores to: no RLlib is loaded for it here."""
     return f"restored from {checkpoint.name}"
 
 
 @pytest.fixture
-def fourth(monkeypatch):
+def fourth(monkeypatch: pytest.MonkeyPatch) -> Engine:
     """One more entry, and first of all."""
     entry = Engine(
         name="scripted", title="the script", trained="scripted", about="does as a script says",
@@ -72,7 +75,7 @@ def fourth(monkeypatch):
     return entry
 
 
-def test_a_further_engine_is_one_entry_and_its_module(tmp_path, fourth):
+def test_a_further_engine_is_one_entry_and_its_module(tmp_path: Path, fourth: Engine) -> None:
     made = plan(num_samples=1, seeds_per_point=1)
     assert (made.engines, made.packs, made.notes) == ({"scripted": 1}, None, ())
     store = SweepStore(tmp_path / "mine")
@@ -82,7 +85,7 @@ def test_a_further_engine_is_one_entry_and_its_module(tmp_path, fourth):
     task = dataclasses.replace(make_task(store.folder, stop={"num_iterations": 2}), engine=record.engine)
     engine = make_engine(record.engine)
     assert isinstance(engine, FakeEngine)
-    loop = TrialLoop(task, engine, FakeEvaluator(), FakeClock())
+    loop = TrialLoop(task, engine, cast("Evaluator", FakeEvaluator()), FakeClock())
     loop.open()
     while loop.advance(0.0).status == "running":
         pass
@@ -93,7 +96,7 @@ def test_a_further_engine_is_one_entry_and_its_module(tmp_path, fourth):
     assert restore("mine/t0000", storage=tmp_path) == "restored from 000002"
 
 
-def test_what_a_further_engine_cannot_hold_goes_to_the_others_and_it_is_told_why(fourth):
+def test_what_a_further_engine_cannot_hold_goes_to_the_others_and_it_is_told_why(fourth: Engine) -> None:
     made = plan(scheduler="hyperband")
     assert made.engines == {"rllib": 10}
     why = "scheduler.type is hyperband, which"
@@ -106,13 +109,13 @@ def test_what_a_further_engine_cannot_hold_goes_to_the_others_and_it_is_told_why
     spec = load_spec({**MINIMAL, "space": {"conv_filters": {"grid": [None, [[4, 8, 4]]]}}})
     wish = spec.model_copy(update={"engine": "scripted"})
     with pytest.raises(SpecError, match=r"engine is scripted, but here cannot be: conv_filters .*, and scripts have"):
-        choose_engines(wish, None, [("t0000", None)], {}, lambda index: "here")
+        choose_engines(wish, cast("Any", None), [("t0000", None)], {}, lambda index: "here")
 
 
 # -- records and manifests
 
 
-def test_a_trial_goes_on_with_the_engine_of_its_record():
+def test_a_trial_goes_on_with_the_engine_of_its_record() -> None:
     assert engine_on_record("packed", "dqn").name == "packed"
     # Records named none when there were baselines already, and reads as rllib.
     assert engine_on_record("rllib", "constant").name == "baseline"
@@ -121,21 +124,21 @@ def test_a_trial_goes_on_with_the_engine_of_its_record():
 
 
 @pytest.fixture
-def checkpoint(tmp_path):
+def checkpoint(tmp_path: Path) -> Path:
     task = dataclasses.replace(make_task(tmp_path, stop={"num_iterations": 1}), engine="packed")
-    loop = TrialLoop(task, FakeEngine(), FakeEvaluator(), FakeClock())
+    loop = TrialLoop(task, FakeEngine(), cast("Evaluator", FakeEvaluator()), FakeClock())
     loop.open()
     assert loop.advance(0.0).status == "completed"
     return SweepStore(tmp_path).trial("t0000").checkpoint_folder(1)
 
 
-def edit(checkpoint, *, sealed, **changes):
+def edit(checkpoint: Path, *, sealed: bool, **changes: Any) -> None:
     path = checkpoint / "manifest.json"
     data = json.loads(path.read_text()) | changes
     path.write_text(json.dumps(data | ({"sha256": seal(data)} if sealed else {})))
 
 
-def test_the_seal_of_a_manifest_covers_the_engine(checkpoint):
+def test_the_seal_of_a_manifest_covers_the_engine(checkpoint: Path) -> None:
     verify_checkpoint(checkpoint)
     assert read_engine_name(checkpoint) == engine_of_checkpoint(checkpoint).name == "packed"
     edit(checkpoint, sealed=False, engine="rllib")
@@ -144,19 +147,20 @@ def test_the_seal_of_a_manifest_covers_the_engine(checkpoint):
             read(checkpoint)
 
 
-def test_an_engine_that_is_no_name_or_not_known_is_refused(checkpoint):
+def test_an_engine_that_is_no_name_or_not_known_is_refused(checkpoint: Path) -> None:
     edit(checkpoint, sealed=True, engine="jax")
     verify_checkpoint(checkpoint)
     with pytest.raises(CheckpointError, match=r"manifest of checkpoint .*000001 names the engine 'jax'"):
         engine_of_checkpoint(checkpoint)
-    for value in (7, ["packed"], {}):
+    values: tuple[Any, ...] = (7, ["packed"], {})
+    for value in values:
         edit(checkpoint, sealed=True, engine=value)
         with pytest.raises(CheckpointError, match=r"engine is .*, not a name"):
             verify_checkpoint(checkpoint)
 
 
 @pytest.mark.parametrize("name", OLD)
-def test_a_manifest_of_before_is_told_by_what_its_folder_holds(tmp_path, name):
+def test_a_manifest_of_before_is_told_by_what_its_folder_holds(tmp_path: Path, name: str) -> None:
     folder = shutil.copytree(OLD[name], tmp_path / "000002")
     verify_checkpoint(folder)
     assert "engine" not in json.loads((folder / "manifest.json").read_text())

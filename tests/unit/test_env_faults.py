@@ -1,11 +1,15 @@
 """Environments that raise what ends processes, or give numbers that are none: one trial fails, and says why."""
 
+from __future__ import annotations
+
 import dataclasses
 import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,6 +31,9 @@ from policies.errors import EnvError
 from policies.packed.evaluation import evaluate_many
 from tune_jobs.training.baseline import BaselineEngine
 
+if TYPE_CHECKING:
+    from policies.packed.envs.scalar import ScalarEnvs
+
 __all__ = ["make", "own_modules"]
 
 FAULTY = "odd_envs:Faulty"
@@ -34,7 +41,7 @@ NUMBERS = {"nan": "NaN", "inf": "infinite", "-inf": "minus infinity", "1e39": r"
 
 
 @pytest.fixture(autouse=True)
-def in_a_trial(monkeypatch):
+def in_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a trial's process, where signals are noted; none came."""
     monkeypatch.setattr(env_faults, "_notes_signals", True)
     monkeypatch.setattr(env_faults, "_signalled", False)
@@ -65,7 +72,9 @@ STEPS = (
     [("scalar", *case) for case in STEPS] + [("processes", *STEPS[number]) for number in (0, 1, 4, 9)],
 )
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")
-def test_a_faulty_env_fails_its_member_alone(make, kind, fault, words):
+def test_a_faulty_env_fails_its_member_alone(
+    make: Callable[..., ScalarEnvs], kind: str, fault: dict[str, str], words: str
+) -> None:
     envs = make(FAULTY, kind, env_args={**fault, "action": 1}, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
     alone = make(FAULTY, "scalar", members={"a": 1, "c": 3})
     for index in range(12):
@@ -89,7 +98,9 @@ def test_a_faulty_env_fails_its_member_alone(make, kind, fault, words):
         ({"number": "nan"}, r"observation from reset\(\), at the beginning of an episode of .* was NaN"),
     ],
 )
-def test_a_reset_that_goes_wrong_makes_no_member(make, kind, fault, words):
+def test_a_reset_that_goes_wrong_makes_no_member(
+    make: Callable[..., ScalarEnvs], kind: str, fault: dict[str, str], words: str
+) -> None:
     args = {"where": "reset", "seed": 13, **fault}
     envs = make(FAULTY, kind, num_envs=2, env_args=args, members={"a": 2}, num_processes=2)
     with pytest.raises(EnvError, match=words):
@@ -103,7 +114,7 @@ def test_a_reset_that_goes_wrong_makes_no_member(make, kind, fault, words):
 
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
-def test_an_env_that_cannot_be_closed_harms_nobody(make, kind):
+def test_an_env_that_cannot_be_closed_harms_nobody(make: Callable[..., ScalarEnvs], kind: str) -> None:
     args = {"where": "close", "raises": "SystemExit"}
     envs = make(FAULTY, kind, env_args=args, members={"a": 1, "b": 2}, num_processes=2)
     go_on(envs)
@@ -114,13 +125,16 @@ def test_an_env_that_cannot_be_closed_harms_nobody(make, kind):
 
 
 @pytest.mark.parametrize("name", RAISED)
-def test_a_constructor_may_raise_anything(name):
-    for make_one in (make_env, lambda *args: make_vector_env(*args, 2)):
+def test_a_constructor_may_raise_anything(name: str) -> None:
+    makers: tuple[Callable[..., object], ...] = (make_env, lambda *args: make_vector_env(*args, 2))
+    for make_one in makers:
         with pytest.raises(EnvError, match=f"cannot be made.*{name}"):
             make_one(FAULTY, {"where": "init", "raises": name})
 
 
-def test_the_message_names_the_line_in_the_env_and_not_in_what_is_around_or_inside_it(make):
+def test_the_message_names_the_line_in_the_env_and_not_in_what_is_around_or_inside_it(
+    make: Callable[..., ScalarEnvs],
+) -> None:
     envs = make("odd_envs:Deep", "scalar", members={"a": 1})
     go_on(envs)
     with pytest.raises(EnvError, match=r"JSONDecodeError: .* \(/.*/odd_envs\.py:\d+ in parse\)"):
@@ -132,7 +146,7 @@ def test_the_message_names_the_line_in_the_env_and_not_in_what_is_around_or_insi
 
 @pytest.mark.parametrize("name", RAISED)
 @pytest.mark.parametrize("where", ["reset", "step"])
-def test_a_vector_env_fails_as_scalar_ones_do(name, where):
+def test_a_vector_env_fails_as_scalar_ones_do(name: str, where: str) -> None:
     envs = CheckedEnvs(make_vector_env(FAULTY, {"where": where, "raises": name}, 2), FAULTY)
     with pytest.raises(EnvError, match=rf"{FAULTY} raised an error in {where}\(\): {name}") as caught:
         step_vector(envs, 3)
@@ -141,7 +155,7 @@ def test_a_vector_env_fails_as_scalar_ones_do(name, where):
 
 @pytest.mark.parametrize("number", NUMBERS)
 @pytest.mark.parametrize("where", ["reward", "observation"])
-def test_a_vector_env_says_what_is_not_finite(number, where):
+def test_a_vector_env_says_what_is_not_finite(number: str, where: str) -> None:
     args = {"where": where, "number": number, "action": 1}
     envs = CheckedEnvs(make_vector_env(FAULTY, args, 2), FAULTY)
     # Seven steps, one that resets, and two of the next episode.
@@ -151,24 +165,24 @@ def test_a_vector_env_says_what_is_not_finite(number, where):
         envs.step(np.array([0, 1]))
 
 
-def step_vector(envs, num_steps):
+def step_vector(envs: CheckedEnvs, num_steps: int) -> None:
     envs.reset(seed=5)
     for _ in range(num_steps):
         envs.step(np.zeros(2, dtype=np.int64))
 
 
-class Vectorised(gym.vector.VectorEnv):
+class Vectorised(gym.vector.VectorEnv[Any, Any, Any]):
     """Its steps return what it is given."""
 
-    def __init__(self, num_envs, returned):
+    def __init__(self, num_envs: int, returned: tuple[Any, ...]) -> None:
         self.num_envs, self.returned = num_envs, returned
         self.single_observation_space = gym.spaces.Box(-1, 1, (3,))
         self.single_action_space = gym.spaces.Discrete(2)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         return [[0, 0, 0]] * self.num_envs, {"x": 5}
 
-    def step(self, actions):
+    def step(self, actions: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         return self.returned
 
 
@@ -182,7 +196,7 @@ ROWS = np.zeros((2, 3), np.float32)
         (ROWS, np.array([[1], [2]]), np.array([[0], [1]]), np.zeros((2, 1)), None),
     ],
 )
-def test_what_a_vectorised_version_returns_is_arrays(returned):
+def test_what_a_vectorised_version_returns_is_arrays(returned: tuple[Any, ...]) -> None:
     envs = CheckedEnvs(Vectorised(2, returned), "Mine-v0")
     observations, _ = envs.reset()
     assert observations.shape == (2, 3)
@@ -202,15 +216,15 @@ def test_what_a_vectorised_version_returns_is_arrays(returned):
         ((ROWS, [1, 2], [0, 0], "no", {}), "truncated of shape .* and dtype <U2"),
     ],
 )
-def test_what_a_vectorised_version_returns_wrong_is_told(returned, told):
+def test_what_a_vectorised_version_returns_wrong_is_told(returned: tuple[Any, ...], told: str) -> None:
     envs = CheckedEnvs(Vectorised(2, returned), "Mine-v0")
     envs.reset()
     with pytest.raises(EnvError, match=f"The vectorised Mine-v0 returned {told}"):
         envs.step([0, 0])
 
 
-def test_whole_rewards_do_not_cut_off_a_penalty():
-    returned = (ROWS, np.array([1, 2]), np.array([False, True]), np.array([False, False]), {})
+def test_whole_rewards_do_not_cut_off_a_penalty() -> None:
+    returned: tuple[Any, ...] = (ROWS, np.array([1, 2]), np.array([False, True]), np.array([False, False]), {})
     envs = FailurePenalty(Vectorised(2, returned), FailureRule(), -0.5)
     assert envs.step([0, 0])[1].tolist() == [1.0, -0.5]
 
@@ -224,7 +238,7 @@ FAULTS = [{"raises": name} for name in RAISED] + [
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: "-".join(fault.values()))
-def test_greedy_episodes_say_what_the_env_did(fault):
+def test_greedy_episodes_say_what_the_env_did(fault: dict[str, str]) -> None:
     words = fault.get("raises") or NUMBERS[fault["number"]]
     for policy in (make_policy(FAULTY), RandomPolicy.for_env(FAULTY)):
         with pytest.raises(EnvError, match=rf"(?s){FAULTY}.*{words}"):
@@ -234,7 +248,7 @@ def test_greedy_episodes_say_what_the_env_did(fault):
     assert all(isinstance(result, EnvError) for result in results)
 
 
-def test_an_evaluator_whose_envs_cannot_be_closed_is_closed():
+def test_an_evaluator_whose_envs_cannot_be_closed_is_closed() -> None:
     evaluator = Evaluator(FAULTY, {"where": "close", "raises": "SystemExit"}, [5])
     assert evaluator.run(make_policy(FAULTY)).lengths == (7,)
     evaluator.close()
@@ -244,7 +258,7 @@ def test_an_evaluator_whose_envs_cannot_be_closed_is_closed():
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: "-".join(fault.values()))
-def test_a_baseline_s_trial_says_what_the_env_did(tmp_path, fault):
+def test_a_baseline_s_trial_says_what_the_env_did(tmp_path: Path, fault: dict[str, str]) -> None:
     task = dataclasses.replace(make_task(tmp_path), algorithm="random", env_id=FAULTY, env_args=fault)
     engine = BaselineEngine()
     engine.build(task, None)
@@ -274,7 +288,7 @@ print("raised", *envs.step(np.zeros(1, int)).errors, flush=True)
 ENV = """
 import os, signal, sys
 import gymnasium as gym, numpy as np
-class Env(gym.Env):
+class Env(gym.Env[Any, Any]):
     observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
     def __init__(self, signal): self.signal = signal
     def reset(self, *, seed=None, options=None): return np.zeros(1, np.float32), {}
@@ -287,7 +301,7 @@ class Env(gym.Env):
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 5), ("SIGINT", -2), ("none", 0)])
-def test_a_signal_to_the_process_is_no_fault_of_the_env(tmp_path, name, code):
+def test_a_signal_to_the_process_is_no_fault_of_the_env(tmp_path: Path, name: str, code: int) -> None:
     (tmp_path / "signalling.py").write_text(ENV)
     paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
     child = subprocess.run(
@@ -298,7 +312,7 @@ def test_a_signal_to_the_process_is_no_fault_of_the_env(tmp_path, name, code):
     assert child.stdout == ("raised a\n" if name == "none" else "")
 
 
-def test_ctrl_c_in_the_process_of_whoever_launched_is_ctrl_c(monkeypatch):
+def test_ctrl_c_in_the_process_of_whoever_launched_is_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_faults, "_notes_signals", False)
     with pytest.raises(KeyboardInterrupt):
         evaluate_policy(make_policy(FAULTY), env_id=FAULTY, env_args={"raises": "KeyboardInterrupt"}, seeds=[5])
@@ -306,7 +320,7 @@ def test_ctrl_c_in_the_process_of_whoever_launched_is_ctrl_c(monkeypatch):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
-def test_numbers_are_looked_at_in_every_precision(dtype):
+def test_numbers_are_looked_at_in_every_precision(dtype: type) -> None:
     assert is_sound(np.array([-1, np.finfo(np.float16).max], dtype))
     for value in (np.nan, np.inf, -np.inf):
         assert not is_sound(np.array([0, value], dtype))

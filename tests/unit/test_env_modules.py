@@ -3,9 +3,13 @@
 import json
 import re
 import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
+from click.testing import Result
 
 from analysis.records import SweepRecord
 from policies.envs import modules as env_modules
@@ -27,7 +31,7 @@ import gymnasium as gym
 import numpy as np
 
 
-class Walk(gym.Env):
+class Walk(gym.Env[Any, Any]):
     metadata = {"render_modes": []}
 
     def __init__(self, length=3):
@@ -56,7 +60,7 @@ for version in (1, 2):
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch):
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder with modules, of which none is allowed, that is the current one and not on the path."""
     monkeypatch.setattr(env_modules, "_allowed", set())
     monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
@@ -75,7 +79,7 @@ def own(tmp_path, monkeypatch):
         del gym.registry[env_id]
 
 
-def test_a_module_is_imported_only_once_it_is_allowed(own):
+def test_a_module_is_imported_only_once_it_is_allowed(own: Path) -> None:
     with pytest.raises(SpecError, match="'own_walks' is not allowed") as caught:
         import_allowed("own_walks:Walk")
     assert "--allow-module own_walks" in caught.value.hint
@@ -85,13 +89,13 @@ def test_a_module_is_imported_only_once_it_is_allowed(own):
     assert allowed_modules() == ("own_walks",)
 
 
-def test_the_environment_variable_allows_for_other_processes(own, monkeypatch):
+def test_the_environment_variable_allows_for_other_processes(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, "own_package.inner, own_walks,")
     assert allowed_modules() == ("own_package.inner", "own_walks")
     assert import_allowed("own_package.inner:THING") == 3
 
 
-def test_a_package_brings_its_submodules_but_no_name_that_begins_alike(own):
+def test_a_package_brings_its_submodules_but_no_name_that_begins_alike(own: Path) -> None:
     allow_modules(["own_package"])
     assert import_allowed("own_package.inner:THING") == 3
     allow_modules(["own_walk"])
@@ -99,14 +103,14 @@ def test_a_package_brings_its_submodules_but_no_name_that_begins_alike(own):
         import_allowed("own_walks:Walk")
 
 
-def test_a_submodule_alone_brings_no_other(own):
+def test_a_submodule_alone_brings_no_other(own: Path) -> None:
     allow_modules(["own_package.other"])
     with pytest.raises(SpecError, match="not allowed"):
         import_allowed("own_package.inner:THING")
 
 
 @pytest.mark.parametrize("name", ["own_walks.py", "own walks", "", "a..b", "a:b", "1a", ".a", "a/b"])
-def test_what_is_no_modules_name_cannot_be_allowed(own, name):
+def test_what_is_no_modules_name_cannot_be_allowed(own: Path, name: str) -> None:
     with pytest.raises(SpecError, match="not the name of a Python module"):
         allow_modules(["own_walks", name])
     assert allowed_modules() == ()
@@ -125,14 +129,14 @@ def test_what_is_no_modules_name_cannot_be_allowed(own, name):
         ("own_walks:Walk.step", "does not name something", "module:Name"),
     ],
 )
-def test_what_cannot_be_imported_says_why(own, path, words, hint):
+def test_what_cannot_be_imported_says_why(own: Path, path: str, words: str, hint: str) -> None:
     allow_modules(["own_nowhere", "own_broken", "own_raising", "own_walks"])
     with pytest.raises(SpecError, match=words) as caught:
         import_allowed(path)
     assert hint in caught.value.hint
 
 
-def test_an_env_of_an_allowed_module_keeps_its_module_in_its_id(own):
+def test_an_env_of_an_allowed_module_keeps_its_module_in_its_id(own: Path) -> None:
     with pytest.raises(EnvError, match=r"'own_walks:OwnWalk-v1' names a module.*not allowed"):
         make_env("own_walks:OwnWalk-v1")
     allow_modules(["own_walks"])
@@ -143,7 +147,7 @@ def test_an_env_of_an_allowed_module_keeps_its_module_in_its_id(own):
     assert [one.unwrapped.length for one in env.unwrapped.envs] == [5, 5]
 
 
-def test_an_env_class_of_an_allowed_module_needs_no_registration(own):
+def test_an_env_class_of_an_allowed_module_needs_no_registration(own: Path) -> None:
     allow_modules(["own_walks"])
     info = check_env("own_walks:Walk", {"max_episode_steps": 2, "length": 7}, "ppo")
     assert (info.env_id, info.threshold, info.max_episode_steps) == ("own_walks:Walk", None, 2)
@@ -155,13 +159,13 @@ def test_an_env_class_of_an_allowed_module_needs_no_registration(own):
 
 
 @pytest.mark.parametrize(("name", "guess"), [("Wlak", "Walk"), ("NoEnv", ""), ("OwnWalk-v7", "OwnWalk-v"), ("", "")])
-def test_a_name_that_is_no_env_of_the_module_is_refused(own, name, guess):
+def test_a_name_that_is_no_env_of_the_module_is_refused(own: Path, name: str, guess: str) -> None:
     allow_modules(["own_walks"])
     with pytest.raises(EnvError, match=f"neither registers an environment '{name}'.*{guess}"):
         make_env(f"own_walks:{name}")
 
 
-def test_a_class_becomes_its_path_and_allows_its_module(own):
+def test_a_class_becomes_its_path_and_allows_its_module(own: Path) -> None:
     allow_modules(["own_walks"])
     walk = import_allowed("own_walks:Walk")
     allow_modules([])
@@ -172,7 +176,7 @@ def test_a_class_becomes_its_path_and_allows_its_module(own):
     assert load_source({"env": walk, "algorithm": "ppo"}).env.id == "own_walks:Walk"
 
 
-def test_an_rl_module_by_python_call_is_named_and_allowed(own):
+def test_an_rl_module_by_python_call_is_named_and_allowed(own: Path) -> None:
     spec = load_source({"env": "CartPole-v1", "algorithm": "ppo"}, rl_module="own_package.inner:Net")
     assert spec.rl_module == "own_package.inner:Net"
     assert modules_of(spec) == allowed_modules() == ("own_package.inner",)
@@ -182,8 +186,8 @@ def test_an_rl_module_by_python_call_is_named_and_allowed(own):
     assert allowed_modules() == ()
 
 
-def test_a_class_that_no_other_process_finds_is_refused(own, monkeypatch):
-    class Local(gym.Env):
+def test_a_class_that_no_other_process_finds_is_refused(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Local(gym.Env[Any, Any]):
         pass
 
     with pytest.raises(SpecError, match=r"Local is defined in a function or class") as caught:
@@ -198,7 +202,7 @@ def test_a_class_that_no_other_process_finds_is_refused(own, monkeypatch):
     assert allowed_modules() == ()
 
 
-def test_the_folders_of_imported_modules_are_known(own):
+def test_the_folders_of_imported_modules_are_known(own: Path) -> None:
     allow_modules(["own_walks", "own_package.inner", "own_nowhere", "json"])
     assert str(own) not in module_folders()
     import_allowed("own_walks:Walk")
@@ -206,7 +210,7 @@ def test_the_folders_of_imported_modules_are_known(own):
     assert module_folders().count(str(own)) == 1
 
 
-def test_a_sweep_json_from_before_there_were_allowed_modules_is_read():
+def test_a_sweep_json_from_before_there_were_allowed_modules_is_read() -> None:
     record = SweepRecord(
         name="old", state="completed", spec={"env": {"id": "CartPole-v1", "args": {"max_episode_steps": 9}},
         "algorithm": "ppo"}, evaluation_seeds=(1,), confirmation_seeds=(2,), num_trials=1, created_at=0.0,
@@ -219,7 +223,7 @@ def test_a_sweep_json_from_before_there_were_allowed_modules_is_read():
     assert (spec.env.wrapped_args, spec.env.failure_penalty, spec.rl_module) == ({"max_episode_steps": 9}, None, None)
 
 
-def test_the_command_line_allows_what_a_sweep_file_cannot(own, run):
+def test_the_command_line_allows_what_a_sweep_file_cannot(own: Path, run: Callable[..., Result]) -> None:
     (own / "own_walks.py").write_text(f"{SOURCE}\nprint('a word on standard output')\n")
     (own / "sweep.yaml").write_text("env: own_walks:OwnWalk\nalgorithm: ppo\n")
     refused = run("launch", "sweep.yaml", "--dry-run")
@@ -242,7 +246,9 @@ def test_the_command_line_allows_what_a_sweep_file_cannot(own, run):
         ("algorithm: ppo\nrl_module: own_package.inner:NOTHING", "has nothing called 'NOTHING'"),
     ],
 )
-def test_an_rl_module_is_checked_before_anything_starts(own, run, text, words):
+def test_an_rl_module_is_checked_before_anything_starts(
+    own: Path, run: Callable[..., Result], text: str, words: str
+) -> None:
     (own / "sweep.yaml").write_text(f"env: CartPole-v1\n{text}\n")
     result = run("launch", "sweep.yaml", "--dry-run", "--allow-module", "own_package")
     assert result.exit_code == 2

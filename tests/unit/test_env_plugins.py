@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -27,7 +29,7 @@ mine = my_envs:register_more
 
 
 @pytest.fixture
-def run_python(tmp_path):
+def run_python(tmp_path: Path) -> Callable[[str], list[str]]:
     """Run code in a process that has such a package installed; returns what it prints."""
     (tmp_path / "my_envs.py").write_text(MODULE)
     metadata = tmp_path / "my_envs-1.0.dist-info"
@@ -35,7 +37,7 @@ def run_python(tmp_path):
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-envs\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text(ENTRY_POINTS)
 
-    def run(code):
+    def run(code: str) -> list[str]:
         code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{code}"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         return done.stdout.split()
@@ -43,7 +45,7 @@ def run_python(tmp_path):
     return run
 
 
-def test_an_env_of_an_installed_package_is_found(run_python):
+def test_an_env_of_an_installed_package_is_found(run_python: Callable[[str], list[str]]) -> None:
     assert run_python(
         "from policies.envs.make import check_env, make_vector_env\n"
         "print(check_env('FromAPackage-v0', {}, 'dqn').max_episode_steps)\n"
@@ -52,7 +54,7 @@ def test_an_env_of_an_installed_package_is_found(run_python):
     ) == ["10", "FromAPackage-v0", "3"]
 
 
-def test_nothing_of_a_package_is_imported_for_an_env_that_is_known(run_python):
+def test_nothing_of_a_package_is_imported_for_an_env_that_is_known(run_python: Callable[[str], list[str]]) -> None:
     assert run_python(
         "from policies.envs.make import check_env\n"
         "check_env('CartPole-v1', {}); check_env('CartPole', {})\n"
@@ -60,7 +62,7 @@ def test_nothing_of_a_package_is_imported_for_an_env_that_is_known(run_python):
     ) == ["False"]
 
 
-def test_a_package_that_fails_is_named_where_an_env_is_missing(run_python):
+def test_a_package_that_fails_is_named_where_an_env_is_missing(run_python: Callable[[str], list[str]]) -> None:
     text = " ".join(
         run_python(
             "from policies.envs.make import check_env\n"

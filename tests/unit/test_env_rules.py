@@ -1,24 +1,27 @@
 """An environment and the settings that have to go with it: refused when the sweep is planned, with both names."""
 
+from typing import Any
+
 import pytest
 
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError, SpecError
+from policies.hyperparams import Algorithm
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
 
 IMAGES = "odd_envs:Images"
 
 
 @pytest.fixture(autouse=True)
-def _own_modules(monkeypatch):
+def _own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["odd_envs"])
 
 
-def plan(env, algorithm="ppo", **spec):
+def plan(env: str | dict[str, Any], algorithm: Algorithm = "ppo", **spec: dict[str, Any]) -> SweepPlan:
     return make_plan(load_spec({"env": env, "algorithm": algorithm, **spec}), Machine(num_cpus=2))
 
 
@@ -26,7 +29,7 @@ FILTERS = [[16, 8, 4], [32, 4, 2]]
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_images_go_with_convolutions_and_vectors_without(algorithm):
+def test_images_go_with_convolutions_and_vectors_without(algorithm: Algorithm) -> None:
     made = plan(IMAGES, algorithm, hyperparams={"conv_filters": [[8, 4, 2]]})
     assert made.env.observes_images
     made = plan(
@@ -60,40 +63,42 @@ def test_images_go_with_convolutions_and_vectors_without(algorithm):
         ),
     ],
 )
-def test_an_encoder_and_observations_that_do_not_go_together_are_refused_with_both_names(env, spec, words):
+def test_an_encoder_and_observations_that_do_not_go_together_are_refused_with_both_names(
+    env: str | dict[str, Any], spec: dict[str, Any], words: str
+) -> None:
     with pytest.raises(SpecError, match=words):
         plan(env, **spec)
 
 
 @pytest.mark.parametrize("algorithm", ["random", "constant"])
-def test_baselines_need_no_encoder(algorithm):
+def test_baselines_need_no_encoder(algorithm: Algorithm) -> None:
     assert plan(IMAGES, algorithm).env.observes_images
 
 
 @pytest.mark.parametrize("env_id", ["Acrobot-v1", "MountainCar-v0", "Pendulum-v1", IMAGES])
-def test_a_penalty_for_an_env_without_failure_is_refused_with_both_names(env_id):
+def test_a_penalty_for_an_env_without_failure_is_refused_with_both_names(env_id: str) -> None:
     with pytest.raises(SpecError, match=rf"env\.failure_penalty is -1, but {env_id} has no failure") as caught:
         plan({"id": env_id, "failure_penalty": -1}, hyperparams={})
     assert "env.failure_penalty" in caught.value.hint
 
 
-def test_a_penalty_changes_nothing_of_what_others_than_training_make():
+def test_a_penalty_changes_nothing_of_what_others_than_training_make() -> None:
     made = plan({"id": "CartPole-v1", "failure_penalty": -100}, "dqn")
     assert made.env.env_args == {}
 
 
 @pytest.mark.parametrize("name", ["frame_stack", "pixels", "failure_penalty"])
-def test_wrappers_are_no_arguments_of_the_env(name):
+def test_wrappers_are_no_arguments_of_the_env(name: str) -> None:
     with pytest.raises(SpecError, match=rf"env\.args\.{name} is 1") as caught:
         plan({"id": "CartPole-v1", "args": {name: 1}})
     assert f"env.{name}" in caught.value.hint
 
 
-def test_a_sweep_file_cannot_tell_env_runners_which_modules_are_allowed():
+def test_a_sweep_file_cannot_tell_env_runners_which_modules_are_allowed() -> None:
     with pytest.raises(EnvError, match="allowed_modules"):
         plan({"id": "CartPole-v1", "args": {"allowed_modules": ["os"]}})
 
 
-def test_pixels_of_an_env_that_is_not_drawn_are_refused():
+def test_pixels_of_an_env_that_is_not_drawn_are_refused() -> None:
     with pytest.raises(EnvError, match=r"odd_envs:Images has pixels: true.*rgb_array"):
         plan({"id": IMAGES, "pixels": True})

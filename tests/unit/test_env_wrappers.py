@@ -3,11 +3,14 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.policy import RandomPolicy
@@ -15,35 +18,36 @@ from policies.envs.failures import FailureRule, failure_rule
 from policies.envs.make import check_env, make_env, make_vector_env
 from policies.envs.wrappers import FailurePenalty, StackFrames, shrink_to_grey
 from policies.errors import EnvError
+from tests.narrowing import present
 
 ROOT = Path(__file__).parents[2]
 
 
-class Counter(gym.Env):
+class Counter(gym.Env[Any, Any]):
     """The observation is [100 * episode + step, -step]; its reward is 2, and it ends after `end` steps."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
-    def __init__(self, end=3, image=False, render_mode=None, reward=2.0):
+    def __init__(self, end: int = 3, image: bool = False, render_mode: str | None = None, reward: float = 2.0) -> None:
         self.end, self.image, self.reward, self.render_mode = end, image, reward, render_mode
         shape = (4, 5, 2) if image else (2,)
         self.observation_space = gym.spaces.Box(-1000, 1000, shape, np.float32)
         self.action_space = gym.spaces.Discrete(2)
         self.episode = self.ticks = 0
 
-    def _observation(self):
+    def _observation(self) -> NDArray[np.float32]:
         pair = np.array([100 * self.episode + self.ticks, -self.ticks], np.float32)
-        return np.broadcast_to(pair, self.observation_space.shape).copy()
+        return np.broadcast_to(pair, present(self.observation_space.shape)).copy()
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.episode, self.ticks = self.episode + 1, 0
         return self._observation(), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.ticks += 1
         return self._observation(), self.reward, self.ticks >= self.end, False, {}
 
-    def render(self):
+    def render(self) -> Any:
         return np.full((130, 65, 3), 10 * self.ticks, np.uint8)
 
 
@@ -52,14 +56,14 @@ class Careful(Counter):
 
 
 @pytest.fixture(autouse=True)
-def _registered():
-    gym.register("TestCounter-v0", Counter)
-    gym.register("TestCareful-v0", Careful)
+def _registered() -> Iterator[None]:
+    gym.register("TestCounter-v0", cast("Any", Counter))
+    gym.register("TestCareful-v0", cast("Any", Careful))
     yield
     del gym.registry["TestCounter-v0"], gym.registry["TestCareful-v0"]
 
 
-def test_stacked_vectors_are_joined_oldest_first_and_begin_with_the_resets():
+def test_stacked_vectors_are_joined_oldest_first_and_begin_with_the_resets() -> None:
     env = make_env("TestCounter-v0", {"frame_stack": 3})
     assert env.observation_space.shape == (6,)
     first, _ = env.reset()
@@ -74,7 +78,7 @@ def test_stacked_vectors_are_joined_oldest_first_and_begin_with_the_resets():
     assert env.reset()[0].tolist() == [200, 0] * 3
 
 
-def test_stacked_images_are_joined_along_their_channels():
+def test_stacked_images_are_joined_along_their_channels() -> None:
     env = make_env("TestCounter-v0", {"frame_stack": 2, "image": True})
     assert env.observation_space.shape == (4, 5, 4)
     env.reset()
@@ -84,7 +88,7 @@ def test_stacked_images_are_joined_along_their_channels():
 
 
 @pytest.mark.parametrize("args", [{"frame_stack": 3}, {"frame_stack": 2, "image": True}])
-def test_stacked_frames_of_a_vector_env_are_those_of_its_parts(args):
+def test_stacked_frames_of_a_vector_env_are_those_of_its_parts(args: dict[str, bool | int]) -> None:
     vector = make_vector_env("TestCounter-v0", args, 2)
     scalar = make_env("TestCounter-v0", args)
     assert vector.single_observation_space == scalar.observation_space
@@ -102,7 +106,7 @@ def test_stacked_frames_of_a_vector_env_are_those_of_its_parts(args):
         assert terminated.tolist() == [ended, ended]
 
 
-def test_stacked_frames_of_the_vectorised_cartpole_begin_anew_for_each_part():
+def test_stacked_frames_of_the_vectorised_cartpole_begin_anew_for_each_part() -> None:
     env = make_vector_env("CartPole-v1", {"frame_stack": 2}, 4)
     assert env.unwrapped.spec.kwargs["vectorization_mode"] == "vector_entry_point"
     last, _ = env.reset(seed=1)
@@ -118,8 +122,8 @@ def test_stacked_frames_of_the_vectorised_cartpole_begin_anew_for_each_part():
     assert resets > 4
 
 
-def test_what_is_neither_vector_nor_image_does_not_stack():
-    gym.register("TestGrid-v0", lambda: gym.wrappers.ReshapeObservation(Counter(), (1, 2)))
+def test_what_is_neither_vector_nor_image_does_not_stack() -> None:
+    gym.register("TestGrid-v0", cast("Any", lambda: gym.wrappers.ReshapeObservation(Counter(), (1, 2))))
     try:
         with pytest.raises(EnvError, match=r"TestGrid-v0 has frame_stack 2, .*\(1, 2\)"):
             make_env("TestGrid-v0", {"frame_stack": 2})
@@ -128,12 +132,12 @@ def test_what_is_neither_vector_nor_image_does_not_stack():
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.0, True, "4", None])
-def test_a_number_of_frames_that_is_none_is_refused(value):
+def test_a_number_of_frames_that_is_none_is_refused(value: bool | float | str | None) -> None:
     with pytest.raises(EnvError, match="frame_stack is"):
         make_env("CartPole-v1", {"frame_stack": value})
 
 
-def test_pixels_are_refused_where_nothing_is_drawn_or_the_value_is_none():
+def test_pixels_are_refused_where_nothing_is_drawn_or_the_value_is_none() -> None:
     with pytest.raises(EnvError, match=r"TestCareful-v0 has pixels.*rgb_array"):
         make_vector_env("TestCareful-v0", {"pixels": True}, 2)
     with pytest.raises(EnvError, match="pixels is 1"):
@@ -142,7 +146,7 @@ def test_pixels_are_refused_where_nothing_is_drawn_or_the_value_is_none():
         make_env("CartPole-v1", {"pixels": True}, render_mode="human")
 
 
-def test_a_picture_shrinks_to_the_mean_brightness_of_its_blocks():
+def test_a_picture_shrinks_to_the_mean_brightness_of_its_blocks() -> None:
     picture = np.zeros((400, 600, 3), np.uint8)
     picture[10:20, 30:40] = 200  # one whole block
     picture[50:60, 70:75] = 100  # half of one
@@ -158,22 +162,22 @@ def test_a_picture_shrinks_to_the_mean_brightness_of_its_blocks():
     ("shape", "small"),
     [((64, 64), (64, 64)), ((3, 5), (3, 5)), ((65, 64), (32, 32)), ((131, 70), (43, 23)), ((640, 3), (1, 1))],
 )
-def test_pictures_of_any_size_shrink_to_few_rows_and_columns(shape, small):
+def test_pictures_of_any_size_shrink_to_few_rows_and_columns(shape: tuple[int, int], small: tuple[int, int]) -> None:
     picture = np.full((*shape, 3), 77, np.uint8)
     assert shrink_to_grey(picture).shape == (*small, 1)
     assert np.unique(shrink_to_grey(picture)).tolist() == [77]
 
 
-def test_pixels_show_what_the_env_renders_and_a_video_shows_all_of_it():
+def test_pixels_show_what_the_env_renders_and_a_video_shows_all_of_it() -> None:
     env = make_env("TestCounter-v0", {"pixels": True, "frame_stack": 2}, render_mode="rgb_array")
     assert env.observation_space == gym.spaces.Box(0, 255, (43, 21, 2), np.uint8)
     env.reset()
     observation = env.step(0)[0]
     assert [np.unique(observation[..., channel]).tolist() for channel in (0, 1)] == [[0], [10]]
-    assert env.render().shape == (130, 65, 3)
+    assert cast("Any", present(env.render())).shape == (130, 65, 3)
 
 
-def test_cartpole_can_be_seen_in_its_pixels_without_a_display():
+def test_cartpole_can_be_seen_in_its_pixels_without_a_display() -> None:
     code = (
         "import numpy as np\n"
         "from policies.envs.make import check_env, make_env, make_vector_env\n"
@@ -195,11 +199,11 @@ def test_cartpole_can_be_seen_in_its_pixels_without_a_display():
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_evaluation_observes_what_training_did():
+def test_evaluation_observes_what_training_did() -> None:
     shapes = set()
 
     class Looking(RandomPolicy):
-        def _act_batch(self, observations):
+        def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
             shapes.add(observations.shape[1:])
             return super()._act_batch(observations)
 
@@ -210,7 +214,7 @@ def test_evaluation_observes_what_training_did():
     assert shapes == {(12,)}
 
 
-def test_a_failure_gets_the_penalty_and_the_own_rewards_are_kept():
+def test_a_failure_gets_the_penalty_and_the_own_rewards_are_kept() -> None:
     env = make_vector_env("TestCareful-v0", {"end": 2}, 2, failure_penalty=-7)
     assert isinstance(env, FailurePenalty)
     env.reset()
@@ -222,7 +226,7 @@ def test_a_failure_gets_the_penalty_and_the_own_rewards_are_kept():
     assert seen == [(2.0, 2.0), (-7.0, 2.0), (0.0, 0.0), (2.0, 2.0)]
 
 
-def test_a_truncated_cartpole_has_not_failed_and_keeps_its_vectorised_physics():
+def test_a_truncated_cartpole_has_not_failed_and_keeps_its_vectorised_physics() -> None:
     env = make_vector_env("CartPole-v1", {"max_episode_steps": 12}, 8, failure_penalty=-100)
     assert env.unwrapped.spec.kwargs["vectorization_mode"] == "vector_entry_point"
     env.reset(seed=0)
@@ -231,7 +235,7 @@ def test_a_truncated_cartpole_has_not_failed_and_keeps_its_vectorised_physics():
         # Half of the carts are pushed one way for ever, half are balanced for twelve steps.
         _, rewards, terminated, truncated, _ = env.step(np.where(np.arange(8) < 4, 1, step % 2))
         assert np.array_equal(rewards == -100, terminated)
-        assert set(env.unpenalized_rewards) <= {0.0, 1.0}
+        assert set(cast("Any", env).unpenalized_rewards) <= {0.0, 1.0}
         fell += int(terminated.sum())
         ran_out += int((truncated & ~terminated).sum())
     assert fell
@@ -239,48 +243,48 @@ def test_a_truncated_cartpole_has_not_failed_and_keeps_its_vectorised_physics():
 
 
 @pytest.mark.parametrize("env_id", ["Acrobot-v1", "MountainCar-v0", "Pendulum-v1", "TestCounter-v0"])
-def test_a_penalty_without_failure_is_refused_with_both_names(env_id):
+def test_a_penalty_without_failure_is_refused_with_both_names(env_id: str) -> None:
     assert check_env(env_id, None).failure is None
     with pytest.raises(EnvError, match=rf"failure_penalty is -1, but {env_id}") as caught:
         make_vector_env(env_id, None, 2, failure_penalty=-1)
     assert "metadata" in caught.value.hint
 
 
-def test_only_a_crash_of_the_lander_is_a_failure():
+def test_only_a_crash_of_the_lander_is_a_failure() -> None:
     pytest.importorskip("Box2D")
     rule = check_env("LunarLander-v3", None).failure
     rewards, terminated = np.array([-100.0, 100.0, -100.0, 1.0]), np.array([True, True, False, False])
-    assert rule.failed(rewards, terminated).tolist() == [True, False, False, False]
+    assert present(rule).failed(rewards, terminated).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize(
     "env_id", ["CartPole-v0", "InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Hopper-v5", "Walker2d-v4",
                "Humanoid-v5", "Ant-v5"],
 )  # fmt: skip
-def test_falls_are_failures(env_id):
+def test_falls_are_failures(env_id: str) -> None:
     spec = gym.registry[env_id]
     assert failure_rule(env_id, spec, {}, {}) == FailureRule()
     if env_id.startswith(("Hopper", "Walker", "Humanoid", "Ant")):
         assert failure_rule(env_id, spec, {}, {"terminate_when_unhealthy": False}) is None
 
 
-def test_an_unknown_kind_of_failure_is_refused():
+def test_an_unknown_kind_of_failure_is_refused() -> None:
     spec = gym.registry["TestCareful-v0"]
     with pytest.raises(EnvError, match=r"metadata\['failure'\] = 'fall'"):
         failure_rule("TestCareful-v0", spec, {"failure": "fall"}, {})
 
 
 @pytest.mark.parametrize("name", ["failure_penalty", "allowed_modules"])
-def test_what_only_env_runners_are_told_is_no_argument_of_an_env(name):
+def test_what_only_env_runners_are_told_is_no_argument_of_an_env(name: str) -> None:
     gym.register("TestAnything-v0", lambda **kwargs: Counter(len(kwargs)))
     try:
-        make_env("TestAnything-v0", {"other": 1}).close()
+        cast("Any", make_env("TestAnything-v0", {"other": 1})).close()
         with pytest.raises(EnvError, match=f"{name!r}.*cannot be set"):
             make_env("TestAnything-v0", {name: -1})
     finally:
         del gym.registry["TestAnything-v0"]
 
 
-def test_the_wrapper_of_frames_can_be_used_alone():
+def test_the_wrapper_of_frames_can_be_used_alone() -> None:
     env = StackFrames(Counter(), 2)
     assert env.reset()[0].tolist() == [100, 0, 100, 0]

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -19,12 +20,13 @@ from policies.envs.make import check_env, make_env, make_vector_env, normalize_e
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError
 from policies.packed.envs.make import make_packed_envs
+from tests.narrowing import present
 
 register_test_envs()
 
 
 @pytest.fixture(autouse=True)
-def _own_modules(monkeypatch):
+def _own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["hostile_envs"])
 
@@ -33,11 +35,13 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(("env_id", "steps", "threshold"), [("CartPole-v0", 200, 195.0), ("CartPole-v1", 500, 475.0)])
-def test_both_cartpoles_are_known_without_a_word(env_id, steps, threshold, capfd):
+def test_both_cartpoles_are_known_without_a_word(
+    env_id: str, steps: int, threshold: float, capfd: pytest.CaptureFixture[str]
+) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         info = check_env(env_id, None, "ppo")
-        make_env(env_id).close()
+        cast("Any", make_env(env_id)).close()
         make_vector_env(env_id, None, 2).close()
     assert (info.env_id, info.max_episode_steps, info.threshold) == (env_id, steps, threshold)
     assert info.has_vector_entry_point
@@ -45,7 +49,7 @@ def test_both_cartpoles_are_known_without_a_word(env_id, steps, threshold, capfd
 
 
 @pytest.mark.parametrize("limit", [200, 500, 30])
-def test_the_vectorised_cartpole_has_the_time_limit_of_the_scalar_one(limit):
+def test_the_vectorised_cartpole_has_the_time_limit_of_the_scalar_one(limit: int) -> None:
     args = {"max_episode_steps": 30} if limit == 30 else {}
     env = make_vector_env("CartPole-v0" if limit == 200 else "CartPole-v1", args, 3)
     env.reset(seed=0)
@@ -57,23 +61,23 @@ def test_the_vectorised_cartpole_has_the_time_limit_of_the_scalar_one(limit):
         assert truncated.all() == (step == limit)
 
 
-def test_an_env_without_a_vectorised_version_is_looped_over_with_its_limit():
+def test_an_env_without_a_vectorised_version_is_looped_over_with_its_limit() -> None:
     info = check_env("Pendulum-v1", {"g": 9.0}, "ppo")
     assert not info.has_vector_entry_point
     env = make_vector_env("Pendulum-v1", {"g": 9.0}, 2)
     assert isinstance(env, gym.vector.SyncVectorEnv)
-    assert [one.unwrapped.g for one in env.envs] == [9.0, 9.0]
-    assert env.envs[0].spec.max_episode_steps == 200
+    assert [cast("Any", one.unwrapped).g for one in env.envs] == [9.0, 9.0]
+    assert present(env.envs[0].spec).max_episode_steps == 200
     env.close()
 
 
-def test_arguments_reach_the_env():
-    assert make_env("CartPole-v1", {"sutton_barto_reward": True}).unwrapped._sutton_barto_reward
+def test_arguments_reach_the_env() -> None:
+    assert cast("Any", make_env("CartPole-v1", {"sutton_barto_reward": True}).unwrapped)._sutton_barto_reward
     assert make_vector_env("CartPole-v1", {"sutton_barto_reward": True}, 2).unwrapped._sutton_barto_reward
     assert check_env("CartPole-v1", {"max_episode_steps": 7}, None).max_episode_steps == 7
 
 
-def test_an_id_without_a_version_is_the_newest():
+def test_an_id_without_a_version_is_the_newest() -> None:
     assert normalize_env_id(" CartPole ") == "CartPole-v1"
     assert check_env("Pendulum", None, "ppo").env_id == "Pendulum-v1"
 
@@ -82,19 +86,19 @@ def test_an_id_without_a_version_is_the_newest():
     ("env_id", "nearest"),
     [("cartpole-v1", "CartPole-v1"), ("CartPole-v7", "CartPole-v1"), ("Pendulm-v1", "Pendulum-v1")],
 )
-def test_an_unknown_id_names_the_nearest(env_id, nearest):
+def test_an_unknown_id_names_the_nearest(env_id: str, nearest: str) -> None:
     with pytest.raises(EnvError, match=rf"{env_id!r}.*Did you mean .*{nearest!r}") as caught:
         check_env(env_id, None, None)
     assert caught.value.exit_code == 2
 
 
 @pytest.mark.parametrize("env_id", ["", "  ", None, 3, "a b c", "Nothing-v", "-v1", "x/y/z-v0"])
-def test_what_is_no_id_is_refused(env_id):
+def test_what_is_no_id_is_refused(env_id: int | str | None) -> None:
     with pytest.raises(EnvError):
-        check_env(env_id, None, None)
+        check_env(env_id, None, None)  # type: ignore[arg-type]
 
 
-def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp_path):
+def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp_path: Path) -> None:
     (tmp_path / "evil_module.py").write_text("print('ran')")
     code = (
         "from policies.envs.make import *\n"
@@ -115,25 +119,25 @@ def test_an_id_that_names_a_module_is_refused_and_the_module_is_not_imported(tmp
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_an_unknown_argument_names_the_nearest_and_all():
+def test_an_unknown_argument_names_the_nearest_and_all() -> None:
     with pytest.raises(EnvError, match=r"no argument 'sutton_barto' .*Did you mean 'sutton_barto_reward'") as caught:
         check_env("CartPole-v1", {"sutton_barto": True}, None)
     assert "max_episode_steps" in caught.value.hint
 
 
 @pytest.mark.parametrize("name", ["render_mode", "num_envs", "wrappers", "disable_env_checker", "id"])
-def test_arguments_that_are_set_elsewhere_are_refused(name):
+def test_arguments_that_are_set_elsewhere_are_refused(name: str) -> None:
     with pytest.raises(EnvError, match=name):
         make_env("CartPole-v1", {name: 1})
 
 
 @pytest.mark.parametrize("limit", [0, -1, 2.5, "100", True, None])
-def test_a_wrong_time_limit_is_refused(limit):
+def test_a_wrong_time_limit_is_refused(limit: bool | float | str | None) -> None:
     with pytest.raises(EnvError, match="max_episode_steps"):
         check_env("CartPole-v1", {"max_episode_steps": limit}, None)
 
 
-def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error():
+def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error() -> None:
     with pytest.raises(EnvError, match="LunarLander-v3' cannot be made"):
         check_env("LunarLander-v3", {"gravity": 5.0}, None)
 
@@ -153,27 +157,29 @@ def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error():
         ({"action_space": gym.spaces.Box(0, 5, (2,), np.int32)}, "int32"),
     ],
 )
-def test_spaces_that_cannot_be_taken_are_refused(spaces, words):
+def test_spaces_that_cannot_be_taken_are_refused(spaces: dict[str, Any], words: str) -> None:
     with pytest.raises(EnvError, match=words):
         check_env("TestOdd-v0", spaces, "ppo")
 
 
-def test_dqn_refuses_continuous_actions_and_says_what_to_do():
+def test_dqn_refuses_continuous_actions_and_says_what_to_do() -> None:
     assert check_env("Pendulum-v1", None, "ppo").action_space.shape == (1,)
     with pytest.raises(EnvError, match="DQN cannot train on Pendulum-v1") as caught:
         check_env("Pendulum-v1", None, "dqn")
     assert "ppo" in caught.value.hint
 
 
-def test_a_reset_of_another_shape_than_declared_is_refused():
-    class Liar(gym.Env):
+def test_a_reset_of_another_shape_than_declared_is_refused() -> None:
+    class Liar(gym.Env[Any, Any]):
         observation_space = gym.spaces.Box(-1, 1, (2,))
         action_space = gym.spaces.Discrete(2)
 
-        def reset(self, *, seed=None, options=None):
+        def reset(
+            self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        ) -> tuple[Any, dict[str, Any]]:
             return np.zeros(3, np.float32), {}
 
-    gym.register("TestLiar-v0", Liar)
+    gym.register("TestLiar-v0", cast("Any", Liar))
     try:
         with pytest.raises(EnvError, match=r"shape \(3,\) but declares \(2,\)"):
             check_env("TestLiar-v0", None, "ppo")
@@ -181,16 +187,16 @@ def test_a_reset_of_another_shape_than_declared_is_refused():
         del gym.registry["TestLiar-v0"]
 
 
-def test_a_vectorised_version_that_cannot_keep_the_time_limit_is_not_used():
-    def without_limit(num_envs):
+def test_a_vectorised_version_that_cannot_keep_the_time_limit_is_not_used() -> None:
+    def without_limit(num_envs: int) -> None:
         raise AssertionError(num_envs)
 
-    def with_limit(num_envs, max_episode_steps):
+    def with_limit(num_envs: int, max_episode_steps: int) -> None:
         raise AssertionError(num_envs)
 
     cartpole = "gymnasium.envs.classic_control:CartPoleEnv"
     for entry_point, used in ((without_limit, False), (with_limit, True)):
-        gym.register("TestVector-v0", cartpole, vector_entry_point=entry_point, max_episode_steps=9)
+        gym.register("TestVector-v0", cartpole, vector_entry_point=cast("Any", entry_point), max_episode_steps=9)
         try:
             assert check_env("TestVector-v0", None, "ppo").has_vector_entry_point == used
             if not used:
@@ -202,14 +208,16 @@ def test_a_vectorised_version_that_cannot_keep_the_time_limit_is_not_used():
 @pytest.mark.parametrize(
     ("mode", "used"), [("NextStep", True), ("SameStep", False), ("Disabled", False), ("Soon", False)]
 )
-def test_a_vectorised_version_that_resets_at_another_time_is_not_used(mode, used):
-    class Vectorised(gym.vector.VectorEnv):
+def test_a_vectorised_version_that_resets_at_another_time_is_not_used(mode: str, used: bool) -> None:
+    class Vectorised(gym.vector.VectorEnv[Any, Any, Any]):
         metadata = {"autoreset_mode": mode}  # noqa: RUF012
 
-        def __init__(self, num_envs):
+        def __init__(self, num_envs: int) -> None:
             raise AssertionError(num_envs)
 
-    gym.register("TestVector-v0", "gymnasium.envs.classic_control:CartPoleEnv", vector_entry_point=Vectorised)
+    gym.register(
+        "TestVector-v0", "gymnasium.envs.classic_control:CartPoleEnv", vector_entry_point=cast("Any", Vectorised)
+    )
     try:
         assert check_env("TestVector-v0", None, "ppo").has_vector_entry_point == used
     finally:
@@ -229,7 +237,7 @@ def test_a_vectorised_version_that_resets_at_another_time_is_not_used(mode, used
     ],
 )
 @pytest.mark.parametrize("limit", [None, 100])
-def test_a_malformed_reset_is_refused_with_what_it_returns(fault, words, limit):
+def test_a_malformed_reset_is_refused_with_what_it_returns(fault: str, words: str, limit: int | None) -> None:
     args = {"reset": fault} | ({} if limit is None else {"max_episode_steps": limit})
     with pytest.raises(EnvError, match=words) as caught:
         check_env("hostile_envs:Malformed", args, "ppo")
@@ -258,7 +266,7 @@ def test_a_malformed_reset_is_refused_with_what_it_returns(fault, words, limit):
     ],
 )
 @pytest.mark.parametrize("limit", [None, 100])
-def test_a_malformed_first_step_is_refused_with_what_it_returns(fault, words, limit):
+def test_a_malformed_first_step_is_refused_with_what_it_returns(fault: str, words: str, limit: int | None) -> None:
     args = {"step": fault} | ({} if limit is None else {"max_episode_steps": limit})
     with pytest.raises(EnvError, match=words) as caught:
         check_env("hostile_envs:Malformed", args, "ppo")
@@ -267,9 +275,9 @@ def test_a_malformed_first_step_is_refused_with_what_it_returns(fault, words, li
 
 
 @pytest.mark.parametrize("kind", ["float64", "list", "reward in an array", "reward in a list", "infos"])
-def test_what_is_harmless_in_a_step_passes_and_can_be_stepped(kind):
+def test_what_is_harmless_in_a_step_passes_and_can_be_stepped(kind: str) -> None:
     args = {"step": kind}
-    assert check_env("hostile_envs:Malformed", args, "ppo").action_space.n == 2
+    assert cast("Any", check_env("hostile_envs:Malformed", args, "ppo").action_space).n == 2
 
     vector = CheckedEnvs(make_vector_env("hostile_envs:Malformed", args, 2), "Malformed")
     vector.reset(seed=0)
@@ -288,10 +296,10 @@ def test_what_is_harmless_in_a_step_passes_and_can_be_stepped(kind):
     assert episodes.returns == (3.0,)
 
 
-def test_a_first_step_that_raises_is_refused():
+def test_a_first_step_that_raises_is_refused() -> None:
     with pytest.raises(EnvError, match=r"cannot be stepped, with the action [01] after a reset: ValueError: the motor"):
         check_env("hostile_envs:Hostile", {"how": "fail"}, "ppo")
 
 
-def test_an_env_that_cannot_be_closed_is_none_the_worse():
-    assert check_env("hostile_envs:Hostile", {"how": "fail", "where": "close"}, "ppo").action_space.n == 2
+def test_an_env_that_cannot_be_closed_is_none_the_worse() -> None:
+    assert cast("Any", check_env("hostile_envs:Hostile", {"how": "fail", "where": "close"}, "ppo").action_space).n == 2

@@ -3,39 +3,42 @@
 import json
 import pickle
 import traceback
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 
 from policies.errors import EnvFailedError, TuneJobsError, fit, said_by, tellable
+from tests.narrowing import present
 
 
 class MuteError(Exception):
-    def __str__(self):
+    def __str__(self) -> str:
         raise RuntimeError("no words")
 
 
 class WordlessError(Exception):
-    def __str__(self):
-        return 3  # noqa: PLE0307 (what is to be lived with)
+    def __str__(self) -> str:
+        return cast("str", 3)
 
 
-def test_what_others_wrote_is_text_that_can_be_written_and_shown():
+def test_what_others_wrote_is_text_that_can_be_written_and_shown() -> None:
     error = TuneJobsError("a \udcff b \x1b[2J c \x00", "d\r\n\te\ud800")
     assert (error.message, error.hint) == ("a \\udcff b \\x1b[2J c \\x00", "d\\r\n\te\\ud800")
     str(error).encode()
     assert pickle.loads(pickle.dumps(error)).args == error.args
 
 
-def test_text_in_any_script_stays_as_it_is():
+def test_text_in_any_script_stays_as_it_is() -> None:
     assert fit("naïve 小車 🚗\n\tof two lines") == "naïve 小車 🚗\n\tof two lines"
 
 
 @pytest.mark.parametrize("error", [MuteError(), WordlessError()])
-def test_an_exception_that_cannot_be_shown_is_told_without_words(error):
+def test_an_exception_that_cannot_be_shown_is_told_without_words(error: MuteError | WordlessError) -> None:
     assert said_by(error) == "it cannot be shown"
 
 
-def test_of_a_long_message_the_middle_is_left_out():
+def test_of_a_long_message_the_middle_is_left_out() -> None:
     said = said_by(ValueError("begin" + "x" * 5_000_000 + "end."))
     assert len(said) < 2_100
     assert said.startswith("beginxxx")
@@ -44,7 +47,7 @@ def test_of_a_long_message_the_middle_is_left_out():
 
 
 @pytest.mark.parametrize("error", [ValueError("\udcff"), ValueError("y" * 1_000_000), MuteError(), WordlessError()])
-def test_an_envs_error_can_be_told(error):
+def test_an_envs_error_can_be_told(error: ValueError | MuteError | WordlessError) -> None:
     from policies.envs.faults import env_failed
 
     failed = env_failed("It raised an error in step()", error)
@@ -53,7 +56,7 @@ def test_an_envs_error_can_be_told(error):
     json.dumps(failed.message, ensure_ascii=False).encode()
 
 
-def caught(raise_it):
+def caught(raise_it: Callable[[], Any]) -> Exception | None:
     try:
         raise_it()
     except Exception as error:  # noqa: BLE001
@@ -61,14 +64,14 @@ def caught(raise_it):
     return None
 
 
-def raise_for_another():
+def raise_for_another() -> None:
     try:
         raise_alone()
     except ValueError as error:
         raise EnvFailedError(f"It failed: {error}.", "Mend it.") from error
 
 
-def raise_alone():
+def raise_alone() -> None:
     raise ValueError("\udcff")
 
 
@@ -79,13 +82,15 @@ def raise_alone():
         (raise_alone, TuneJobsError, "ValueError: \\udcff"),
     ],
 )
-def test_an_error_can_be_carried_to_another_process_whatever_it_was_raised_for(raise_it, kind, words):
+def test_an_error_can_be_carried_to_another_process_whatever_it_was_raised_for(
+    raise_it: Callable[[], Any], kind: type[EnvFailedError] | type[TuneJobsError], words: str
+) -> None:
     """As Ray does it: with its traceback, that of its cause included, in UTF-8."""
-    told = tellable(caught(raise_it))
+    told = tellable(present(caught(raise_it)))
     assert (type(told), str(told)) == (kind, words)
     "".join(traceback.format_exception(told)).encode()
 
 
-def test_other_errors_are_carried_as_they_are():
-    error = caught(lambda: {}["a key"])
-    assert tellable(error) is error
+def test_other_errors_are_carried_as_they_are() -> None:
+    error = caught(lambda: cast("dict[str, int]", {})["a key"])
+    assert tellable(present(error)) is error

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
 import policies.acting.evaluate
@@ -17,7 +20,13 @@ register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
 
 
-def by_hand(policy, env_id, seeds, max_steps=10**9, **env_args):
+def by_hand(
+    policy: NetworkPolicy,
+    env_id: str,
+    seeds: range | Sequence[int] | tuple[int, ...],
+    max_steps: int = 10**9,
+    **env_args: Any,
+) -> Episodes:
     """The definition of an episode, in a few lines of its own."""
     env = gym.make(env_id, **env_args)
     returns, lengths = [], []
@@ -36,7 +45,7 @@ def by_hand(policy, env_id, seeds, max_steps=10**9, **env_args):
 
 @pytest.mark.parametrize("env_id", ["CartPole-v0", "CartPole-v1"])
 @pytest.mark.parametrize("skill", ["good", "fair", "wobbly", "poor"])
-def test_vectorised_cartpole_plays_the_scalar_env_s_episodes(env_id, skill):
+def test_vectorised_cartpole_plays_the_scalar_env_s_episodes(env_id: str, skill: str) -> None:
     policy, seeds = balancing_policy(env_id, skill), tuple(range(1000, 1100))
     expected = by_hand(policy, env_id, seeds)
     assert evaluate_policy(policy, env_id=env_id, seeds=seeds) == expected
@@ -47,7 +56,7 @@ def test_vectorised_cartpole_plays_the_scalar_env_s_episodes(env_id, skill):
 
 
 @pytest.mark.parametrize("skill", ["good", "poor"])
-def test_vectorised_cartpole_has_the_scalar_env_s_other_reward(skill):
+def test_vectorised_cartpole_has_the_scalar_env_s_other_reward(skill: str) -> None:
     policy, seeds = balancing_policy("CartPole-v1", skill), tuple(range(20))
     expected = by_hand(policy, "CartPole-v1", seeds, sutton_barto_reward=True)
     assert set(expected.returns) == ({0.0} if skill == "good" else {-1.0})
@@ -56,11 +65,11 @@ def test_vectorised_cartpole_has_the_scalar_env_s_other_reward(skill):
 
 
 @pytest.mark.parametrize("args", [{"pixels": True}, {"frame_stack": 3}, {"pixels": True, "frame_stack": 2}])
-def test_cartpole_in_wrappers_is_played_with_them(args):
+def test_cartpole_in_wrappers_is_played_with_them(args: dict[str, bool | int]) -> None:
     class Parity(Policy):
         """Acts by the whole observation, whatever its shape."""
 
-        def _act_batch(self, observations):
+        def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
             return np.array([int(1000 * abs(observation.sum(dtype=np.float64))) % 2 for observation in observations])
 
     env, seeds = make_env("CartPole-v1", args), tuple(range(8))
@@ -71,11 +80,11 @@ def test_cartpole_in_wrappers_is_played_with_them(args):
     assert list(zip(played.returns, played.lengths, strict=True)) == expected
 
 
-def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit():
+def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit() -> None:
     seen = []
 
     class Spy(NetworkPolicy):
-        def act(self, observations):
+        def act(self, observations: Any) -> int | NDArray[Any]:
             seen.append(np.array(observations))
             return super().act(observations)
 
@@ -91,7 +100,7 @@ def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit(
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v0", "Pendulum-v1", "TestWalk-v0"])
-def test_an_episode_depends_on_its_seed_alone(env_id, monkeypatch):
+def test_an_episode_depends_on_its_seed_alone(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policies.acting.evaluate, "_MAX_CARTPOLES", 8)
     policy = balancing_policy(env_id, "poor") if env_id == "CartPole-v0" else make_policy(env_id, seed=1)
     seeds = tuple(int(seed) for seed in np.random.default_rng(0).permutation(40)[:21])
@@ -104,7 +113,7 @@ def test_an_episode_depends_on_its_seed_alone(env_id, monkeypatch):
     assert tuple(alone) == whole.returns
 
 
-def test_an_evaluator_can_be_used_again_and_again():
+def test_an_evaluator_can_be_used_again_and_again() -> None:
     first, second = balancing_policy(skill="poor"), balancing_policy(skill="wobbly")
     with Evaluator("CartPole-v0", None, range(12)) as evaluator:
         results = [evaluator.run(policy) for policy in (first, second, first)]
@@ -112,7 +121,7 @@ def test_an_evaluator_can_be_used_again_and_again():
     assert results[1] == by_hand(second, "CartPole-v0", range(12))
 
 
-def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed(monkeypatch):
+def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policies.acting.evaluate, "_MAX_ENVS", 3)
     policy, seeds = make_policy("TestWalk-v0", seed=1), tuple(range(17))
     with Evaluator("TestWalk-v0", {"end": 2.0}, seeds, max_episode_steps=300) as evaluator:
@@ -123,7 +132,7 @@ def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed(monkeypa
     assert len(set(result.lengths)) > 5
 
 
-def test_continuous_actions():
+def test_continuous_actions() -> None:
     policy = make_policy("Pendulum-v1", seed=3)
     result = evaluate_policy(policy, env_id="Pendulum-v1", seeds=range(5))
     assert result == by_hand(policy, "Pendulum-v1", range(5))
@@ -132,7 +141,7 @@ def test_continuous_actions():
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_a_random_policy_repeats_itself(env_id):
+def test_a_random_policy_repeats_itself(env_id: str) -> None:
     policy = RandomPolicy.for_env(env_id, seed=1)
     first = evaluate_policy(policy, env_id=env_id, seeds=range(6))
     policy.act(np.zeros(policy.observation_space.shape))
@@ -141,12 +150,12 @@ def test_a_random_policy_repeats_itself(env_id):
     assert len(set(first.returns)) > 1
 
 
-def test_a_random_policy_scores_what_is_known_of_it():
+def test_a_random_policy_scores_what_is_known_of_it() -> None:
     result = evaluate_policy(RandomPolicy.for_env("CartPole-v1"), env_id="CartPole-v1", seeds=range(300))
     assert 19 < result.mean_return < 26
 
 
-def test_an_endless_episode_is_cut_off():
+def test_an_endless_episode_is_cut_off() -> None:
     policy = make_policy("TestWalk-v0")
     assert evaluate_policy(policy, env_id="TestWalk-v0", seeds=[0]).lengths == (10_000,)
     assert evaluate_policy(policy, env_id="TestWalk-v0", seeds=[0], max_episode_steps=7).lengths == (7,)
@@ -165,7 +174,7 @@ def test_an_endless_episode_is_cut_off():
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v0", "Pendulum-v1"])
-def test_weights_that_are_not_finite_are_refused(env_id):
+def test_weights_that_are_not_finite_are_refused(env_id: str) -> None:
     portable = make_portable(env_id)
     portable.network.layers[0].weight[0, 0] = np.nan
     with pytest.raises(NonFiniteWeightsError, match="layer 0"):
@@ -181,17 +190,17 @@ def test_weights_that_are_not_finite_are_refused(env_id):
         ("MountainCar-v0", "TestWalk-v0", "actions"),
     ],
 )
-def test_a_policy_for_another_env_is_refused(policy_env, env_id, words):
+def test_a_policy_for_another_env_is_refused(policy_env: str, env_id: str, words: str) -> None:
     with pytest.raises(EnvError, match=f"is for {policy_env}, whose {words}"):
         evaluate_policy(make_policy(policy_env), env_id=env_id, seeds=[0])
 
 
-def test_a_policy_for_one_cartpole_may_act_in_the_other():
+def test_a_policy_for_one_cartpole_may_act_in_the_other() -> None:
     assert evaluate_policy(balancing_policy("CartPole-v0"), env_id="CartPole-v1", seeds=[0]).lengths == (500,)
 
 
 @pytest.mark.parametrize("policy", [make_policy("TestWalk-v0"), RandomPolicy.for_env("TestWalk-v0")])
-def test_an_env_that_raises_is_one_clear_error(policy):
+def test_an_env_that_raises_is_one_clear_error(policy: NetworkPolicy | RandomPolicy) -> None:
     with pytest.raises(
         EnvError, match=r"step\(\) of the episode with seed 5, after 2 steps: RuntimeError: the motor broke"
     ):
@@ -199,12 +208,12 @@ def test_an_env_that_raises_is_one_clear_error(policy):
 
 
 @pytest.mark.parametrize(("seeds", "cap"), [([], None), ([1, -1], None), ([1], 0)])
-def test_seeds_and_caps_out_of_range_are_refused(seeds, cap):
+def test_seeds_and_caps_out_of_range_are_refused(seeds: list[int], cap: int | None) -> None:
     with pytest.raises(SpecError):
         evaluate_policy(balancing_policy(), env_id="CartPole-v0", seeds=seeds, max_episode_steps=cap)
 
 
-def test_an_episode_step_by_step():
+def test_an_episode_step_by_step() -> None:
     policy, env = balancing_policy(skill="poor"), make_env("CartPole-v0")
     steps = list(episode_steps(policy, env, 3, max_episode_steps=200))
     assert [length for length, _, _ in steps] == list(range(len(steps)))
@@ -212,8 +221,8 @@ def test_an_episode_step_by_step():
     assert play_episode(policy, env, 3, max_episode_steps=200) == (steps[-1][1], steps[-1][0])
 
 
-def test_episodes_are_plain_values():
-    episodes = evaluate_policy(balancing_policy(), env_id="CartPole-v0", seeds=np.arange(2))
+def test_episodes_are_plain_values() -> None:
+    episodes = evaluate_policy(balancing_policy(), env_id="CartPole-v0", seeds=cast("Any", np.arange(2)))
     for values, kind in ((episodes.seeds, int), (episodes.returns, float), (episodes.lengths, int)):
         assert isinstance(values, tuple)
         assert all(type(value) is kind for value in values)

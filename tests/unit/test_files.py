@@ -3,6 +3,8 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +12,7 @@ from policies.errors import CannotRunError
 from policies.files import atomic_path, sha256_file, sync, write_atomic
 
 
-def test_text_and_bytes_are_written_and_replaced(tmp_path):
+def test_text_and_bytes_are_written_and_replaced(tmp_path: Path) -> None:
     path = tmp_path / "new folder" / "a.json"
     write_atomic(path, "käse\n")
     assert path.read_bytes() == "käse\n".encode()
@@ -19,7 +21,7 @@ def test_text_and_bytes_are_written_and_replaced(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["a.json"]
 
 
-def test_others_may_read_what_is_written(tmp_path):
+def test_others_may_read_what_is_written(tmp_path: Path) -> None:
     mask = os.umask(0o022)
     try:
         write_atomic(tmp_path / "a", "x")
@@ -28,11 +30,11 @@ def test_others_may_read_what_is_written(tmp_path):
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o644
 
 
-def test_an_error_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_an_error_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_text("old")
 
-    def write_half():
+    def write_half() -> None:
         with atomic_path(path) as temporary:
             temporary.write_text("half")
             assert temporary.suffix == ".mp4"
@@ -45,7 +47,7 @@ def test_an_error_in_the_middle_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
+def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CannotRunError, match=r"Cannot write .*file/a\.json") as caught:
         write_atomic(tmp_path / "file" / "a.json", "x")
@@ -53,21 +55,28 @@ def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
     assert caught.value.hint
 
 
-def test_sha256_of_a_file(tmp_path):
+def test_sha256_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc" * 100_000)
     assert sha256_file(tmp_path / "a") == hashlib.sha256(b"abc" * 100_000).hexdigest()
 
 
-def test_the_content_is_on_disk_before_the_name_is(tmp_path, monkeypatch):
+def test_the_content_is_on_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events = []
     replace = type(tmp_path).replace
     monkeypatch.setattr(os, "fsync", lambda descriptor: events.append("sync"))
-    monkeypatch.setattr(type(tmp_path), "replace", lambda *args: (events.append("replace"), replace(*args)))
+
+    def replacing(*args: Any) -> None:
+        events.append("replace")
+        replace(*args)
+
+    monkeypatch.setattr(type(tmp_path), "replace", replacing)
     write_atomic(tmp_path / "a", "x")
     assert events == ["sync", "replace", "sync"]
 
 
-def test_a_file_that_nobody_may_write_is_synced_and_a_folder_that_cannot_be_is_no_error(tmp_path, monkeypatch):
+def test_a_file_that_nobody_may_write_is_synced_and_a_folder_that_cannot_be_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a"
     path.write_text("x")
     path.chmod(0o400)
@@ -77,7 +86,7 @@ def test_a_file_that_nobody_may_write_is_synced_and_a_folder_that_cannot_be_is_n
     sync(tmp_path)
     assert synced == [path.stat().st_ino, tmp_path.stat().st_ino]
 
-    def refuse(descriptor):
+    def refuse(descriptor: int) -> None:
         raise OSError
 
     monkeypatch.setattr(os, "fsync", refuse)

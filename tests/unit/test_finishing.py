@@ -5,7 +5,9 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_baselines import make_task, run_trial
@@ -13,6 +15,7 @@ from test_baselines import make_task, run_trial
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
 from policies.errors import EnvFailedError
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
@@ -26,16 +29,16 @@ HOSTILE = "hostile_envs:Hostile"
 
 
 @pytest.fixture(autouse=True)
-def _own_modules(monkeypatch):
+def _own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["hostile_envs"])
 
 
 @pytest.fixture
-def sweep_of(tmp_path):
+def sweep_of(tmp_path: Path) -> Callable[..., SweepStore]:
     """A sweep of one trial that went well, in an environment that is hostile from now on."""
 
-    def make(**args):
+    def make(**args: Any) -> SweepStore:
         flag = tmp_path / "hostile"
         args |= {"only_after": str(flag)}
         spec = load_spec(
@@ -65,7 +68,7 @@ def sweep_of(tmp_path):
     return make
 
 
-def finished(store):
+def finished(store: SweepStore) -> SweepResult:
     return _finished(store, SweepResult(store.folder, store.read_record(), store.read_trials()))
 
 
@@ -78,24 +81,26 @@ def finished(store):
         ({"how": "fail", "at": 3}, "after 2 steps: ValueError: the motor broke"),
     ],
 )
-def test_a_confirmation_that_fails_is_in_the_report_and_the_exit_code(sweep_of, args, words):
+def test_a_confirmation_that_fails_is_in_the_report_and_the_exit_code(
+    sweep_of: Callable[..., SweepStore], args: dict[str, Any], words: str
+) -> None:
     store = sweep_of(**args)
     result = finished(store)
     assert result.exit_code == 3
     assert result.best is None
-    assert words in result.why_no_best
+    assert words in present(result.why_no_best)
     page = result.artifacts["report"].read_text(encoding="utf-8")
     assert "No winner" in page
     assert words in page
     assert {path.name for path in store.best_folder.glob("*")} <= {"evaluation.json"}
 
 
-def test_a_report_that_chooses_says_why_it_could_not(sweep_of):
+def test_a_report_that_chooses_says_why_it_could_not(sweep_of: Callable[..., SweepStore]) -> None:
     store = sweep_of(how="exit", at=4)
     assert "ended with exit code 7 in step(), step 4" in finish.make_report(store).read_text(encoding="utf-8")
 
 
-def test_an_older_winner_is_not_shown_as_the_confirmed_one(sweep_of):
+def test_an_older_winner_is_not_shown_as_the_confirmed_one(sweep_of: Callable[..., SweepStore]) -> None:
     store = sweep_of(how="fail", where="close")  # harmless
     assert finished(store).exit_code == 0
     spec = store.read_record().spec
@@ -107,7 +112,9 @@ def test_an_older_winner_is_not_shown_as_the_confirmed_one(sweep_of):
 
 
 @pytest.mark.parametrize(("how", "words"), [("hang", "hangs in render()"), ("exit", "exit code 7 in render()")])
-def test_a_film_that_fails_is_a_note_and_an_exit_code(sweep_of, how, words):
+def test_a_film_that_fails_is_a_note_and_an_exit_code(
+    sweep_of: Callable[..., SweepStore], how: str, words: str
+) -> None:
     store = sweep_of(how=how, where="render", at=5)
     result = finished(store)
     assert result.exit_code == 3
@@ -120,7 +127,7 @@ def test_a_film_that_fails_is_a_note_and_an_exit_code(sweep_of, how, words):
     }  # fmt: skip
 
 
-def test_an_env_that_cannot_be_drawn_is_no_failure(sweep_of):
+def test_an_env_that_cannot_be_drawn_is_no_failure(sweep_of: Callable[..., SweepStore]) -> None:
     store = sweep_of(how="fail", where="render")
     result = finished(store)
     assert (result.exit_code, result.best is None) == (0, False)
@@ -128,7 +135,7 @@ def test_an_env_that_cannot_be_drawn_is_no_failure(sweep_of):
 
 
 @pytest.mark.parametrize("call", [sweeps.best, sweeps.evaluate, sweeps.video])
-def test_what_is_done_by_hand_is_guarded_too(sweep_of, call):
+def test_what_is_done_by_hand_is_guarded_too(sweep_of: Callable[..., SweepStore], call: Callable[..., Any]) -> None:
     store = sweep_of(how="exit", at=4)
     with pytest.raises(EnvFailedError, match=r"exit code 7 in step\(\), step 4"):
         call(store.folder)
@@ -141,7 +148,7 @@ def test_what_is_done_by_hand_is_guarded_too(sweep_of, call):
         (["launch", "sweep.yaml", "--json", "--storage", "here"], "hangs in step(), step 1 after reset()"),
     ],
 )
-def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path, arguments, words):
+def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path: Path, arguments: list[str], words: str) -> None:
     (tmp_path / "sweep.yaml").write_text(
         f"env: {{id: '{HOSTILE}', args: {{how: hang}}}}\nalgorithm: ppo\niteration_timeout_s: 1\n"
     )

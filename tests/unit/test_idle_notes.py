@@ -1,5 +1,7 @@
 """Hyperparameters that can't act: a search over one is refused, what acts in some points alone is told."""
 
+from typing import Any
+
 import pytest
 from spec_errors import MINIMAL
 
@@ -14,13 +16,13 @@ DQN = {"algorithm": "dqn", "stop": {"num_env_steps": 5000}}
 TWO_LRS = {"lr": {"grid": [1e-3, 1e-2]}}
 
 
-def notes(*records, **fields):
+def notes(*records: Any, **fields: Any) -> list[str]:
     """What the plan of a small sweep says, but for its engines."""
     made = make_plan(load_spec({**MINIMAL, "space": TWO_LRS, **fields}), Machine(2), records)
     return [note for note in made.notes if "packed" not in note]
 
 
-def grid(**values):
+def grid(**values: Any) -> dict[str, dict[str, list[bool | float | str]]]:
     return {name: {"grid": list(listed)} for name, listed in values.items()}
 
 
@@ -41,7 +43,7 @@ def grid(**values):
         ({"scheduler": {"type": "asha", "quantile_fraction": 0.25}}, []),
     ],
 )
-def test_settings_that_cannot_act_are_told(section, told):
+def test_settings_that_cannot_act_are_told(section: dict[str, dict[str, Any]], told: list[str]) -> None:
     found = notes(**{**PPO, **section})
     assert len(found) == len(told)
     assert all(note.startswith(words) for note, words in zip(found, told, strict=True))
@@ -70,18 +72,18 @@ NEVER = {
 
 
 @pytest.mark.parametrize("name", NEVER)
-def test_a_search_that_changes_nothing_is_refused(name):
+def test_a_search_that_changes_nothing_is_refused(name: str) -> None:
     fields, space, why = NEVER[name]
-    fields = {"num_samples": 1 if "grid" in space[name] else 6, **fields}
+    fields: dict[str, Any] = {"num_samples": 1 if "grid" in space[name] else 6, **fields}
     with pytest.raises(SpecError, match=rf"space\.{name} is searched, but can't act.*{why}") as refused:
-        notes(**fields, space=space)
+        notes(**fields, space=space)  # type: ignore[arg-type]
     assert "Take it out of space" in refused.value.hint
     # Whatever else is searched, no trial differs by this one.
     with pytest.raises(SpecError, match=rf"space\.{name} is searched"):
-        notes(**fields, space={**space, **grid(activation=["relu", "tanh"])})
+        notes(**fields, space={**space, **grid(activation=["relu", "tanh"])})  # type: ignore[arg-type]
 
 
-def test_several_are_told_at_once():
+def test_several_are_told_at_once() -> None:
     space = grid(kl_target=[0.01, 0.1], kl_coeff=[0.1, 0.2], lr=[1e-3, 1e-4])
     with pytest.raises(SpecError, match=r"space\.kl_target, space\.kl_coeff are searched") as refused:
         notes(**PPO, space=space)
@@ -89,18 +91,18 @@ def test_several_are_told_at_once():
 
 
 @pytest.mark.parametrize("more", [{}, {"search": "tpe", "num_samples": 30}, {"scheduler": "pbt", "num_samples": 3}])
-def test_whatever_chooses_the_points(more):
+def test_whatever_chooses_the_points(more: dict[str, int | str]) -> None:
     space = {"rmsprop_rho": {"uniform": [0.9, 0.99]}, "lr": {"loguniform": [1e-4, 1e-2]}}
     with pytest.raises(SpecError, match=r"space\.rmsprop_rho is searched.*optimizer is adam"):
         notes(**DQN, **{"num_samples": 3, **more}, space=space)
 
 
-def test_values_at_both_ends_of_a_range_may_be_alike_for_two_reasons_and_those_between_not():
+def test_values_at_both_ends_of_a_range_may_be_alike_for_two_reasons_and_those_between_not() -> None:
     space = {"learning_starts": {"randint": [0, 20_000]}}
     assert not any("space" in note for note in notes(**DQN, space=space, num_samples=2))
 
 
-def test_a_sweep_that_is_there_goes_on_and_is_told():
+def test_a_sweep_that_is_there_goes_on_and_is_told() -> None:
     spec = load_spec({**MINIMAL, **PPO, "space": grid(kl_target=[0.01, 0.1])})
     record = TrialRecord(trial_id="t0000", index=0, point_index=0, seed=1, point={"kl_target": 0.01})
     assert "space.kl_target can't act: use_kl_loss is false." in make_plan(spec, Machine(2), [record]).notes
@@ -109,14 +111,14 @@ def test_a_sweep_that_is_there_goes_on_and_is_told():
 # -- searched, and idle in some points
 
 
-def test_what_acts_in_some_points_alone_is_told_with_these():
+def test_what_acts_in_some_points_alone_is_told_with_these() -> None:
     space = grid(use_kl_loss=[False, True], kl_target=[0.01, 0.1])
     assert notes(**PPO, space=space) == ["space.kl_target can't act in 2 of 4 points (0, 1): use_kl_loss is false."]
     many = grid(use_kl_loss=[False, True], kl_target=[0.01 * number for number in range(1, 11)])
     assert notes(**PPO, space=many) == ["space.kl_target can't act in 10 of 20 points: use_kl_loss is false."]
 
 
-def test_each_reason_has_its_points():
+def test_each_reason_has_its_points() -> None:
     space = grid(use_kl_loss=[False, True], kl_coeff=[0.0, 0.2], kl_target=[0.01, 0.1])
     zero = "kl_coeff is 0, and stays 0 as it is changed by factors"
     assert notes(**PPO, space=space) == [
@@ -127,7 +129,7 @@ def test_each_reason_has_its_points():
     ]
 
 
-def test_the_search_of_one_optimizer_with_the_values_of_both_is_no_error():
+def test_the_search_of_one_optimizer_with_the_values_of_both_is_no_error() -> None:
     space = grid(optimizer=["adam", "rmsprop"], rmsprop_rho=[0.9, 0.99], adam_beta1=[0.8, 0.9])
     found = notes(**DQN, space=space)
     assert found == [
@@ -136,7 +138,7 @@ def test_the_search_of_one_optimizer_with_the_values_of_both_is_no_error():
     ]
 
 
-def test_values_that_act_alike_are_told_and_one_alone_is_not():
+def test_values_that_act_alike_are_told_and_one_alone_is_not() -> None:
     space = grid(replay_capacity=[2000, 8000, 20_000])
     (found,) = notes(**DQN, space=space)
     assert found.startswith(
@@ -145,7 +147,7 @@ def test_values_that_act_alike_are_told_and_one_alone_is_not():
     assert notes(**DQN, space=grid(replay_capacity=[2000, 8000])) == []
 
 
-def test_a_few_draws_of_a_range_that_act_alike_are_not_worth_a_note():
+def test_a_few_draws_of_a_range_that_act_alike_are_not_worth_a_note() -> None:
     rare = {"replay_capacity": {"randint": [100, 6100]}}
     assert notes(**DQN, space=rare, num_samples=50) == []
     often = {"replay_capacity": {"randint": [100, 20_000]}}
@@ -153,13 +155,13 @@ def test_a_few_draws_of_a_range_that_act_alike_are_not_worth_a_note():
     assert "its values act alike in" in found
 
 
-def test_mutations_may_change_what_others_depend_on():
+def test_mutations_may_change_what_others_depend_on() -> None:
     pbt = {"scheduler": "pbt", "num_samples": 1}
     (found,) = notes(**PPO, **pbt, space=grid(use_kl_loss=[False, True], kl_target=[0.01, 0.1]))
     assert found.endswith("use_kl_loss is false. A mutation of use_kl_loss may change that.")
 
 
-def test_points_that_are_not_known_yet_may_act():
+def test_points_that_are_not_known_yet_may_act() -> None:
     space = {**grid(optimizer=["adam", "rmsprop"]), "rmsprop_rho": {"uniform": [0.9, 0.99]}}
     (found,) = notes(**DQN, space=space, search="tpe", num_samples=30)
     assert "of 10 points that are known" in found
@@ -168,7 +170,7 @@ def test_points_that_are_not_known_yet_may_act():
 # -- fixed
 
 
-def test_fixed_values_that_cannot_act_are_told():
+def test_fixed_values_that_cannot_act_are_told() -> None:
     fixed = {"rmsprop_rho": 0.9, "adam_beta1": 0.8, "prioritized_beta": 0.5, "hidden_sizes": [8]}
     assert notes(**DQN, hyperparams=fixed) == [
         "hyperparams.rmsprop_rho can't act: optimizer is adam.",
@@ -178,19 +180,19 @@ def test_fixed_values_that_cannot_act_are_told():
     assert notes(**DQN, hyperparams={"rmsprop_rho": 0.9}, space=both) == []
 
 
-def test_a_searched_value_of_one_is_a_fixed_one():
+def test_a_searched_value_of_one_is_a_fixed_one() -> None:
     assert notes(**DQN, space={**grid(rmsprop_rho=[0.9]), **TWO_LRS}) == [
         "space.rmsprop_rho can't act: optimizer is adam."
     ]
 
 
-def test_what_is_switched_off_or_large_enough_needs_no_note():
+def test_what_is_switched_off_or_large_enough_needs_no_note() -> None:
     fixed = {"replay_capacity": 100_000, "target_update_freq": None, "target_network": False, "double_q": False}
     assert notes(**DQN, hyperparams=fixed) == []
     assert notes(**PPO, hyperparams={"use_kl_loss": False, "kl_coeff": 0.0})[0].startswith("hyperparams.kl_coeff")
 
 
-def test_trials_that_never_learn_are_told():
+def test_trials_that_never_learn_are_told() -> None:
     fixed = {"learning_starts": 6003, "gamma": 0.9}
     (found,) = notes(**DQN, hyperparams=fixed, space={}, num_samples=1)
     assert found == (
@@ -206,7 +208,7 @@ def test_trials_that_never_learn_are_told():
     assert notes(**DQN, hyperparams={"learning_starts": 6002}) == []
 
 
-def test_the_exploration_of_a_users_own_module_is_its_own_affair(monkeypatch):
+def test_the_exploration_of_a_users_own_module_is_its_own_affair(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_rl_module", lambda spec: None)
     flat = {"epsilon_initial": 0.1, "epsilon_final": 0.1}
     assert notes(**DQN, rl_module="own:Module", hyperparams=flat, space=grid(epsilon_decay=[10, 100])) == []

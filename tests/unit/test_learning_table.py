@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,23 +13,31 @@ from tests.learning import __main__ as command
 from tests.learning.measure import Measurement, SeedResult, misses, owns_up, verdict
 from tests.learning.table import HEADINGS, markdown, row
 from tests.learning.targets import TARGETS, Target, Task, tasks
+from tests.narrowing import present
 from tune_jobs.spec.file import read_preset
 
 
-def seed(score, *, steps=50_000, solve=20_000, returns=(), random=20.0):
+def seed(
+    score: float,
+    *,
+    steps: int = 50_000,
+    solve: int | None = 20_000,
+    returns: Sequence[float] | tuple[Any, ...] = (),
+    random: float = 20.0,
+) -> SeedResult:
     return SeedResult("t0000", score, tuple(returns), random, steps, steps, solve, 1.0)
 
 
-def measured(*seeds, preset="cartpole-dqn-replay", num_failed=0):
+def measured(*seeds: SeedResult, preset: str = "cartpole-dqn-replay", num_failed: int = 0) -> Measurement:
     return Measurement(preset, seeds, num_failed, 60.0)
 
 
-def task(preset="cartpole-dqn-replay", target=None):
+def task(preset: str = "cartpole-dqn-replay", target: Target | None = None) -> Task:
     target = target or TARGETS[preset]
     return Task(preset, target, target)
 
 
-def test_the_median_over_the_seeds_decides():
+def test_the_median_over_the_seeds_decides() -> None:
     target = Target("why", score=195)
     lucky = measured(seed(200.0), seed(100.0), seed(196.0), seed(9.0), seed(195.0))
     assert lucky.score == 195.0
@@ -34,13 +45,13 @@ def test_the_median_over_the_seeds_decides():
     assert misses(target, measured(seed(200.0), seed(194.9), seed(9.0))) == ["score 194.9 < 195"]
 
 
-def test_a_failed_seed_is_a_miss_and_so_are_no_seeds():
+def test_a_failed_seed_is_a_miss_and_so_are_no_seeds() -> None:
     target = Target("why", score=195)
     assert misses(target, measured(seed(200.0), num_failed=1)) == ["1 trials failed"]
     assert misses(target, measured(num_failed=5)) == ["every trial failed"]
 
 
-def test_no_seed_may_take_more_env_steps():
+def test_no_seed_may_take_more_env_steps() -> None:
     target = Target("why", score=500, max_env_steps=60_000)
     assert misses(target, measured(seed(500.0, steps=60_000), seed(500.0, steps=100))) == []
     assert misses(target, measured(seed(500.0, steps=60_001), seed(500.0), seed(500.0))) == [
@@ -48,14 +59,14 @@ def test_no_seed_may_take_more_env_steps():
     ]
 
 
-def test_solving_within_is_strict_and_about_the_median():
+def test_solving_within_is_strict_and_about_the_median() -> None:
     target = Target("why", solve_within=140_000)
     assert misses(target, measured(seed(1.0, solve=139_999), seed(1.0, solve=None), seed(1.0, solve=5))) == []
     assert misses(target, measured(seed(1.0, solve=140_000))) == ["solved after 140,000, not within 140,000 env steps"]
     assert misses(target, measured(seed(1.0, solve=None)))[0].startswith("never solved in training")
 
 
-def test_full_episodes_are_counted_among_the_first():
+def test_full_episodes_are_counted_among_the_first() -> None:
     target = TARGETS["cartpole-dqn-keras"]
     good = [500.0] * 19 + [499.0] + [500.0] * 80
     assert misses(target, measured(seed(490.0, returns=good))) == []
@@ -65,11 +76,11 @@ def test_full_episodes_are_counted_among_the_first():
     assert len(misses(target, measured(seed(400.0, returns=poor)))) == 2
 
 
-def test_falling_short_of_random_play_passes_only_where_the_preset_says_so(monkeypatch):
+def test_falling_short_of_random_play_passes_only_where_the_preset_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     last = task("cartpole-dql-last")
     found = measured(seed(59.0), preset="cartpole-dql-last")
-    assert misses(last.target, measured(seed(60.0))) == []
-    assert misses(last.target, found) == ["2.95 x random play < 3 x"]
+    assert misses(present(last.target), measured(seed(60.0))) == []
+    assert misses(present(last.target), found) == ["2.95 x random play < 3 x"]
     for words, fine in (("It does not beat random play.", True), ("It beats random play.", False)):
         monkeypatch.setattr(
             "tests.learning.measure.find_preset",
@@ -90,11 +101,11 @@ def test_falling_short_of_random_play_passes_only_where_the_preset_says_so(monke
         ("not solved. It beats random play", False),
     ],
 )
-def test_what_owning_up_means(words, fine):
+def test_what_owning_up_means(words: str, fine: bool) -> None:
     assert owns_up(read_preset("x", f"about:\n  title: T\n  description: More {words}\n")) is fine
 
 
-def test_the_target_is_the_fixed_siblings_and_the_plain_one_is_measured_beside_it():
+def test_the_target_is_the_fixed_siblings_and_the_plain_one_is_measured_beside_it() -> None:
     found, skipped = tasks({"cartpole-dqn-keras", "cartpole-dqn-keras-fixed", "acrobot-ppo", "own"})
     assert [(item.preset, item.target is None) for item in found] == [
         ("cartpole-dqn-keras", True),
@@ -109,7 +120,7 @@ def test_the_target_is_the_fixed_siblings_and_the_plain_one_is_measured_beside_i
     )
 
 
-def test_wanted_presets_alone_are_run_and_unknown_ones_named():
+def test_wanted_presets_alone_are_run_and_unknown_ones_named() -> None:
     found, skipped = tasks({"acrobot-ppo", "pendulum-ppo"}, ("pendulum-ppo", "acrobot-dqn"))
     assert [item.preset for item in found] == ["pendulum-ppo"]
     assert list(skipped) == ["acrobot-dqn"]
@@ -117,13 +128,13 @@ def test_wanted_presets_alone_are_run_and_unknown_ones_named():
         tasks({"acrobot-ppo"}, ("acrobat",))
 
 
-def test_every_target_has_a_reason_and_something_to_reach():
+def test_every_target_has_a_reason_and_something_to_reach() -> None:
     for name, target in TARGETS.items():
         assert len(target.reason) > 10, name
         assert misses(target, measured(seed(-1e9, steps=10**9, solve=None, returns=[-1.0] * 100))), name
 
 
-def test_a_row_tells_all_of_a_preset():
+def test_a_row_tells_all_of_a_preset() -> None:
     cells = row(
         task("cartpole-ppo-single"),
         measured(seed(200.0, solve=30_000), seed(190.0, solve=None), seed(198.0, solve=9_000, steps=40_000)),
@@ -142,10 +153,12 @@ def test_a_row_tells_all_of_a_preset():
     assert markdown([cells]).splitlines()[2].startswith("| cartpole-ppo-single | 195, solved before 140,000 | 198.0 |")
 
 
-def run(monkeypatch, tmp_path, answers, *arguments):
+def run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, answers: dict[str, EnvError | Measurement], *arguments: str
+) -> int:
     """The command with measurements by preset, exceptions raised."""
 
-    def fake(task, num_seeds, storage):
+    def fake(task: Task, num_seeds: int, storage: Path) -> Measurement:
         answer = answers[task.preset]
         if isinstance(answer, Exception):
             raise answer
@@ -157,7 +170,9 @@ def run(monkeypatch, tmp_path, answers, *arguments):
     return command.main([*arguments, "--json", str(tmp_path / "out.json")])
 
 
-def test_the_exit_code_tells_a_miss(monkeypatch, tmp_path, capsys):
+def test_the_exit_code_tells_a_miss(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     good, bad = measured(seed(200.0)), measured(seed(100.0))
     assert run(monkeypatch, tmp_path, {"cartpole-dqn-replay": good}) == 0
     assert "cartpole-dql-last: skipped, there is no preset of this name" in capsys.readouterr().out
@@ -171,7 +186,9 @@ def test_the_exit_code_tells_a_miss(monkeypatch, tmp_path, capsys):
     assert documents[0]["seeds"][0]["score"] == 200.0
 
 
-def test_a_missing_package_skips_and_a_wrong_preset_does_not(monkeypatch, tmp_path, capsys):
+def test_a_missing_package_skips_and_a_wrong_preset_does_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     missing = EnvError("LunarLander needs Box2D.", "Install it: pip install Box2D==2.3.10")
     assert run(monkeypatch, tmp_path, {"lunarlander-ppo": missing}) == 0
     assert "lunarlander-ppo: skipped, it cannot run here: LunarLander needs Box2D." in capsys.readouterr().out
@@ -180,7 +197,9 @@ def test_a_missing_package_skips_and_a_wrong_preset_does_not(monkeypatch, tmp_pa
         run(monkeypatch, tmp_path, {"lunarlander-ppo": EnvError("No such argument.", "It takes: x.")})
 
 
-def test_bad_options_are_exit_code_2(monkeypatch, tmp_path, capsys):
+def test_bad_options_are_exit_code_2(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(monkeypatch, tmp_path, {}, "--preset", "nope") == 2
     assert "no target for nope" in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:

@@ -4,6 +4,8 @@ import io
 import os
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from fake_engine import FakeClock
@@ -11,17 +13,18 @@ from rich.console import Console
 from test_monitor import make_monitor, make_trial
 
 from tune_jobs.sweeps import live_table as live
+from tune_jobs.sweeps.monitor import SweepMonitor
 
 
-def screen(monitor, width=120):
+def screen(monitor: SweepMonitor, width: int = 120) -> str:
     """The table as text."""
     console = Console(file=io.StringIO(), width=width, color_system=None, force_terminal=True, legacy_windows=False)
     console.print(live.render(monitor))
-    return console.file.getvalue()
+    return cast("str", cast("Any", console.file).getvalue())
 
 
 @pytest.fixture
-def running():
+def running() -> tuple[SweepMonitor, FakeClock]:
     """(monitor, its clock): one trial of six is done, one has failed, two run."""
     clock = FakeClock()
     monitor = make_monitor(*(make_trial(index) for index in range(6)), clock=clock, cap=50_000)
@@ -36,7 +39,7 @@ def running():
     return monitor, clock
 
 
-def test_the_table_tells_how_far_it_is_what_is_best_and_what_runs(running):
+def test_the_table_tells_how_far_it_is_what_is_best_and_what_runs(running: tuple[SweepMonitor, FakeClock]) -> None:
     text = screen(running[0])
     lines = text.splitlines()
     assert "mine" in lines[0]
@@ -58,14 +61,14 @@ def test_the_table_tells_how_far_it_is_what_is_best_and_what_runs(running):
     assert not any(line.startswith(("t0000", "t0001", "t0004")) for line in lines)
 
 
-def test_before_the_first_score_and_rate_it_says_so():
+def test_before_the_first_score_and_rate_it_says_so() -> None:
     text = screen(make_monitor(make_trial(0)))
     assert "no evaluation yet" in text
     assert "0 of 1 trials" in text
     assert "left: about ?" in text
 
 
-def test_many_running_trials_do_not_fill_the_screen():
+def test_many_running_trials_do_not_fill_the_screen() -> None:
     monitor = make_monitor(*(make_trial(index) for index in range(40)))
     for index in range(30):
         monitor.update(make_trial(index, "running"))
@@ -74,21 +77,21 @@ def test_many_running_trials_do_not_fill_the_screen():
     assert sum(line.startswith("t00") for line in text.splitlines()) == 12
 
 
-def test_who_stops_it_is_told_what_happens(running):
+def test_who_stops_it_is_told_what_happens(running: tuple[SweepMonitor, FakeClock]) -> None:
     monitor, _ = running
     assert "Ctrl-C again" not in screen(monitor)
     monitor.stopping = True
     assert "Stopping: the running trials save a checkpoint. Ctrl-C again ends them now." in screen(monitor)
 
 
-def test_a_narrow_terminal_still_shows_the_numbers(running):
+def test_a_narrow_terminal_still_shows_the_numbers(running: tuple[SweepMonitor, FakeClock]) -> None:
     text = screen(running[0], width=80)
     assert all(len(line) <= 80 for line in text.splitlines())
     assert "12,345" in text
     assert "195.2" in text
 
 
-def test_values_are_no_markup():
+def test_values_are_no_markup() -> None:
     """A list among the values looks like rich's markup."""
     trial = make_trial(0, "running", score=1.0, steps=5)
     trial = trial.model_copy(update={"point": {"hidden_sizes": [64, 32], "activation": "[red]"}})
@@ -97,11 +100,11 @@ def test_values_are_no_markup():
     assert "hidden_sizes 64x32, activation [red]" in screen(monitor)
 
 
-def test_a_point_without_values_is_named():
+def test_a_point_without_values_is_named() -> None:
     assert live.describe_point(make_trial(0).model_copy(update={"point": {}})) == "no searched values"
 
 
-def test_a_line_for_logs_tells_the_same(running):
+def test_a_line_for_logs_tells_the_same(running: tuple[SweepMonitor, FakeClock]) -> None:
     line = live.summary_line(running[0])
     assert "\n" not in line
     words = ("mine: 1 min 15 s", "2 running", "1 failed", "62,355 env steps", "best 195.2 (t0000: lr 0.001)", "left")
@@ -128,7 +131,7 @@ print("done")
 
 
 @pytest.mark.parametrize(("progress", "lines"), [("auto", 1), ("none", 0)])
-def test_nothing_else_is_on_the_terminal(tmp_path, progress, lines):
+def test_nothing_else_is_on_the_terminal(tmp_path: Path, progress: str, lines: int) -> None:
     log = tmp_path / "driver.log"
     code = PROGRAM.format(here=os.path.dirname(__file__), progress=progress, log=str(log))  # noqa: PTH120
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -142,15 +145,17 @@ def test_nothing_else_is_on_the_terminal(tmp_path, progress, lines):
 
 
 @pytest.mark.parametrize(("progress", "first"), [("auto", "note: one\nnote: two\nmine: "), ("none", "")])
-def test_the_plans_notes_come_first(tmp_path, capfd, progress, first):
+def test_the_plans_notes_come_first(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], progress: str, first: str
+) -> None:
     with live.shown(make_monitor(make_trial(0)), progress, tmp_path / "driver.log", ["one", "two"]):
         pass
     assert capfd.readouterr().err.startswith(first)
     assert progress == "auto" or not capfd.readouterr().err
 
 
-def test_streams_come_back_after_an_error(tmp_path, capfd):
-    def fail():
+def test_streams_come_back_after_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
         with live.shown(make_monitor(make_trial(0)), "none", tmp_path / "driver.log"):
             os.write(1, b"hidden")
             raise ZeroDivisionError

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from trial_runs import Trial
@@ -15,7 +17,7 @@ SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1" / "trials" / "t000
 
 
 @pytest.fixture
-def checkpoint(tmp_path):
+def checkpoint(tmp_path: Path) -> Path:
     trial = Trial(tmp_path / "mine", stop={"num_iterations": 2})
     trial.run()
     folder = trial.store.checkpoint_folder(2)
@@ -27,12 +29,14 @@ def checkpoint(tmp_path):
 
 
 @pytest.fixture
-def old_checkpoint(tmp_path):
+def old_checkpoint(tmp_path: Path) -> Path:
     """Of format 1, which had no seals."""
     return shutil.copytree(SAMPLE, tmp_path / "old")
 
 
-def edit(checkpoint, change, *, sealed=True):
+def edit(
+    checkpoint: Path, change: Callable[..., str | dict[str, dict[str, Any]] | None], *, sealed: bool = True
+) -> None:
     path = checkpoint / "manifest.json"
     data = json.loads(path.read_text())
     change(data)
@@ -65,7 +69,9 @@ BAD_FILES = {
 
 @pytest.mark.parametrize("case", BAD_FILES)
 @pytest.mark.parametrize("kind", ["checkpoint", "old_checkpoint"])
-def test_a_manifest_that_does_not_cover_the_folder_is_refused(request, kind, case):
+def test_a_manifest_that_does_not_cover_the_folder_is_refused(
+    request: pytest.FixtureRequest, kind: str, case: str
+) -> None:
     folder, (change, words) = request.getfixturevalue(kind), BAD_FILES[case]
     verify_checkpoint(folder)
     edit(folder, change)
@@ -76,7 +82,9 @@ def test_a_manifest_that_does_not_cover_the_folder_is_refused(request, kind, cas
 
 @pytest.mark.parametrize("name", ["more.pkl", "rllib/algorithm_state.pkl", ".hidden"])
 @pytest.mark.parametrize("kind", ["checkpoint", "old_checkpoint"])
-def test_a_file_that_the_manifest_does_not_name_is_refused(request, kind, name):
+def test_a_file_that_the_manifest_does_not_name_is_refused(
+    request: pytest.FixtureRequest, kind: str, name: str
+) -> None:
     folder = request.getfixturevalue(kind)
     (folder / name).parent.mkdir(exist_ok=True)
     (folder / name).write_text("something that would be unpickled")
@@ -85,7 +93,7 @@ def test_a_file_that_the_manifest_does_not_name_is_refused(request, kind, name):
 
 
 @pytest.mark.parametrize("name", ["policy.json", "manifest.json", "rllib"])
-def test_links_in_a_checkpoint_are_refused(checkpoint, tmp_path, name):
+def test_links_in_a_checkpoint_are_refused(checkpoint: Path, tmp_path: Path, name: str) -> None:
     if (checkpoint / name).exists():
         (checkpoint / name).rename(tmp_path / name)
     (checkpoint / name).symlink_to(tmp_path / name)
@@ -94,7 +102,7 @@ def test_links_in_a_checkpoint_are_refused(checkpoint, tmp_path, name):
 
 
 @pytest.mark.parametrize("changes", [{"evaluation_return": 924.5}, {"num_env_steps": 1}, {"trial_id": "t0007"}])
-def test_a_changed_manifest_is_refused(checkpoint, changes):
+def test_a_changed_manifest_is_refused(checkpoint: Path, changes: dict[str, Any]) -> None:
     """However small: 2.0 became 924.5, and won."""
     assert read_manifest(checkpoint).evaluation_return == 2.0
     edit(checkpoint, lambda data: data.update(changes), sealed=False)
@@ -103,19 +111,19 @@ def test_a_changed_manifest_is_refused(checkpoint, changes):
             read(checkpoint)
 
 
-def test_a_seal_that_is_gone_is_missed(checkpoint):
+def test_a_seal_that_is_gone_is_missed(checkpoint: Path) -> None:
     edit(checkpoint, lambda data: data.pop("sha256"), sealed=False)
     with pytest.raises(CheckpointError, match="that was written"):
         read_manifest(checkpoint)
 
 
-def test_a_manifest_that_is_only_laid_out_otherwise_is_the_same(checkpoint):
+def test_a_manifest_that_is_only_laid_out_otherwise_is_the_same(checkpoint: Path) -> None:
     path = checkpoint / "manifest.json"
     path.write_text(json.dumps(dict(reversed(json.loads(path.read_text()).items()))))
     assert verify_checkpoint(checkpoint).evaluation_return == 2.0
 
 
-def test_a_manifest_of_format_1_is_read(old_checkpoint):
+def test_a_manifest_of_format_1_is_read(old_checkpoint: Path) -> None:
     record = verify_checkpoint(old_checkpoint)
     assert (record.trial_id, record.iteration, record.num_env_steps, record.evaluation_return) == (
         "t0001",

@@ -1,5 +1,7 @@
 """How population based training changes values: always within the domain, near the better trial's or drawn anew."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
@@ -13,7 +15,12 @@ from tune_jobs.spec.rules import FIXED_IN_A_POPULATION
 DOMAIN = TypeAdapter(Domain)
 
 
-def neighbours(domain, value, resample_probability=0.0, draws=300):
+def neighbours(
+    domain: dict[str, Sequence[bool | float | Sequence[int]]],
+    value: bool | float | Sequence[int],
+    resample_probability: float = 0.0,
+    draws: int = 300,
+) -> set[str]:
     space = {"x": DOMAIN.validate_python(domain)}
     rng = np.random.default_rng(0)
     return {repr(mutate({"x": value}, space, rng, resample_probability)["x"]) for _ in range(draws)}
@@ -37,20 +44,22 @@ def neighbours(domain, value, resample_probability=0.0, draws=300):
         ({"choice": [True, False]}, True, {True, False}),
     ],
 )
-def test_a_neighbouring_value_is_one_step_away_and_in_the_domain(domain, value, expected):
+def test_a_neighbouring_value_is_one_step_away_and_in_the_domain(
+    domain: dict[str, list[bool | float | str]], value: bool | float | str, expected: set[bool | float | str]
+) -> None:
     assert neighbours(domain, value) == {repr(value) for value in expected}
 
 
-def test_a_list_of_sizes_read_back_from_json_is_found_again():
+def test_a_list_of_sizes_read_back_from_json_is_found_again() -> None:
     assert neighbours({"grid": [[16], [32], [64, 64]]}, [32]) == {"[16]", "[64, 64]"}
 
 
-def test_a_value_drawn_anew_comes_from_the_whole_domain():
+def test_a_value_drawn_anew_comes_from_the_whole_domain() -> None:
     assert neighbours({"choice": [1, 2, 3, 4, 5]}, 1, resample_probability=1.0) == {"1", "2", "3", "4", "5"}
     assert neighbours({"choice": [1, 2, 3, 4, 5]}, 1, resample_probability=0.0) == {"1", "2"}
 
 
-def test_the_resample_probability_is_the_share_of_values_drawn_anew():
+def test_the_resample_probability_is_the_share_of_values_drawn_anew() -> None:
     space = {"x": DOMAIN.validate_python({"uniform": [0.0, 1.0]})}
     rng = np.random.default_rng(1)
     values = [mutate({"x": 0.5}, space, rng, 0.3)["x"] for _ in range(2000)]
@@ -58,12 +67,12 @@ def test_the_resample_probability_is_the_share_of_values_drawn_anew():
     assert 0.25 < anew / 2000 < 0.35
 
 
-def test_the_same_trial_and_change_give_the_same_mutation_and_others_another():
+def test_the_same_trial_and_change_give_the_same_mutation_and_others_another() -> None:
     draws = {key: random_streams.mutation(*key).random() for key in [(0, 1, 0), (0, 1, 1), (0, 2, 0), (1, 1, 0)]}
     assert len(set(draws.values())) == 4
     assert random_streams.mutation(0, 1, 1).random() == draws[0, 1, 1]
 
 
-def test_all_names_that_are_refused_exist():
+def test_all_names_that_are_refused_exist() -> None:
     known = {name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields}
     assert known >= FIXED_IN_A_POPULATION

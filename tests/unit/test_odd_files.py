@@ -4,16 +4,21 @@ import contextlib
 import itertools
 import json
 import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import odd_files
 import pytest
 
+from analysis.records import CheckpointRecord
 from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
 from policies.packed.state import load_member
 from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import candidates
 from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.pack_files import PackFiles
@@ -23,25 +28,25 @@ from tune_jobs.sweeps import verbs as sweeps
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory):
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return odd_files.make_template(tmp_path_factory.mktemp("template") / "mine")
 
 
 @pytest.fixture(autouse=True)
-def _no_modules_stay_allowed(monkeypatch):
+def _no_modules_stay_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
 
 
 @pytest.fixture
-def folder(template, tmp_path):
+def folder(template: Path, tmp_path: Path) -> Path:
     return shutil.copytree(template, tmp_path / "mine")
 
 
-def act(path):
+def act(path: Path) -> None:
     load_policy(path).act(np.zeros(4))
 
 
-def read_results(folder):
+def read_results(folder: Path) -> tuple[list[Any], list[CheckpointRecord]]:
     trial = SweepStore(folder).trial("t0001")
     return trial.read_iterations(), candidates(trial)
 
@@ -60,7 +65,9 @@ READERS = {
 """What reads each file, and little else: it is asked thousands of times."""
 
 
-def problems(folder, template, file, make, ask):
+def problems(
+    folder: Path, template: Path, file: str, make: Callable[[Path], None], ask: Callable[[Path], SweepSpec]
+) -> Iterator[Any]:
     """Errors that are none of ours, where a file was made wrong; it is mended afterwards."""
     try:
         make(folder / file)
@@ -77,10 +84,10 @@ def problems(folder, template, file, make, ask):
 
 
 @pytest.mark.parametrize("file", odd_files.FILES)
-def test_every_field_of_every_file_may_hold_anything(folder, template, file):
+def test_every_field_of_every_file_may_hold_anything(folder: Path, template: Path, file: str) -> None:
     """A third of the values for each field, the next third for the next one."""
     data, values = odd_files.read(template / file), itertools.cycle(odd_files.WRONG.items())
-    found = {}
+    found: dict[str, Any] = {}
     for at, ask in itertools.product(odd_files.places(data), READERS[file]):
         some = itertools.islice(values, len(odd_files.WRONG) // 3 + 1)
         changed = {name: odd_files.put(data, at, value) for name, value in some}
@@ -92,8 +99,8 @@ def test_every_field_of_every_file_may_hold_anything(folder, template, file):
 
 
 @pytest.mark.parametrize("content", odd_files.CONTENTS)
-def test_every_file_may_be_none_of_ours(folder, template, content):
-    def make(path):
+def test_every_file_may_be_none_of_ours(folder: Path, template: Path, content: str) -> None:
+    def make(path: Path) -> None:
         path.write_bytes(odd_files.CONTENTS[content])
         odd_files.in_manifest(path)
 
@@ -109,13 +116,13 @@ class EarlyEndError(Exception):
 
 
 @pytest.fixture
-def resume(monkeypatch):
-    def early(*arguments, **options):
+def resume(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], Any]:
+    def early(*arguments: Any, **options: Any) -> None:
         raise EarlyEndError
 
     monkeypatch.setattr(sweeps, "run_sweep", early)
 
-    def resume(folder):
+    def resume(folder: Path) -> None:
         with pytest.raises((EarlyEndError, TuneJobsError)):
             sweeps.resume(folder)
 
@@ -123,10 +130,12 @@ def resume(monkeypatch):
 
 
 @pytest.mark.parametrize("file", ["sweep.json", "trials/t0001/trial.json", "trials/t0001/results.jsonl"])
-def test_a_sweep_with_anything_in_a_record_is_shown_and_resumed_or_refused(folder, template, file, resume):
+def test_a_sweep_with_anything_in_a_record_is_shown_and_resumed_or_refused(
+    folder: Path, template: Path, file: str, resume: Callable[[Path], Any]
+) -> None:
     """One value for each field, another for the next one."""
     data, values = odd_files.read(template / file), itertools.cycle(odd_files.WRONG.items())
-    found = {}
+    found: dict[str, Any] = {}
     for at in odd_files.places(data):
         name, value = next(values)
         for ask in (sweeps.trials, sweeps.dataframe, resume):
@@ -141,7 +150,9 @@ def test_a_sweep_with_anything_in_a_record_is_shown_and_resumed_or_refused(folde
 
 @pytest.mark.parametrize("content", ["null", "a list", "no text"])
 @pytest.mark.parametrize("file", READERS)
-def test_the_best_of_a_sweep_with_a_file_that_is_none_of_ours_is_chosen_or_refused(folder, template, file, content):
+def test_the_best_of_a_sweep_with_a_file_that_is_none_of_ours_is_chosen_or_refused(
+    folder: Path, template: Path, file: str, content: str
+) -> None:
     (folder / file).write_bytes(odd_files.CONTENTS[content])
     for ask in (
         lambda folder: sweeps.best(folder, num_episodes=1),
@@ -152,7 +163,9 @@ def test_the_best_of_a_sweep_with_a_file_that_is_none_of_ours_is_chosen_or_refus
             ask(folder)
 
 
-def test_a_sweep_that_cannot_be_read_does_not_hide_the_others(folder, template, caplog):
+def test_a_sweep_that_cannot_be_read_does_not_hide_the_others(
+    folder: Path, template: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     other = shutil.copytree(template, folder.parent / "other")
     (other / "sweep.json").write_text("[]")
     assert [status.sweep.name for status in sweeps.list_sweeps(folder.parent)] == ["mine"]
@@ -167,7 +180,7 @@ def test_a_sweep_that_cannot_be_read_does_not_hide_the_others(folder, template, 
 @pytest.mark.parametrize(
     "verb", ["status", "trials", "dataframe", "best", "report", "stop", "resume", "restore", "evaluate", "video"]
 )
-def test_a_sweep_is_called_anything(tmp_path, monkeypatch, verb, name):
+def test_a_sweep_is_called_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str, name: str) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(TuneJobsError):
         getattr(sweeps, verb)(name)
@@ -181,7 +194,7 @@ def test_a_sweep_is_called_anything(tmp_path, monkeypatch, verb, name):
 # -- weights
 
 
-def damage_bytes(content, rng):
+def damage_bytes(content: bytes, rng: np.random.Generator) -> bytes:
     content = bytearray(content)
     for index in rng.integers(len(content), size=4):
         content[index] ^= 1 << int(rng.integers(8))
@@ -189,7 +202,7 @@ def damage_bytes(content, rng):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_weights_that_are_damaged_are_refused(folder, seed):
+def test_weights_that_are_damaged_are_refused(folder: Path, seed: int) -> None:
     """Also by somebody who knows which hash stands where."""
     from hashlib import sha256
 
@@ -208,7 +221,9 @@ def test_weights_that_are_damaged_are_refused(folder, seed):
 
 @pytest.mark.parametrize("dtype", [np.float64, np.int32, np.bool_, np.float16])
 @pytest.mark.parametrize("shape", [None, (), (0,), (3, 3, 3)])
-def test_weights_of_other_types_and_shapes_are_taken_or_refused(folder, dtype, shape):
+def test_weights_of_other_types_and_shapes_are_taken_or_refused(
+    folder: Path, dtype: type, shape: tuple[int, ...] | None
+) -> None:
     from hashlib import sha256
 
     from safetensors.numpy import load, save

@@ -6,6 +6,8 @@ Each case is a script in a process of its own, since what counts is the state of
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -15,10 +17,10 @@ OURS = "import analysis.report, policies.acting.policy, policies.packed.dqn.repl
 
 
 @pytest.fixture
-def project(tmp_path):
+def project(tmp_path: Path) -> Callable[[str, dict[str, str], bool], tuple[str, str]]:
     """Writes a script's folder and runs the script in it; returns its standard output and error."""
 
-    def run(script, files, *, fails=False):
+    def run(script: str, files: dict[str, str], *, fails: bool = False) -> tuple[str, str]:
         for path, text in {**files, "script.py": script}.items():
             (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / path).write_text(text)
@@ -47,7 +49,9 @@ USE = (
 
 @pytest.mark.parametrize("with_inits", [False, True], ids=["folders", "packages"])
 @pytest.mark.parametrize("first", ["tune_jobs", "theirs", "within"])
-def test_modules_of_both_are_found(project, with_inits, first):
+def test_modules_of_both_are_found(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]], with_inits: bool, first: str
+) -> None:
     files = {**HELPERS, **(INITS if with_inits else {})}
     script = {
         "tune_jobs": "import tune_jobs\n" + USE + OURS + USE,
@@ -63,7 +67,9 @@ def test_modules_of_both_are_found(project, with_inits, first):
 
 
 @pytest.mark.parametrize("first", ["tune_jobs", "theirs"])
-def test_names_in_the_users_own_packages_are_found(project, first):
+def test_names_in_the_users_own_packages_are_found(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]], first: str
+) -> None:
     names = "from analysis import LEVEL, plot_all\nimport analysis\nprint(LEVEL, plot_all(), analysis.LEVEL)\n"
     imports = ["import tune_jobs\n" + OURS, names]
     script = "".join(imports if first == "tune_jobs" else imports[::-1])
@@ -71,7 +77,9 @@ def test_names_in_the_users_own_packages_are_found(project, first):
     assert stdout.splitlines() == ["3 plotted 3"] * 2 + ["3"]
 
 
-def test_plain_modules_of_these_names_are_found(project):
+def test_plain_modules_of_these_names_are_found(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     files = {"analysis.py": "import statistics\nLEVEL = 3\nclass Kept: pass\n", "policies.py": "WIDTH = 7\n"}
     script = (
         "import analysis\nfrom analysis import Kept\nimport tune_jobs\n" + OURS + "import analysis.statistics\n"
@@ -81,13 +89,15 @@ def test_plain_modules_of_these_names_are_found(project):
     assert project(script, files)[0] == "3 3 7 True"
 
 
-def test_the_users_code_runs_only_when_it_is_asked_for(project):
+def test_the_users_code_runs_only_when_it_is_asked_for(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     files = {"policies/__init__.py": "print('ran')\nWIDTH = 7\n", "policies/nets.py": ""}
     script = "import tune_jobs\n" + OURS + "from policies import errors\nimport policies.nets\n"
     assert project(script + "print('now')\nimport policies\npolicies.WIDTH", files)[0].splitlines() == ["now", "ran"]
 
 
-def test_what_neither_has_is_missing_as_ever(project):
+def test_what_neither_has_is_missing_as_ever(project: Callable[[str, dict[str, str], bool], tuple[str, str]]) -> None:
     script = (
         "import tune_jobs, analysis\nprint(hasattr(analysis, 'nothing'))\n"
         "for line in ('import analysis.nothing', 'from policies import nothing', 'import policies.packed.nothing'):\n"
@@ -97,13 +107,15 @@ def test_what_neither_has_is_missing_as_ever(project):
     assert project(script, {**HELPERS, **INITS})[0].splitlines() == expected
 
 
-def test_an_error_in_the_users_package_reaches_them(project):
+def test_an_error_in_the_users_package_reaches_them(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     attempt = "try:\n    from analysis import x\nexcept ZeroDivisionError:\n    print(0)\n"
     script = f"import tune_jobs\n{attempt}{attempt}"
     assert project(script, {"analysis/__init__.py": "x = 1 / 0\n"})[0].split() == ["0", "0"]
 
 
-def test_a_hidden_module_is_warned_of_once(project):
+def test_a_hidden_module_is_warned_of_once(project: Callable[[str, dict[str, str], bool], tuple[str, str]]) -> None:
     files = {
         "policies/__init__.py": "",
         "policies/networks.py": "",
@@ -126,7 +138,9 @@ def test_a_hidden_module_is_warned_of_once(project):
     assert "nets.py" not in stderr
 
 
-def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(project):
+def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     files = {
         "policies/envs/cart.py": "",
         "policies/packed/notes.txt": "",
@@ -139,7 +153,9 @@ def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(project):
     assert f"policies{os.sep}envs: `import policies.envs` gives tune-jobs' own" in warnings[0]
 
 
-def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(project):
+def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     files = {"policies/__init__.py": "", "policies/networks.py": ""}
     script = "import policies.networks\nimport tune_jobs\n"
     error = project(script, files, fails=True)[1].splitlines()[-1]
@@ -148,7 +164,9 @@ def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(project):
     assert "Rename" in error
 
 
-def test_a_spawned_process_of_environments_finds_ours(project):
+def test_a_spawned_process_of_environments_finds_ours(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     script = (
         "if __name__ == '__main__':\n"
         "    import tune_jobs\n"
@@ -165,7 +183,9 @@ def test_a_spawned_process_of_environments_finds_ours(project):
 ENV = "import gymnasium\n\n\nclass Walk(gymnasium.Env):\n    pass\n"
 
 
-def test_environments_in_the_users_packages_are_found_by_id_and_for_other_processes(project):
+def test_environments_in_the_users_packages_are_found_by_id_and_for_other_processes(
+    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+) -> None:
     # As the command has it: without the current folder on the path.
     script = (
         "import os, sys\nsys.path.pop(0)\nimport tune_jobs\n"

@@ -1,12 +1,15 @@
 """Whom a pack is to train, and the end of what it printed."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import pytest
 
 from policies.errors import CheckpointError
 from tune_jobs.store.pack_files import Assignment, PackFiles
 
 
-def test_an_assignment_is_read_as_it_was_written(tmp_path):
+def test_an_assignment_is_read_as_it_was_written(tmp_path: Path) -> None:
     files = PackFiles(tmp_path, "p03")
     assignment = Assignment(("t0007", "t0002"), {"t0002": 2})
     files.write(assignment)
@@ -16,7 +19,7 @@ def test_an_assignment_is_read_as_it_was_written(tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "{", "[]", '{"trial_ids": ["t0000"]}'])
-def test_an_assignment_that_cannot_be_read_is_an_error_with_its_path(tmp_path, content):
+def test_an_assignment_that_cannot_be_read_is_an_error_with_its_path(tmp_path: Path, content: str | None) -> None:
     files = PackFiles(tmp_path, "p00")
     if content is not None:
         files.write(Assignment())
@@ -25,7 +28,7 @@ def test_an_assignment_that_cannot_be_read_is_an_error_with_its_path(tmp_path, c
         files.read()
 
 
-def log(files, capsys, *parts):
+def log(files: PackFiles, capsys: pytest.CaptureFixture[str], *parts: Sequence[str]) -> None:
     """Processes one after the other: each begins the log, then prints its lines."""
     files.log_path.parent.mkdir(parents=True, exist_ok=True)
     with files.log_path.open("a") as file:
@@ -34,7 +37,7 @@ def log(files, capsys, *parts):
             file.write(capsys.readouterr().out + "".join(f"{line}\n" for line in lines))
 
 
-def test_the_end_of_a_log_is_of_the_last_process(tmp_path, capsys):
+def test_the_end_of_a_log_is_of_the_last_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = PackFiles(tmp_path, "p00")
     assert files.log_tail() == ""
     threads = [f"  File thread-{index}" for index in range(30)]

@@ -1,22 +1,25 @@
 """Packs: how many there are, how many trials at once in each, and how their environments step."""
 
+from typing import Any
+
 import pytest
 from pack_plans import DQN, TPE, fake_reasons, plan
 
 from policies.guard import guarded
 from policies.packed.envs.make import StepTime
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 
 
 @pytest.fixture
-def slow_env(monkeypatch):
+def slow_env(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every environment be one whose steps take long."""
     monkeypatch.setattr(guarded, "measure_step", lambda env_id, env_args, *, timeout_s: StepTime(5000.0))
 
 
-def packs(machine=2, **fields):
+def packs(machine: int | Machine = 2, **fields: Any) -> tuple[int, int]:
     made = plan(machine, **fields).packs
-    return made.num_packs, made.slots
+    return present(made).num_packs, present(made).slots
 
 
 # -- sizes
@@ -43,21 +46,23 @@ def packs(machine=2, **fields):
         (Machine(8, 1, nodes=((2, 1), (6, 0))), {"resources": {"num_gpus": 0.25}}, (2, 5)),
     ],
 )
-def test_packs_fill_the_machine(machine, fields, expected):
+def test_packs_fill_the_machine(machine: float | Machine, fields: dict[str, Any], expected: tuple[int, int]) -> None:
     assert packs(machine, **fields) == expected
 
 
-def test_trials_at_once_are_those_of_all_packs():
+def test_trials_at_once_are_those_of_all_packs() -> None:
     assert plan(2).max_concurrent == 10
     assert plan(3).max_concurrent == 10
     assert plan(2, num_samples=1000).max_concurrent == 2 * 63
     assert plan(2, resources={"max_concurrent": 5}).max_concurrent == 4
     made = plan(8, resources={"num_cpus": 3}).packs
-    assert (made.cpus_per_pack, made.gpus_per_pack) == (3, 0)
+    assert (present(made).cpus_per_pack, present(made).gpus_per_pack) == (3, 0)
 
 
 @pytest.mark.parametrize(("cpus", "expected"), [(1, (1, 4)), (2, (2, 2)), (3, (3, 1)), (4, (4, 1)), (16, (16, 1))])
-def test_few_trials_run_at_once_where_a_model_learns_from_those_that_ended(cpus, expected):
+def test_few_trials_run_at_once_where_a_model_learns_from_those_that_ended(
+    cpus: int, expected: tuple[int, int]
+) -> None:
     assert packs(cpus, **TPE) == expected
     assert packs(cpus, **{**TPE, "resources": {"max_concurrent": 1}}) == (1, 1)
 
@@ -65,14 +70,14 @@ def test_few_trials_run_at_once_where_a_model_learns_from_those_that_ended(cpus,
 # -- memory
 
 # Observations of 4 numbers, before and after, action, reward, discount: 48 bytes a transition.
-MEMORY = {**DQN, "hyperparams": {"replay_capacity": 1_000_000}}
+MEMORY: dict[str, Any] = {**DQN, "hyperparams": {"replay_capacity": 1_000_000}}
 MEMBER = 48e6
 
 
-def test_packs_are_smaller_where_memory_is_short():
+def test_packs_are_smaller_where_memory_is_short() -> None:
     assert packs(**MEMORY) == (2, 5)
     roomy = plan(Machine(2, memory_bytes=2.1 * 10 * MEMBER), **MEMORY)
-    assert (roomy.packs.slots, roomy.packs.notes) == (5, ())
+    assert (present(roomy.packs).slots, present(roomy.packs).notes) == (5, ())
     tight = plan(Machine(2, memory_bytes=2.1 * 6 * MEMBER), **MEMORY)
     assert (tight.packs.num_packs, tight.packs.slots) == (2, 3)
     (note,) = tight.packs.notes
@@ -82,13 +87,13 @@ def test_packs_are_smaller_where_memory_is_short():
     assert tight.max_concurrent == 6
 
 
-def test_fewer_packs_where_memory_is_shorter_still():
+def test_fewer_packs_where_memory_is_shorter_still() -> None:
     made = plan(Machine(2, memory_bytes=2.1 * MEMBER), **MEMORY)
-    assert (made.packs.num_packs, made.packs.slots) == (1, 1)
-    assert "1 x 1 trials run at once" in made.packs.notes[0]
+    assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 1)
+    assert "1 x 1 trials run at once" in present(made.packs).notes[0]
 
 
-def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own():
+def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own() -> None:
     made = plan(Machine(2, memory_bytes=MEMBER), **MEMORY)
     assert (made.packs.num_packs, made.packs.slots) == (1, 1)
     (note,) = made.packs.notes
@@ -97,19 +102,19 @@ def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own():
     assert made.engines == {"packed": 10}
 
 
-def test_a_few_large_trials_do_not_make_all_places_large():
+def test_a_few_large_trials_do_not_make_all_places_large() -> None:
     space = {"replay_capacity": {"grid": [1_000, 10_000_000]}}
     machine = Machine(1, memory_bytes=2.1 * (10 * MEMBER * 2))
     # Two of them, and six small ones: all fit at once.
     assert packs(machine, **{**DQN, "space": {"replay_capacity": {"grid": [1_000]}}}) == (1, 10)
     made = plan(machine, **{**DQN, "space": space, "num_samples": 1, "seeds_per_point": 2})
-    assert (made.packs.num_packs, made.packs.slots) == (1, 4)
+    assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 4)
     made = plan(machine, **{**DQN, "space": space, "num_samples": 1, "seeds_per_point": 3})
-    assert (made.packs.num_packs, made.packs.slots) == (1, 2)
+    assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 2)
 
 
 @pytest.mark.parametrize("search", [{}, {"search": {"type": "tpe", "num_startup_trials": 1}}])
-def test_points_that_are_not_known_count_with_the_largest_memory(search):
+def test_points_that_are_not_known_count_with_the_largest_memory(search: dict[str, Any]) -> None:
     space = {"replay_capacity": {"qlograndint": [1000, 1_000_000, 1000]}}
     machine = Machine(1, memory_bytes=2.1 * 3 * MEMBER)
     fields = {**DQN, "space": space, "num_samples": 12}
@@ -120,23 +125,23 @@ def test_points_that_are_not_known_count_with_the_largest_memory(search):
         assert packs(machine, **fields)[1] > 3
 
 
-def test_on_a_cluster_the_node_where_packs_get_least_decides():
+def test_on_a_cluster_the_node_where_packs_get_least_decides() -> None:
     nodes = Machine(8, nodes=((4, 0), (4, 0)), memory_bytes=2.1 * 4 * MEMBER)
     # Two packs may come to lie on one node, which has half of the memory.
     made = plan(nodes, **{**MEMORY, "num_samples": 2}).packs
-    assert (made.num_packs, made.slots) == (2, 1)
+    assert (present(made).num_packs, present(made).slots) == (2, 1)
     made = plan(nodes, **{**MEMORY, "num_samples": 3}).packs
-    assert (made.num_packs, made.slots) == (2, 1)
+    assert (present(made).num_packs, present(made).slots) == (2, 1)
 
 
 # -- environments
 
 
-def test_the_plan_says_how_environments_step():
+def test_the_plan_says_how_environments_step() -> None:
     made = plan().packs
-    assert made.env_kind == "vectorised"
-    assert made.num_env_processes == 0
-    assert made.env_step_us is None or made.env_step_us > 0
+    assert present(made).env_kind == "vectorised"
+    assert present(made).num_env_processes == 0
+    assert present(made).env_step_us is None or present(made).env_step_us > 0
 
 
 ONE_GPU = {"resources": {"num_gpus": 1}}
@@ -165,12 +170,21 @@ FOUR_ENVS = {"hyperparams": {"num_envs": 4, "train_batch_size": 64, "minibatch_s
         (4, {**TPE, "num_samples": 12, "resources": {"max_concurrent": 1}, **FOUR_ENVS}, 1, 3),
     ],
 )
-def test_idle_cpus_step_slow_environments(slow_env, machine, fields, packs, processes):
+def test_idle_cpus_step_slow_environments(
+    slow_env, machine: int | Machine, fields: dict[str, Any], packs: int, processes: int
+) -> None:
     made = plan(machine, **fields).packs
-    assert (made.env_kind, made.num_packs, made.num_env_processes) == ("processes", packs, processes)
-    assert made.cpus_per_pack == fields.get("resources", {}).get("num_cpus", 1) + processes
+    assert (present(made).env_kind, present(made).num_packs, present(made).num_env_processes) == (
+        "processes",
+        packs,
+        processes,
+    )
+    assert present(made).cpus_per_pack == fields.get("resources", {}).get("num_cpus", 1) + processes
     idle = "one CPU" if processes == 1 else f"{processes} CPUs"
-    assert (made.env_step_us, made.why_env_kind) == (5000.0, f"a step takes 5.0 ms, and {idle} would be idle")
+    assert (present(made).env_step_us, present(made).why_env_kind) == (
+        5000.0,
+        f"a step takes 5.0 ms, and {idle} would be idle",
+    )
 
 
 @pytest.mark.parametrize(
@@ -183,15 +197,15 @@ def test_idle_cpus_step_slow_environments(slow_env, machine, fields, packs, proc
         (16, {"num_samples": 1, "hyperparams": {"num_envs": 1}}, "there is one sub-environment"),
     ],
 )
-def test_no_idle_cpus_no_processes(slow_env, machine, fields, why):
+def test_no_idle_cpus_no_processes(slow_env, machine: int, fields: dict[str, Any], why: str) -> None:
     made = plan(machine, **fields).packs
-    assert (made.env_kind, made.num_env_processes) == ("scalar", 0)
-    assert made.why_env_kind.startswith(f"a step takes 5.0 ms, but {why}")
+    assert (present(made).env_kind, present(made).num_env_processes) == ("scalar", 0)
+    assert present(made).why_env_kind.startswith(f"a step takes 5.0 ms, but {why}")
 
 
-def test_cpus_that_other_trials_need_are_not_idle(slow_env, monkeypatch):
+def test_cpus_that_other_trials_need_are_not_idle(slow_env, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_reasons(monkeypatch, [0.2])
-    space = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1, "resources": {"num_gpus": 1}}
+    space: dict[str, Any] = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1, "resources": {"num_gpus": 1}}
     made = plan(Machine(8, 1), **space).packs
-    assert made.num_env_processes == 0
-    assert made.why_env_kind.endswith("but other trials need the idle CPUs")
+    assert present(made).num_env_processes == 0
+    assert present(made).why_env_kind.endswith("but other trials need the idle CPUs")

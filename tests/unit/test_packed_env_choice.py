@@ -1,5 +1,7 @@
 """How the environments of a pack are stepped, and which cannot be packed."""
 
+from typing import Any
+
 import pytest
 from policy_factory import register_test_envs
 from test_packed_envs import own_modules
@@ -12,21 +14,21 @@ __all__ = ["own_modules"]
 register_test_envs()
 
 
-def test_cartpole_is_vectorised():
+def test_cartpole_is_vectorised() -> None:
     step = measure_step("CartPole-v1", {"max_episode_steps": 200})
     assert step.us > 0
     assert choose_kind(step, spare_cpus=4).kind == "vectorised"
     assert choose_kind(measure_step("CartPole-v1", {"frame_stack": 2}), spare_cpus=4).kind == "scalar"
 
 
-def test_a_fast_env_stays_in_the_process():
+def test_a_fast_env_stays_in_the_process() -> None:
     step = measure_step("Pendulum-v1", None)
     assert step.us > 0
     choice = choose_kind(StepTime(80.4), spare_cpus=4)
     assert (choice.kind, choice.why) == ("scalar", "a step takes 80 us")
 
 
-def test_a_slow_env_gets_processes_where_cpus_are_idle():
+def test_a_slow_env_gets_processes_where_cpus_are_idle() -> None:
     step = measure_step("odd_envs:Slow", None)
     assert step.us > 2000
     choice = choose_kind(step, spare_cpus=2)
@@ -37,14 +39,14 @@ def test_a_slow_env_gets_processes_where_cpus_are_idle():
     assert choice.why.endswith("ms, but no CPU is idle")
 
 
-def test_a_step_longer_than_all_the_time_for_measuring_is_measured():
+def test_a_step_longer_than_all_the_time_for_measuring_is_measured() -> None:
     step = measure_step("odd_envs:VerySlow", None)
     assert step.us > 250_000
     assert choose_kind(step, spare_cpus=1).kind == "processes"
 
 
 @pytest.mark.parametrize("fail_at", [1, 2, 3, 50])
-def test_an_env_that_raises_is_left_to_its_trial(fail_at):
+def test_an_env_that_raises_is_left_to_its_trial(fail_at: int) -> None:
     step = measure_step("TestWalk-v0", {"fail_at": fail_at})
     assert (step.us is None) == (fail_at == 1)
     assert choose_kind(step, spare_cpus=0).kind == "scalar"
@@ -61,7 +63,7 @@ def test_an_env_that_raises_is_left_to_its_trial(fail_at):
         ("odd_envs:Slow", None),
     ],
 )
-def test_envs_that_can_be_seeded(env_id, env_args):
+def test_envs_that_can_be_seeded(env_id: str, env_args: dict[str, Any] | None) -> None:
     check_seedable(env_id, env_args)
 
 
@@ -76,7 +78,7 @@ def test_envs_that_can_be_seeded(env_id, env_args):
         ),
     ],
 )
-def test_envs_that_cannot_be_seeded_are_refused_with_what_differs(name, words):
+def test_envs_that_cannot_be_seeded_are_refused_with_what_differs(name: str, words: str) -> None:
     with pytest.raises(EnvError, match=words) as caught:
         check_seedable(f"odd_envs:{name}", None)
     assert "engine: rllib" in caught.value.hint

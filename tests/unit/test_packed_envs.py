@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import multiprocessing
+from collections.abc import Iterator
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +20,7 @@ register_test_envs()
 
 
 @pytest.fixture(autouse=True)
-def own_modules(monkeypatch):
+def own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     """The modules of these tests are allowed, and are not any more when they are over."""
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["odd_envs", "policy_factory"])
@@ -34,10 +36,10 @@ KINDS = [
 
 
 @pytest.fixture
-def make():
+def make() -> Iterator[Any]:
     made = []
 
-    def make_one(env_id, kind, num_envs=N, env_args=None, members=(), **kwargs):
+    def make_one(env_id: str, kind: str, num_envs: int = N, env_args: Any = None, members=(), **kwargs: Any):
         envs = make_packed_envs(env_id, env_args, num_envs, kind=kind, **kwargs)
         made.append(envs)
         for member_id, seed in dict(members).items():
@@ -53,7 +55,7 @@ def make():
 class Actor:
     """The actions of one member: the same ones again for the same seed."""
 
-    def __init__(self, space, seed, num_envs=N):
+    def __init__(self, space: Any, seed: int, num_envs: int = N) -> None:
         self.space, self.rng, self.num_envs = space, np.random.default_rng(seed), num_envs
 
     def __call__(self):
@@ -67,7 +69,7 @@ def step_all(envs, actors):
     return envs.step(np.concatenate([actors[member_id]() for member_id in envs.member_ids]))
 
 
-def rows_of(envs, member_id, num_envs=N):
+def rows_of(envs, member_id, num_envs: int = N):
     first = envs.member_ids.index(member_id) * num_envs
     return slice(first, first + num_envs)
 
@@ -78,7 +80,7 @@ def seen_by(envs, step, member_id):
     return {name: getattr(step, name)[rows].copy() for name in names}
 
 
-def assert_equal_bits(one, another):
+def assert_equal_bits(one, another) -> None:
     assert len(one) == len(another)
     for left, right in zip(one, another, strict=True):
         for name, values in left.items():
@@ -89,11 +91,11 @@ def assert_equal_bits(one, another):
 
 
 @pytest.mark.parametrize("env_args", [{"max_episode_steps": 25}, {"sutton_barto_reward": True}])
-def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make, env_args):
+def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make, env_args: Any) -> None:
     envs = make("CartPole-v1", "vectorised", env_args=env_args, members={"a": 1, "b": 2})
     scalars = [make_env("CartPole-v1", env_args) for _ in range(2 * N)]
 
-    def restart(row):
+    def restart(row) -> None:
         scalars[row].reset(seed=0)
         scalars[row].unwrapped.state = envs._rows.states[row].copy()
 
@@ -116,7 +118,7 @@ def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make, 
     assert (num_ended["truncated"] > 10) is ("max_episode_steps" in env_args)
 
 
-def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make):
+def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make) -> None:
     envs = make("CartPole-v1", "vectorised", num_envs=50, env_args={"max_episode_steps": 2}, members={"a": 1, "b": 2})
     starts = [envs.observations]
     for _ in range(20):
@@ -127,10 +129,10 @@ def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make):
     assert len(np.unique(starts, axis=0)) == len(starts)
     assert np.abs(starts).max() <= 0.05
     assert np.abs(starts).max() > 0.049
-    assert np.abs(starts.mean(axis=0)).max() < 0.004
+    assert np.abs(cast("Any", starts).mean(axis=0)).max() < 0.004
 
 
-def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make):
+def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make) -> None:
     traces = []
     every = dict.fromkeys(range(60), 1)
     for stretches in ({0: 60}, every, {0: 7, 7: 20, 27: 33}, {0: 100}, {}, {0: 10, 3: 20, 17: 2, 30: 8, 33: 40}):
@@ -149,16 +151,21 @@ def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make):
     ("env_id", "env_args"),
     [("Pendulum-v1", {}), ("CartPole-v1", {"pixels": True}), ("CartPole-v1", {"frame_stack": 2})],
 )
-def test_only_a_plain_cartpole_is_vectorised(env_id, env_args):
+def test_only_a_plain_cartpole_is_vectorised(env_id: str, env_args: Any) -> None:
     with pytest.raises(EnvError, match="no vectorised version"):
         make_packed_envs(env_id, env_args, 2, kind="vectorised")
 
 
-def test_a_cartpole_of_somebody_s_own_is_not_vectorised():
+def test_a_cartpole_of_somebody_s_own_is_not_vectorised() -> None:
     class LowGravity(CartPoleEnv):
         """Its registry entry has forgotten that Gymnasium's vectorised version does not know of this."""
 
-    gym.register("TestLowGravity-v0", LowGravity, max_episode_steps=20, vector_entry_point=CartPoleVectorEnv)
+    gym.register(
+        "TestLowGravity-v0",
+        cast("Any", LowGravity),
+        max_episode_steps=20,
+        vector_entry_point=cast("Any", CartPoleVectorEnv),
+    )
     try:
         with pytest.raises(EnvError, match="no vectorised version"):
             make_packed_envs("TestLowGravity-v0", None, 2, kind="vectorised")
@@ -170,8 +177,8 @@ def test_a_cartpole_of_somebody_s_own_is_not_vectorised():
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_a_member_gets_the_same_beside_any_others(make, env_id, kind):
-    def trace_alone(member_id, seed, actor_seed):
+def test_a_member_gets_the_same_beside_any_others(make, env_id: str, kind: str) -> None:
+    def trace_alone(member_id, seed: int, actor_seed):
         envs = make(env_id, kind, env_args={"max_episode_steps": 15}, members={member_id: seed}, num_processes=2)
         actor = Actor(envs.action_space, actor_seed)
         return [seen_by(envs, envs.step(actor()), member_id) for _ in range(60)]
@@ -199,7 +206,7 @@ def test_a_member_gets_the_same_beside_any_others(make, env_id, kind):
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make, env_id, kind):
+def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make, env_id: str, kind: str) -> None:
     envs = make(env_id, kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
     actors = {name: Actor(envs.action_space, seed) for seed, name in enumerate("abcd")}
     step_all(envs, actors)
@@ -223,7 +230,7 @@ def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make, env_
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_members_are_named_once_and_all_of_them_are_arranged(make, env_id, kind):
+def test_members_are_named_once_and_all_of_them_are_arranged(make, env_id: str, kind: str) -> None:
     envs = make(env_id, kind, members={"a": 1, "b": 2}, num_processes=1)
     with pytest.raises(ValueError, match="a member already"):
         envs.add("a", 3)
@@ -240,7 +247,7 @@ def test_members_are_named_once_and_all_of_them_are_arranged(make, env_id, kind)
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_no_step_spans_a_reset(make, env_id, kind):
+def test_no_step_spans_a_reset(make, env_id: str, kind: str) -> None:
     limit = 6
     envs = make(env_id, kind, env_args={"max_episode_steps": limit}, members={"a": 1, "b": 2}, num_processes=2)
     actors = {"a": Actor(envs.action_space, 0), "b": Actor(envs.action_space, 1)}
@@ -265,7 +272,7 @@ def test_no_step_spans_a_reset(make, env_id, kind):
 
 
 @pytest.mark.parametrize("kind", ["vectorised", "scalar"])
-def test_truncated_is_not_terminated(make, kind):
+def test_truncated_is_not_terminated(make, kind: str) -> None:
     envs = make("CartPole-v1", kind, env_args={"max_episode_steps": 12}, num_envs=2, members={"a": 1})
     balanced, pushed = [], []
     for index in range(12):
@@ -278,7 +285,7 @@ def test_truncated_is_not_terminated(make, kind):
 
 
 @pytest.mark.parametrize("kind", ["vectorised", "scalar"])
-def test_the_failure_penalty_is_for_the_learner_alone(make, kind):
+def test_the_failure_penalty_is_for_the_learner_alone(make, kind: str) -> None:
     envs = make("CartPole-v1", kind, env_args={"max_episode_steps": 12}, members={"a": 1}, failure_penalty=-7.5)
     num_failed = num_truncated = 0
     for index in range(40):
@@ -292,7 +299,7 @@ def test_the_failure_penalty_is_for_the_learner_alone(make, kind):
     assert num_truncated == 3
 
 
-def test_a_penalty_without_a_failure_is_refused():
+def test_a_penalty_without_a_failure_is_refused() -> None:
     for kind in ("scalar", "processes"):
         with pytest.raises(EnvError, match="no failure"):
             make_packed_envs("MountainCar-v0", None, 2, kind=kind, failure_penalty=-1)
@@ -310,7 +317,9 @@ def test_a_penalty_without_a_failure_is_refused():
         ("policy_factory:Walk", {"end": 1.0}),
     ],
 )
-def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(make, kind, env_id, env_args):
+def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(
+    make, kind: str, env_id: str, env_args: Any
+) -> None:
     envs = make(env_id, kind, env_args=env_args, members={"a": 2**32 - 2}, num_processes=2)
     scalars = [make_env(env_id, env_args) for _ in range(N)]
     first = [env.reset(seed=seed)[0] for env, seed in zip(scalars, (2**32 - 2, 2**32 - 1, 0), strict=True)]
@@ -320,7 +329,7 @@ def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(m
         actions = actor()
         step = envs.step(actions)
         for row, env in enumerate(scalars):
-            action = int(actions[row]) + int(env.action_space.start) if actions.ndim == 1 else actions[row]
+            action = int(actions[row]) + int(cast("Any", env.action_space).start) if actions.ndim == 1 else actions[row]
             observation, reward, terminated, truncated, _ = env.step(action)
             np.testing.assert_array_equal(step.final_observations[row], np.asarray(observation, np.float32))
             assert step.rewards[row] == np.float32(reward)
@@ -332,7 +341,7 @@ def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(m
     assert num_ended
 
 
-def test_images_stay_bytes(make):
+def test_images_stay_bytes(make) -> None:
     envs = make("CartPole-v1", "scalar", env_args={"pixels": True}, num_envs=1, members={"a": 1})
     assert envs.observations.dtype == np.uint8
     step = envs.step(np.array([1]))
@@ -340,19 +349,21 @@ def test_images_stay_bytes(make):
     assert step.observations.max() > 0
 
 
-def test_an_env_may_write_into_its_action(make):
-    class Greedy(gym.Env):
+def test_an_env_may_write_into_its_action(make) -> None:
+    class Greedy(gym.Env[Any, Any]):
         observation_space = gym.spaces.Box(-1, 1, (1,))
         action_space = gym.spaces.Box(-1, 1, (2,))
 
-        def reset(self, *, seed=None, options=None):
+        def reset(
+            self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        ) -> tuple[Any, dict[str, Any]]:
             return np.zeros(1, np.float32), {}
 
-        def step(self, action):
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
             action[:] = 9.0
             return np.zeros(1, np.float32), 0.0, False, False, {}
 
-    gym.register("TestGreedy-v0", Greedy)
+    gym.register("TestGreedy-v0", cast("Any", Greedy))
     try:
         envs = make("TestGreedy-v0", "scalar", num_envs=2, members={"a": 1})
         actions = np.zeros((2, 2), np.float32)

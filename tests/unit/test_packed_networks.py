@@ -1,10 +1,15 @@
 """Stacked networks and optimizers compute what separate torch modules and torch.optim compute, padding included."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 
 from policies.activations import ACTIVATIONS
@@ -12,14 +17,21 @@ from policies.packed.member import MAX_GROUP, group_members, network_layouts, si
 from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm
 from policies.packed.rows import StackedRows
+from tests.narrowing import present
 from tests.rounding import assert_rounded, close
+
+if TYPE_CHECKING:
+    from torch.optim.adam import Adam
+    from torch.optim.rmsprop import RMSprop
+
+    from policies.packed.member import Member
 
 # Of the members of one stack, by the number of layers: the second is padded in every layer, the third in one.
 SIZES = {1: [(12,), (7,), (9,)], 2: [(12, 9), (5, 4), (11, 9)], 3: [(8, 12, 6), (7, 5, 4), (8, 12, 3)]}
 ROWS = 10
 
 
-def make_stack(num_layers, activation, *, shares):
+def make_stack(num_layers: int, activation: str, *, shares: bool) -> tuple[list[Member], StackedRows]:
     members = [
         random_member(f"m{index}", index, hidden_sizes=sizes, activation=activation, vf_share_layers=shares)
         for index, sizes in enumerate(SIZES[num_layers])
@@ -27,18 +39,18 @@ def make_stack(num_layers, activation, *, shares):
     return members, StackedRows(members, NUM_INPUTS, NUM_OUTPUTS, "cpu")
 
 
-def observations(num_members, seed=0):
+def observations(num_members: int, seed: int = 0) -> torch.Tensor:
     # Numbers of float32, as observations are, in whatever format the networks compute.
     rng = torch.Generator().manual_seed(seed)
     return torch.randn(num_members, ROWS, NUM_INPUTS, generator=rng, dtype=torch.float32).to(torch.get_default_dtype())
 
 
-def stacked_inputs(rows, x):
+def stacked_inputs(rows: StackedRows, x: torch.Tensor) -> torch.Tensor:
     inputs = torch.from_numpy(with_ones(x.numpy())).to(x.dtype)
     return inputs.repeat(rows.networks_per_member, 1, 1)
 
 
-def outputs_of(rows, x):
+def outputs_of(rows: StackedRows, x: torch.Tensor) -> torch.Tensor:
     """(M, B, policy outputs and value), like the references'."""
     out = rows.networks.forward(stacked_inputs(rows, x))
     if rows.networks_per_member == 1:
@@ -46,7 +58,7 @@ def outputs_of(rows, x):
     return torch.cat((out[: len(x)], out[len(x) :, :, :1]), dim=-1)
 
 
-def backward(rows, gradient):
+def backward(rows: StackedRows, gradient: torch.Tensor) -> None:
     """As `outputs_of`, the other way round."""
     networks, num_members = rows.networks, len(gradient)
     if rows.networks_per_member == 1:
@@ -58,16 +70,18 @@ def backward(rows, gradient):
     networks.backward(full)
 
 
-def by_name(rows, flat, members, index):
+def by_name(
+    rows: StackedRows, flat: torch.Tensor, members: Sequence[Member], index: int
+) -> dict[str, NDArray[np.float64]]:
     """A member's part of a tensor over all weights, (K, P)."""
-    found = {}
+    found: dict[str, Any] = {}
     for number, layout in enumerate(network_layouts(members[index].hyperparams, NUM_OUTPUTS)):
         row = number * len(members) + index
         found |= layout.read([layer[row] for layer in rows.networks.views_of(flat)], NUM_INPUTS)
     return found
 
 
-def is_padding(rows, members):
+def is_padding(rows: StackedRows, members: Sequence[Member]) -> torch.Tensor:
     """Which of all weights, (K, P), no member has."""
     flat = torch.zeros_like(rows.networks.weights)
     views = rows.networks.views_of(flat)
@@ -82,7 +96,7 @@ def is_padding(rows, members):
 @pytest.mark.parametrize("num_layers", sorted(SIZES))
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.usefixtures("in_double")
-def test_outputs_and_gradients_are_those_of_separate_modules(activation, num_layers, shares):
+def test_outputs_and_gradients_are_those_of_separate_modules(activation: str, num_layers: int, shares: bool) -> None:
     members, rows = make_stack(num_layers, activation, shares=shares)
     x = observations(len(members))
     upstream = torch.randn(len(members), ROWS, NUM_OUTPUTS + 1, generator=torch.Generator().manual_seed(1))
@@ -100,11 +114,11 @@ def test_outputs_and_gradients_are_those_of_separate_modules(activation, num_lay
         gradients = by_name(rows, rows.networks.gradients, members, index)
         assert set(gradients) == set(member.weights)
         for name, weight in reference.named():
-            assert weight.grad.abs().max() > 1e-3
+            assert present(weight.grad).abs().max() > 1e-3
             close(torch.from_numpy(gradients[name]), weight.grad)
 
 
-def test_weights_that_are_written_into_a_stack_come_back():
+def test_weights_that_are_written_into_a_stack_come_back() -> None:
     members, rows = make_stack(2, "tanh", shares=True)
     before = [dict(member.weights) for member in members]
     rows.networks.weights.mul_(2.0)
@@ -117,7 +131,7 @@ def test_weights_that_are_written_into_a_stack_come_back():
 
 @pytest.mark.parametrize("kind", ["adam", "rmsprop"])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_padding_stays_zero(activation, kind):
+def test_padding_stays_zero(activation: str, kind: str) -> None:
     members, rows = make_stack(3, activation, shares=False)
     networks, column = rows.networks, torch.full((2 * len(members), 1), 0.9)
     if kind == "adam":
@@ -152,31 +166,37 @@ class Separate:
     what they are made of.
     """
 
-    def __init__(self, make, first, settings, *, sizes=False):
+    def __init__(
+        self, make: type[Adam | RMSprop], first: torch.Tensor, settings: dict[str, Any], *, sizes: bool = False
+    ) -> None:
         self._sizes = sizes
         self.weight = torch.nn.Parameter(first.double().abs() if sizes else first.double())
         self.optimizer = make([self.weight], **settings)
 
-    def step(self, gradient):
+    def step(self, gradient: torch.Tensor) -> None:
         self.weight.grad = -gradient.double().abs() if self._sizes else gradient.double()
         self.optimizer.step()
 
-    def set_lr(self, lr):
+    def set_lr(self, lr: float) -> None:
         self.optimizer.param_groups[0]["lr"] = lr
 
     @property
-    def state(self):
-        return self.optimizer.state.get(self.weight, {})
+    def state(self) -> dict[str, torch.Tensor]:
+        return cast("dict[str, torch.Tensor]", self.optimizer.state.get(self.weight, {}))
 
 
-def take_over(optimizer, rows):
+def take_over(optimizer: StackedAdam | StackedRMSprop, rows: Sequence[Separate]) -> None:
     for index, row in enumerate(rows):
         for name in optimizer.state.keys() & row.state.keys():
             optimizer.state[name][index] = row.state[name]
         optimizer.num_steps[index] = 3 * index
 
 
-def compare_with_torch(stacked, make_separate, columns):
+def compare_with_torch(
+    stacked: Callable[[torch.Tensor], StackedAdam | StackedRMSprop],
+    make_separate: type[Adam | RMSprop],
+    columns: dict[str, Sequence[float | tuple[float, float]]],
+) -> None:
     """Two stretches of four steps beside torch.optim; row k has made 3 * k steps before."""
     rng = torch.Generator().manual_seed(0)
     settings = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
@@ -208,17 +228,17 @@ def compare_with_torch(stacked, make_separate, columns):
     for index, (row, size) in enumerate(zip(rows, sizes, strict=True)):
         for name in optimizer.state.keys() & row.state.keys():
             if row.state[name] is not None:
-                limits = {"sizes": size.state[name].abs(), "num_roundings": NUM_ROUNDINGS, "what": name}
+                limits: dict[str, Any] = {"sizes": size.state[name].abs(), "num_roundings": NUM_ROUNDINGS, "what": name}
                 assert_rounded(optimizer.state[name][index], row.state[name], **limits)
         assert optimizer.num_steps[index].item() == 3 * index + 8
 
 
-def as_columns(values, dtype=torch.float32):
+def as_columns(values: Sequence[float], dtype: torch.dtype = torch.float32) -> torch.Tensor:
     return torch.tensor(values, dtype=dtype)[:, None]
 
 
-def test_adam_is_torchs_row_by_row():
-    values = {
+def test_adam_is_torchs_row_by_row() -> None:
+    values: dict[str, Any] = {
         "lr": [1e-3, 0.02, 0.3], "betas": [(0.9, 0.999), (0.0, 0.99), (0.95, 0.9)], "eps": [1e-8, 1e-3, 0.5],
     }  # fmt: skip
     beta1, beta2 = (as_columns([pair[at] for pair in values["betas"]], torch.float64) for at in (0, 1))
@@ -230,7 +250,7 @@ def test_adam_is_torchs_row_by_row():
 
 
 @pytest.mark.parametrize("momentum", [[0.0, 0.0, 0.0], [0.9, 0.0, 0.5]])
-def test_rmsprop_is_torchs_row_by_row(momentum):
+def test_rmsprop_is_torchs_row_by_row(momentum: list[float]) -> None:
     values = {"lr": [1e-3, 0.02, 0.3], "alpha": [0.999, 0.9, 0.5], "momentum": momentum, "eps": [1e-8, 1e-3, 0.5]}
     columns = {name: as_columns(column) for name, column in values.items()}
     columns["alpha"] = as_columns(values["alpha"], torch.float64)
@@ -242,7 +262,7 @@ def test_rmsprop_is_torchs_row_by_row(momentum):
 
 
 @pytest.mark.usefixtures("in_double")
-def test_the_norm_of_all_of_a_members_networks_is_clipped():
+def test_the_norm_of_all_of_a_members_networks_is_clipped() -> None:
     rng = torch.Generator().manual_seed(0)
     before = torch.randn(6, NUM_WEIGHTS, generator=rng)
     before[[0, 3]] *= 0.01
@@ -260,7 +280,7 @@ def test_the_norm_of_all_of_a_members_networks_is_clipped():
 
 
 @pytest.mark.usefixtures("in_double")
-def test_what_is_no_number_stays_so_under_clipping_and_stays_where_it_is():
+def test_what_is_no_number_stays_so_under_clipping_and_stays_where_it_is() -> None:
     gradients = torch.ones(2, NUM_WEIGHTS)
     gradients[0, 3] = math.nan
     clip_by_global_norm(gradients, torch.tensor([[1.0], [1.0]]), 1)
@@ -272,7 +292,7 @@ def test_what_is_no_number_stays_so_under_clipping_and_stays_where_it_is():
 # -- groups
 
 
-def test_sizes_are_padded_by_a_third_at_most():
+def test_sizes_are_padded_by_a_third_at_most() -> None:
     sizes = sorted({size_class(number) for number in range(1, 2000)})
     assert sizes[:7] == [8, 12, 16, 24, 32, 48, 64]
     for number in range(1, 2000):
@@ -283,7 +303,7 @@ def test_sizes_are_padded_by_a_third_at_most():
         assert size_class(padded) == padded
 
 
-def test_groups_are_of_one_activation_and_like_sizes():
+def test_groups_are_of_one_activation_and_like_sizes() -> None:
     rng = np.random.default_rng(0)
     members = [
         random_member(f"m{index}", hidden_sizes=(int(rng.choice([9, 12, 30])), 8), activation=str(activation))
@@ -301,17 +321,17 @@ def test_groups_are_of_one_activation_and_like_sizes():
     assert min(sizes) >= MAX_GROUP // 2
 
 
-def _members_by_key(members):
+def _members_by_key(members: Sequence[Member]) -> list[int]:
     keys = [(m.hyperparams.activation, size_class(m.hyperparams.hidden_sizes[0])) for m in members]
     return [keys.count(key) for key in set(keys)]
 
 
-def test_networks_of_other_depth_are_not_grouped():
+def test_networks_of_other_depth_are_not_grouped() -> None:
     one, two = random_member("a", hidden_sizes=(8,)), random_member("b", hidden_sizes=(8, 8))
     assert len(group_members([one, two])) == 2
 
 
-def test_a_stack_starts_without_weights():
+def test_a_stack_starts_without_weights() -> None:
     networks = StackedNetworks(2, (3, 4, 1), "relu")
     assert networks.weights.shape == (2, 4 * 4 + 5)
     assert (networks.weights == 0).all()

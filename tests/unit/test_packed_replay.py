@@ -1,37 +1,45 @@
 """Stacked replay memories hold and draw what one memory a member does, and get the same n-step sums."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, cast
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn.n_step import StackedNStep
-from policies.packed.dqn.replay import StackedPrioritizedReplay, StackedReplay, make_stacked_replay
+from policies.packed.dqn.replay import Drawn, StackedPrioritizedReplay, StackedReplay, make_stacked_replay
 from policies.packed.envs.vector import Step
 from policies.replay import LastTransitions, NStep, PrioritizedReplayBuffer, ReplayBuffer, Transitions, make_replay
+from tests.narrowing import present
 
+Seen = tuple[NDArray[np.float32], NDArray[np.int64], Step]
 D = 2
 BATCH = 6
 
 
-def make_hyperparams(**values):
+def make_hyperparams(**values: Any) -> DQNHyperparams:
     return DQNHyperparams(**{"train_batch_size": BATCH, "replay_capacity": 10, **values})
 
 
-def transitions(first, count):
+def transitions(first: int, count: int) -> Transitions:
     """Rows that tell their number."""
     numbers = np.arange(first, first + count, dtype=np.float32)
     obs = np.stack([numbers, -numbers], axis=1)
     return Transitions(obs, (numbers % 3).astype(np.int64), numbers, obs + 0.5, numbers / 1000)
 
 
-def as_rows(found):
+def as_rows(found: Transitions) -> NDArray[np.float32]:
     """The same as a stacked memory's rows, (B, columns)."""
     ones = np.ones((len(found.actions), 1), dtype=np.float32)
     numbers = np.stack([found.actions, found.rewards, found.discounts], axis=1)
     return np.concatenate([found.obs, ones, found.next_obs, ones, numbers], axis=1).astype(np.float32)
 
 
-def stack_of(replay, *members):
+def stack_of(replay: str, *members: tuple[str, dict[str, float]]) -> StackedPrioritizedReplay | StackedReplay:
     """A memory with members of (name, further hyperparameters)."""
     stacked = make_stacked_replay(make_hyperparams(replay=replay), D)
     for name, values in members:
@@ -39,11 +47,11 @@ def stack_of(replay, *members):
     return stacked
 
 
-def put(stacked, names, *parts):
+def put(stacked: StackedReplay, names: Sequence[str], *parts: Transitions) -> None:
     stacked.add(stacked.slots(names), np.stack([as_rows(part) for part in parts]))
 
 
-def numbers_of(drawn):
+def numbers_of(drawn: Drawn) -> NDArray[np.int64]:
     """Which rows were drawn, (M, B)."""
     return drawn.rows[..., -2].astype(int)
 
@@ -51,10 +59,10 @@ def numbers_of(drawn):
 class Given:
     """Stands in for a random generator: gives the numbers that the stack is given."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.numbers = np.zeros(0)
 
-    def integers(self, low, high, shape):
+    def integers(self, low: int, high: int, shape: tuple[int, int]) -> NDArray[np.int64]:
         return (self.numbers * high).astype(np.int64).reshape(shape)
 
     def uniform(self, low, high, size):
@@ -64,19 +72,19 @@ class Given:
 class Separate:
     """A memory of `policies.replay` for one member."""
 
-    def __init__(self, hyperparams):
+    def __init__(self, hyperparams: DQNHyperparams) -> None:
         self.batch_size, self.given = hyperparams.train_batch_size, Given()
         self.replay = make_replay(hyperparams, seed=0)
         self.replay.rng = self.given
         self.num_rows = 0
 
-    def add(self, count):
+    def add(self, count: int) -> Transitions:
         new = transitions(self.num_rows, count)
         self.num_rows += count
         self.replay.add(new)
         return new
 
-    def draw(self, numbers):
+    def draw(self, numbers: NDArray[np.float64]) -> Transitions:
         self.given.numbers = numbers
         return next(self.replay.batches(1, self.batch_size))
 
@@ -84,12 +92,12 @@ class Separate:
 class Both:
     """The same members in a stacked memory and in separate ones, which must give the same."""
 
-    def __init__(self, replay, seed):
+    def __init__(self, replay: str, seed: int) -> None:
         self.kind, self.rng = replay, np.random.default_rng(seed)
         self.stacked, self.separate = stack_of(replay), {}
         self.num_draws = 0
 
-    def come(self):
+    def come(self) -> None:
         name = f"m{self.rng.integers(1000)}"
         if name in self.separate:
             return
@@ -102,21 +110,24 @@ class Both:
         self.stacked.add_member(name, hyperparams)
         self.separate[name] = Separate(hyperparams)
 
-    def leave(self):
+    def leave(self) -> None:
         if len(self.separate) > 1:
             name = str(self.rng.choice(list(self.separate)))
             self.stacked.remove_member(name)
             del self.separate[name]
 
-    def some(self):
-        return self.rng.permutation(list(self.separate))[: self.rng.integers(1, len(self.separate) + 1)].tolist()
+    def some(self) -> list[str]:
+        return cast(
+            "list[str]",
+            self.rng.permutation(list(self.separate))[: self.rng.integers(1, len(self.separate) + 1)].tolist(),
+        )
 
-    def add(self, names, count):
+    def add(self, names: Sequence[str], count: int) -> None:
         put(self.stacked, names, *(self.separate[name].add(count) for name in names))
         sizes = self.stacked.sizes(self.stacked.slots(names))
         assert list(sizes) == [len(self.separate[name].replay) for name in names]
 
-    def draw(self, names):
+    def draw(self, names: Sequence[str]) -> None:
         if any(self.separate[name].num_rows < BATCH for name in names):
             return
         slots, shape = self.stacked.slots(names), (len(names), BATCH)
@@ -128,7 +139,7 @@ class Both:
             assert (drawn.weights is None) == (expected.weights is None) == (self.kind != "prioritized")
             if drawn.weights is not None:
                 np.testing.assert_allclose(drawn.weights[index], expected.weights, rtol=1e-6)
-                np.testing.assert_array_equal(drawn.indices[index], expected.indices)
+                np.testing.assert_array_equal(present(drawn.indices)[index], expected.indices)
                 self.separate[name].replay.set_priorities(expected.indices, errors[index])
         if drawn.indices is not None:
             self.stacked.set_priorities(slots, drawn.indices, errors)
@@ -137,7 +148,7 @@ class Both:
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "none"])
 @pytest.mark.parametrize("seed", range(4))
-def test_stacked_memories_are_separate_ones(replay, seed):
+def test_stacked_memories_are_separate_ones(replay: str, seed: int) -> None:
     """Members come, go, add up to more than fits, draw and set priorities, alone and together, in any order."""
     both, most = Both(replay, seed), 0
     for _ in range(3):
@@ -155,7 +166,7 @@ def test_stacked_memories_are_separate_ones(replay, seed):
     assert most > 3
 
 
-def test_the_oldest_rows_go_first_and_of_more_than_fit_the_newest_stay():
+def test_the_oldest_rows_go_first_and_of_more_than_fit_the_newest_stay() -> None:
     stacked = stack_of("uniform", ("a", {"replay_capacity": 6}), ("b", {"replay_capacity": 9}))
     for first in (0, 4):
         put(stacked, ["a", "b"], transitions(first, 4), transitions(100 + first, 4))
@@ -171,7 +182,7 @@ def test_the_oldest_rows_go_first_and_of_more_than_fit_the_newest_stay():
     assert list(stacked.sizes(stacked.slots(["a", "b"]))) == [6, 9]
 
 
-def test_uniform_draws_every_row_as_often():
+def test_uniform_draws_every_row_as_often() -> None:
     stacked = stack_of("uniform", ("a", {}), ("b", {"replay_capacity": 40}))
     put(stacked, ["a"], transitions(0, 10))
     put(stacked, ["b"], transitions(0, 25))
@@ -184,7 +195,7 @@ def test_uniform_draws_every_row_as_often():
         assert chi_square < count - 1 + 5 * np.sqrt(2 * (count - 1))
 
 
-def test_no_replay_gives_the_newest_rows_in_order():
+def test_no_replay_gives_the_newest_rows_in_order() -> None:
     stacked = stack_of("none", ("a", {}), ("b", {}))
     put(stacked, ["a", "b"], transitions(0, 4), transitions(100, 4))
     put(stacked, ["a", "b"], transitions(4, 5), transitions(104, 5))
@@ -193,7 +204,7 @@ def test_no_replay_gives_the_newest_rows_in_order():
 
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "none"])
-def test_a_slot_that_is_used_again_holds_nothing_of_the_member_before(replay):
+def test_a_slot_that_is_used_again_holds_nothing_of_the_member_before(replay: str) -> None:
     # Also where its new member holds less, or the array has grown meanwhile.
     for capacity in (10, 7, 33):
         stacked = stack_of(replay, ("old", {}), ("other", {}))
@@ -217,7 +228,7 @@ def test_a_slot_that_is_used_again_holds_nothing_of_the_member_before(replay):
 
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized"])
-def test_the_memory_grows_for_more_members_and_larger_ones(replay):
+def test_the_memory_grows_for_more_members_and_larger_ones(replay: str) -> None:
     stacked = stack_of(replay, ("a", {}))
     put(stacked, ["a"], transitions(0, 13))
     before = numbers_of(stacked.draw(stacked.slots(["a"]), np.linspace(0, 0.999, 50)[None]))
@@ -234,7 +245,7 @@ def test_the_memory_grows_for_more_members_and_larger_ones(replay):
 # -- priorities
 
 
-def test_prioritized_draws_in_proportion_to_what_each_member_makes_of_its_errors():
+def test_prioritized_draws_in_proportion_to_what_each_member_makes_of_its_errors() -> None:
     errors = np.arange(1, 9, dtype=np.float32)[None].repeat(2, axis=0)
     members = [("a", {"prioritized_alpha": 1.0, "prioritized_beta": 1.0}), ("b", {"prioritized_alpha": 0.0})]
     stacked = stack_of("prioritized", *members)
@@ -247,11 +258,11 @@ def test_prioritized_draws_in_proportion_to_what_each_member_makes_of_its_errors
         chi_square = ((np.bincount(found, minlength=8) - expected) ** 2 / expected).sum()
         assert chi_square < 7 + 5 * np.sqrt(14)
     # With beta 1 the weights undo the preference; the largest is 1.
-    np.testing.assert_allclose(drawn.weights[0], 1 / (1 + numbers_of(drawn)[0]), rtol=1e-5)
-    np.testing.assert_array_equal(drawn.weights[1], 1.0)
+    np.testing.assert_allclose(present(drawn.weights)[0], 1 / (1 + numbers_of(drawn)[0]), rtol=1e-5)
+    np.testing.assert_array_equal(present(drawn.weights)[1], 1.0)
 
 
-def test_priorities_of_rows_that_are_in_a_batch_twice():
+def test_priorities_of_rows_that_are_in_a_batch_twice() -> None:
     stacked = stack_of("prioritized", ("a", {"prioritized_alpha": 1.0}))
     put(stacked, ["a"], transitions(0, 4))
     indices = np.array([[2, 2, 0, 2, 0]])
@@ -263,7 +274,7 @@ def test_priorities_of_rows_that_are_in_a_batch_twice():
     assert found.tolist() == [[0, 0, 1, 1, 2, 2, 3]]
 
 
-def test_errors_that_are_no_numbers_do_not_spoil_the_trees():
+def test_errors_that_are_no_numbers_do_not_spoil_the_trees() -> None:
     stacked = stack_of("prioritized", ("a", {}), ("b", {}))
     put(stacked, ["a", "b"], transitions(0, 4), transitions(0, 4))
     slots = stacked.slots(["a", "b"])
@@ -282,7 +293,9 @@ def test_errors_that_are_no_numbers_do_not_spoil_the_trees():
         ("prioritized", StackedPrioritizedReplay, PrioritizedReplayBuffer),
     ],
 )
-def test_the_memory_that_the_hyperparameters_name(replay, kind, reference):
+def test_the_memory_that_the_hyperparameters_name(
+    replay: str, kind: type[StackedPrioritizedReplay | StackedReplay], reference: type
+) -> None:
     hyperparams = make_hyperparams(replay=replay)
     assert type(make_stacked_replay(hyperparams, D)) is kind
     assert type(make_replay(hyperparams, 0)) is reference
@@ -295,12 +308,12 @@ GAMMA = {"a": 0.9, "b": 1.0, "c": 0.5}
 N = 3
 
 
-def random_steps(num_steps, num_rows, seed):
+def random_steps(num_steps: int, num_rows: int, seed: int) -> Iterator[Seen]:
     """(observations, actions, step) one after another; observations tell their row and their number in it."""
     rng = np.random.default_rng(seed)
     numbers = np.zeros(num_rows)
 
-    def observe():
+    def observe() -> NDArray[np.float32]:
         return np.stack([np.arange(num_rows), numbers], axis=1).astype(np.float32)
 
     now = observe()
@@ -316,7 +329,7 @@ def random_steps(num_steps, num_rows, seed):
         now = after
 
 
-def expected_rows(steps, row, n_step, gamma):
+def expected_rows(steps: Sequence[Seen], row: int, n_step: int, gamma: float) -> NDArray[np.float32]:
     """What `NStep` makes of one sub-environment's steps, which resets in a step of its own, all at once."""
     columns = {name: [] for name in ("obs", "actions", "rewards", "terminated", "truncated", "stepped")}
     for now, actions, step in steps:
@@ -333,7 +346,7 @@ def expected_rows(steps, row, n_step, gamma):
 
 
 @pytest.mark.parametrize("n_step", [1, 2, 3])
-def test_n_step_rows_are_those_of_one_sum_a_row(n_step):
+def test_n_step_rows_are_those_of_one_sum_a_row(n_step: int) -> None:
     stacked = StackedNStep(N, D, n_step)
     for name in NAMES:
         stacked.add_member(name, make_hyperparams(n_step=n_step, gamma=GAMMA[name]))
@@ -354,7 +367,7 @@ def test_n_step_rows_are_those_of_one_sum_a_row(n_step):
         assert np.all(np.isin(together[:, 0], range(index * N, (index + 1) * N)))
 
 
-def test_what_waits_for_rewards_leaves_with_its_member():
+def test_what_waits_for_rewards_leaves_with_its_member() -> None:
     stacked = StackedNStep(1, D, 3)
     for name in ("a", "b"):
         stacked.add_member(name, make_hyperparams(n_step=3))
@@ -372,7 +385,7 @@ def test_what_waits_for_rewards_leaves_with_its_member():
 
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "none"])
-def test_no_rows_change_nothing(replay):
+def test_no_rows_change_nothing(replay: str) -> None:
     stacked, plain = (stack_of(replay, ("a", {}), ("b", {})) for _ in range(2))
     put(stacked, ["a", "b"], transitions(0, 0), transitions(0, 0))
     assert stacked.sizes(stacked.slots(["a", "b"])).tolist() == [0, 0]

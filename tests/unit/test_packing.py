@@ -1,6 +1,8 @@
 """Engines: which trials are packed, with which others, and why others are not."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 from pack_plans import DQN, LR, TPE, fake_reasons, plan
@@ -8,12 +10,14 @@ from spec_errors import MINIMAL, errors
 
 from policies.errors import EnvError, SpecError
 from policies.guard import guarded
-from policies.hyperparams import make_hyperparams
+from policies.hyperparams import Algorithm, make_hyperparams
+from tests.narrowing import present
 from tune_jobs.plan.engine_choice import pack_key, why_not
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.drive import write_new
@@ -24,8 +28,8 @@ IMAGES = {"env": {"id": "CartPole-v1", "pixels": True}, "hyperparams": {"conv_fi
 
 
 @pytest.fixture
-def unseedable_env(monkeypatch):
-    def check_seedable(env_id, env_args, *, timeout_s):
+def unseedable_env(monkeypatch: pytest.MonkeyPatch) -> None:
+    def check_seedable(env_id: str, env_args: dict[str, Any], *, timeout_s: float) -> None:
         raise EnvError(f"{env_id} gives other observations with the same seed.", "Set engine: rllib.")
 
     monkeypatch.setattr(guarded, "check_seedable", check_seedable)
@@ -34,7 +38,7 @@ def unseedable_env(monkeypatch):
 # -- which engine
 
 
-def test_what_can_be_packed_is_packed():
+def test_what_can_be_packed_is_packed() -> None:
     for fields in ({}, DQN, {"env": "Pendulum-v1"}, {"scheduler": "asha"}, {"scheduler": "median"}, TPE):
         made = plan(**fields)
         assert {trial.engine for trial in made.trials} == {"packed"}
@@ -51,7 +55,9 @@ def test_what_can_be_packed_is_packed():
         ({"rl_module": "my_nets:Net"}, "rl_module is my_nets:Net, and packs have no networks but their own"),
     ],
 )
-def test_what_cannot_be_packed_is_left_to_rllib_with_the_reason(monkeypatch, fields, reason):
+def test_what_cannot_be_packed_is_left_to_rllib_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch, fields: dict[str, Any], reason: str
+) -> None:
     monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_rl_module", lambda spec: None)
     made = plan(**fields)
     assert (made.engines, made.packs) == ({"rllib": 10}, None)
@@ -63,17 +69,17 @@ def test_what_cannot_be_packed_is_left_to_rllib_with_the_reason(monkeypatch, fie
     assert plan(**{**fields, "engine": "rllib"}).notes == ()
 
 
-def test_an_engine_that_is_none_is_refused_with_the_nearest():
+def test_an_engine_that_is_none_is_refused_with_the_nearest() -> None:
     assert "engine: 'pack' is not allowed" in errors(engine="pack")
 
 
-def test_a_baseline_has_an_engine_of_its_own():
+def test_a_baseline_has_an_engine_of_its_own() -> None:
     made = plan(algorithm="random", space={}, num_samples=1)
     assert (made.engines, made.packs, made.notes) == ({"baseline": 1}, None, ())
     assert "algorithm is random, which does not learn" in errors(algorithm="random", engine="packed")
 
 
-def test_trials_with_convolutions_are_not_packed(monkeypatch):
+def test_trials_with_convolutions_are_not_packed(monkeypatch: pytest.MonkeyPatch) -> None:
     # Whether observations are images is known of the environment alone: here none of them is looked at.
     monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_env_rules", lambda *arguments: None)
     fields = {"space": {"conv_filters": {"grid": [None, [[4, 8, 4]]]}}, "num_samples": 3}
@@ -86,13 +92,13 @@ def test_trials_with_convolutions_are_not_packed(monkeypatch):
     assert why_not(PACKED, load_spec({**MINIMAL, **TPE}), None) is None
 
 
-def test_engines_are_chosen_trial_by_trial(monkeypatch):
+def test_engines_are_chosen_trial_by_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     fake_reasons(monkeypatch, [0.2])
-    space = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1}
+    space: dict[str, Any] = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1}
     made = plan(**space, seeds_per_point=2)
     assert [trial.engine for trial in made.trials] == ["packed"] * 2 + ["rllib"] * 2 + ["packed"] * 2
     assert made.notes == ("t0002, t0003 are not packed, RLlib trains them: its lr is odd.",)
-    assert made.packs.trial_ids == ("t0000", "t0001", "t0004", "t0005")
+    assert present(made.packs).trial_ids == ("t0000", "t0001", "t0004", "t0005")
     assert made.to_json()["engines"] == {"packed": 4, "rllib": 2}
     many = plan(**space, seeds_per_point=20)
     assert many.notes == ("20 trials are not packed, RLlib trains them: its lr is odd.",)
@@ -104,7 +110,7 @@ def test_engines_are_chosen_trial_by_trial(monkeypatch):
     assert "auto" in caught.value.hint
 
 
-def test_environments_without_seeds_are_left_to_rllib(unseedable_env):
+def test_environments_without_seeds_are_left_to_rllib(unseedable_env) -> None:
     reason = "CartPole-v1 gives other observations with the same seed"
     made = plan()
     assert made.notes == (f"No trial is packed, RLlib trains them all: {reason}.",)
@@ -114,11 +120,13 @@ def test_environments_without_seeds_are_left_to_rllib(unseedable_env):
     assert plan(engine="rllib").notes == ()
 
 
-def test_a_dry_run_shows_the_engine_of_each_trial_if_they_differ(monkeypatch, capsys):
+def test_a_dry_run_shows_the_engine_of_each_trial_if_they_differ(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from tune_jobs.cli.plan_view import show_plan
 
     fake_reasons(monkeypatch, [0.2])
-    fields = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1}
+    fields: dict[str, Any] = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1}
     show_plan(load_spec({**MINIMAL, **fields}), plan(**fields), as_json=False)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert next(line for line in lines if line[:1] == ["engine"])[1:5] == ["packed", "2,", "rllib", "1;"]
@@ -128,14 +136,14 @@ def test_a_dry_run_shows_the_engine_of_each_trial_if_they_differ(monkeypatch, ca
 # -- going on
 
 
-def written(tmp_path, made, spec):
+def written(tmp_path: Path, made: SweepPlan, spec: SweepSpec) -> SweepStore:
     store = SweepStore(tmp_path / "mine")
     store.create()
     write_new(store, spec, made, None)
     return store
 
 
-def test_trials_go_on_with_the_engines_they_have(tmp_path):
+def test_trials_go_on_with_the_engines_they_have(tmp_path: Path) -> None:
     fields = {**MINIMAL, "num_samples": 4, "space": LR}
     spec = load_spec(fields)
     made = make_plan(spec, Machine(2))
@@ -154,9 +162,9 @@ def test_trials_go_on_with_the_engines_they_have(tmp_path):
     check_same_trials(store, again)
     assert [trial.engine for trial in again.trials] == ["packed", "rllib", *["packed"] * 4]
     # Packs are for what is left to be trained.
-    assert again.packs.trial_ids == ("t0000", "t0004", "t0005")
+    assert present(again.packs).trial_ids == ("t0000", "t0004", "t0005")
     retried = make_plan(spec, Machine(2), store.read_trials(), retry_failed=True)
-    assert retried.packs.trial_ids == ("t0000", "t0003")
+    assert present(retried.packs).trial_ids == ("t0000", "t0003")
     assert pending_record(again.trials[1]).engine == "rllib"
     # What the file wishes is for new trials.
     forced = make_plan(load_spec({**fields, "engine": "packed"}), Machine(2), store.read_trials())
@@ -165,7 +173,7 @@ def test_trials_go_on_with_the_engines_they_have(tmp_path):
     assert none_new.engines == {"packed": 3, "rllib": 1}
 
 
-def test_packs_are_gone_when_all_packed_trials_have_ended():
+def test_packs_are_gone_when_all_packed_trials_have_ended() -> None:
     made = plan()
     ended = [pending_record(trial).model_copy(update={"status": "completed"}) for trial in made.trials]
     again = plan(records=ended)
@@ -175,18 +183,18 @@ def test_packs_are_gone_when_all_packed_trials_have_ended():
 # -- stacks
 
 
-def test_what_can_be_stacked_is_handed_out_together():
+def test_what_can_be_stacked_is_handed_out_together() -> None:
     space = {"hidden_sizes": {"grid": [[8], [8, 8]]}, "activation": {"grid": ["tanh", "relu"]}}
     made = plan(space=space, num_samples=1, seeds_per_point=2)
     layers = {trial.trial_id: len(trial.point["hidden_sizes"]) for trial in made.trials}
-    assert [layers[name] for name in made.packs.trial_ids] == [1] * 4 + [2] * 4
-    assert made.packs.trial_ids[:4] == ("t0000", "t0001", "t0002", "t0003")
+    assert [layers[name] for name in present(made.packs).trial_ids] == [1] * 4 + [2] * 4
+    assert present(made.packs).trial_ids[:4] == ("t0000", "t0001", "t0002", "t0003")
     mixed = plan(space={"num_envs": {"grid": [8, 16]}, "activation": {"grid": ["tanh", "relu"]}}, num_samples=2)
     ids = [trial.trial_id for trial in mixed.trials if trial.point["num_envs"] == 8]
-    assert mixed.packs.trial_ids[:4] == tuple(ids)
+    assert present(mixed.packs).trial_ids[:4] == tuple(ids)
     # Points that are not known come last.
     made = plan(**{**TPE, "search": {"type": "tpe", "num_startup_trials": 3}})
-    assert made.packs.trial_ids == tuple(trial.trial_id for trial in made.trials)
+    assert present(made.packs).trial_ids == tuple(trial.trial_id for trial in made.trials)
 
 
 ALIKE = {
@@ -211,7 +219,7 @@ APART = {
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_members_of_a_stack_share_what_shapes_their_work(algorithm):
+def test_members_of_a_stack_share_what_shapes_their_work(algorithm: Algorithm) -> None:
     key = pack_key(make_hyperparams(algorithm, {}))
     for name, value in ALIKE[algorithm].items():
         assert pack_key(make_hyperparams(algorithm, {name: value})) == key, name
@@ -219,7 +227,7 @@ def test_members_of_a_stack_share_what_shapes_their_work(algorithm):
         assert pack_key(make_hyperparams(algorithm, {name: value})) != key, name
 
 
-def test_two_kinds_of_target_updates_are_not_stacked():
+def test_two_kinds_of_target_updates_are_not_stacked() -> None:
     values = [
         {"tau": 0.5}, {"tau": 0.5, "target_update_freq": 4}, {"double_q": False},
         {"double_q": False, "target_network": False},
@@ -231,7 +239,7 @@ def test_two_kinds_of_target_updates_are_not_stacked():
         pack_key(make_hyperparams("random", {}))
 
 
-def test_trials_are_listed_with_their_engines_if_they_differ(capsys):
+def test_trials_are_listed_with_their_engines_if_they_differ(capsys: pytest.CaptureFixture[str]) -> None:
     from tune_jobs.cli.output import show_trials
 
     records = [pending_record(trial) for trial in plan(num_samples=2).trials]

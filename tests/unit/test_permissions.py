@@ -1,7 +1,10 @@
 """Parts of a storage folder that this user may not look at: said in our words, and the others are shown."""
 
 import os
+from collections.abc import Callable
+from os import stat_result
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from sweep_folders import make_sweep_folder
@@ -11,19 +14,19 @@ from tune_jobs.sweeps import verbs as sweeps
 
 
 @pytest.fixture
-def closed(monkeypatch):
+def closed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Close a folder, to root as well: nothing below it can be looked at, nor what lies in it."""
-    folders = []
+    folders: list[Any] = []
 
-    def closing(name):
+    def closing(name: str) -> Callable[..., int | stat_result | list[str]]:
         real = getattr(os, name)
 
-        def call(path, *arguments, **options):
+        def call(path: str | Path, *arguments: int, **options: bool) -> int | stat_result | list[str]:
             text = os.fspath(path) if isinstance(path, (str, os.PathLike)) else ""
             listed = f"{text}/" if name in ("listdir", "scandir") else text
             if any(listed.startswith(f"{folder}/") for folder in folders):
                 raise PermissionError(13, "Permission denied", text)
-            return real(path, *arguments, **options)
+            return cast("int | stat_result | list[str]", real(path, *arguments, **options))
 
         return call
 
@@ -33,13 +36,15 @@ def closed(monkeypatch):
 
 
 @pytest.fixture
-def storage(tmp_path):
+def storage(tmp_path: Path) -> Path:
     for name in ("mine", "other"):
         make_sweep_folder(tmp_path / name, iterations=1)
     return tmp_path
 
 
-def test_a_sweep_that_may_not_be_looked_at_does_not_hide_the_others(storage, closed, caplog):
+def test_a_sweep_that_may_not_be_looked_at_does_not_hide_the_others(
+    storage: Path, closed: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
     closed(storage / "other")
     assert [status.sweep.name for status in sweeps.list_sweeps(storage)] == ["mine"]
     assert f"{storage}/other/sweep.json cannot be looked at: Permission denied" in caplog.text
@@ -49,13 +54,15 @@ def test_a_sweep_that_may_not_be_looked_at_does_not_hide_the_others(storage, clo
 
 
 @pytest.mark.parametrize("part", ["trials", "trials/t0001", "trials/t0001/checkpoints"])
-def test_a_part_of_a_sweep_that_may_not_be_looked_at_is_named(storage, closed, part):
+def test_a_part_of_a_sweep_that_may_not_be_looked_at_is_named(
+    storage: Path, closed: Callable[..., Any], part: str
+) -> None:
     closed(storage / "mine" / Path(part))
     with pytest.raises(CheckpointError, match=f"mine/{part}.* cannot be looked at: Permission denied"):
         sweeps.trials("mine", storage=storage)
 
 
-def test_a_storage_folder_that_may_not_be_looked_into_is_named(storage, closed):
+def test_a_storage_folder_that_may_not_be_looked_into_is_named(storage: Path, closed: Callable[..., Any]) -> None:
     closed(storage)
     with pytest.raises(CheckpointError, match=f"{storage} cannot be looked at: Permission denied"):
         sweeps.list_sweeps(storage)

@@ -4,6 +4,7 @@ import collections
 import enum
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ class Colour(enum.StrEnum):
 
 
 class Broken:
-    def __repr__(self):
+    def __repr__(self) -> None:
         raise RuntimeError
 
 
@@ -43,14 +44,14 @@ class Broken:
         (Uniform(uniform=(1, 2)), {"uniform": [1.0, 2.0]}),
     ],
 )
-def test_python_values_become_plain_ones(value, plain):
+def test_python_values_become_plain_ones(value: Any, plain: Any) -> None:
     copied = to_plain({"x": value}, "sweep")["x"]
     assert copied == plain
     assert json.dumps(copied) == json.dumps(plain)
     assert type(copied) is type(plain)
 
 
-def test_a_sweep_of_numpy_values_is_the_same_as_one_of_python_values(tmp_path):
+def test_a_sweep_of_numpy_values_is_the_same_as_one_of_python_values(tmp_path: Path) -> None:
     with_numpy = {
         "env": {"id": "CartPole-v1", "args": {"path": tmp_path, "flag": np.bool_(False)}},
         "algorithm": "ppo",
@@ -90,7 +91,7 @@ def test_a_sweep_of_numpy_values_is_the_same_as_one_of_python_values(tmp_path):
         (["x" * 1000] * 1000, "more than 262,144 characters"),
     ],
 )
-def test_what_a_sweep_folder_cannot_hold_is_told_with_its_place(value, part):
+def test_what_a_sweep_folder_cannot_hold_is_told_with_its_place(value: Any, part: str) -> None:
     with pytest.raises(SpecError) as caught:
         load_spec({**MINIMAL, "env": {"id": "x", "args": {"thing": [value]}}})
     assert caught.value.message.startswith("sweep: env.args.thing[0]")
@@ -98,7 +99,7 @@ def test_what_a_sweep_folder_cannot_hold_is_told_with_its_place(value, part):
     assert caught.value.hint
 
 
-def test_what_is_shared_is_counted_as_often_as_it_stands_there():
+def test_what_is_shared_is_counted_as_often_as_it_stands_there() -> None:
     shared = [1] * 10
     for _ in range(20):
         shared = [shared] * 10
@@ -111,12 +112,12 @@ def test_what_is_shared_is_counted_as_often_as_it_stands_there():
     assert to_plain({"a": twice, "b": twice}, "sweep") == {"a": [1, 2], "b": [1, 2]}
 
 
-def test_what_contains_itself_or_is_too_deep_is_refused():
-    own = {}
+def test_what_contains_itself_or_is_too_deep_is_refused() -> None:
+    own: dict[str, Any] = {}
     own["me"] = [own]
     with pytest.raises(SpecError, match=r"sweep: me\[0\]: contains itself"):
         load_spec(own)
-    deep = []
+    deep: list[Any] = []
     for _ in range(5_000):
         deep = [deep]
     with pytest.raises(SpecError, match="nested more than 64 deep"):

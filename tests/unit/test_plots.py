@@ -1,12 +1,15 @@
 """The figures hold the data, on any kind of sweep, and become safe, themeable SVG."""
 
+from __future__ import annotations
+
 import re
 import subprocess
 import sys
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
-from synthetic_sweep import make_points, make_sweep
+from synthetic_sweep import Synthetic, make_points, make_sweep
 
 from analysis.plot_style import (
     CSS_DARK,
@@ -20,23 +23,29 @@ from analysis.plot_style import (
     to_svg,
 )
 from analysis.plots import learning_curves, score_by_lr, score_per_episode
+from tests.narrowing import present
+
+if TYPE_CHECKING:
+    from matplotlib.axes._axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 
 @pytest.fixture(scope="module")
-def synthetic():
+def synthetic() -> Synthetic:
     return make_sweep(failed={3}, pending={5})
 
 
-def legend_of(figure):
+def legend_of(figure: Figure) -> list[str]:
     return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
-def lines_longer_than(axes, length):
+def lines_longer_than(axes: Axes, length: int) -> list[Line2D]:
     return [line for line in axes.lines if len(line.get_xdata()) > length and line.get_linestyle() != "None"]
 
 
-def test_every_trial_with_results_has_its_curve(synthetic):
-    winner = synthetic.best.checkpoint.trial_id
+def test_every_trial_with_results_has_its_curve(synthetic: Synthetic) -> None:
+    winner = present(synthetic.best).checkpoint.trial_id
     axes = learning_curves(synthetic.trials, synthetic.results, threshold=195.0, winner=winner).axes[0]
     curves = lines_longer_than(axes, 2)
     assert len(curves) == 19
@@ -50,9 +59,9 @@ def test_every_trial_with_results_has_its_curve(synthetic):
     assert "training return" in axes.get_ylabel()
 
 
-def test_legend_names_groups_goal_winner_and_failure(synthetic):
+def test_legend_names_groups_goal_winner_and_failure(synthetic: Synthetic) -> None:
     figure = learning_curves(
-        synthetic.trials, synthetic.results, threshold=195.0, winner=synthetic.best.checkpoint.trial_id
+        synthetic.trials, synthetic.results, threshold=195.0, winner=present(synthetic.best).checkpoint.trial_id
     )
     labels = legend_of(figure)
     assert {"32 · linear", "32 · relu", "64 · linear", "64 · relu", "failed", "goal 195"} <= set(labels)
@@ -60,7 +69,7 @@ def test_legend_names_groups_goal_winner_and_failure(synthetic):
     assert len(labels) == len(set(labels))
 
 
-def test_long_curves_are_thinned_but_keep_their_ends():
+def test_long_curves_are_thinned_but_keep_their_ends() -> None:
     long = make_sweep(points=[{"lr": 1e-6}], max_steps=1_000_000)
     axes = learning_curves(long.trials, long.results, threshold=None).axes[0]
     (line,) = lines_longer_than(axes, 2)
@@ -69,15 +78,15 @@ def test_long_curves_are_thinned_but_keep_their_ends():
     assert (line.get_xdata()[0], line.get_xdata()[-1]) == (rows[0].num_env_steps, rows[-1].num_env_steps)
 
 
-def test_the_range_over_the_seeds_of_the_winning_point_is_drawn():
+def test_the_range_over_the_seeds_of_the_winning_point_is_drawn() -> None:
     several = make_sweep(points=make_points(1, np.random.default_rng(0)), seeds_per_point=3)
-    winner = several.best.checkpoint.trial_id
+    winner = present(several.best).checkpoint.trial_id
     figure = learning_curves(several.trials, several.results, threshold=195.0, winner=winner)
     assert "winner: range of 3 seeds" in legend_of(figure)
 
 
-def test_scores_stand_at_their_learning_rates(synthetic):
-    figure = score_by_lr(synthetic.trials, threshold=195.0, winner=synthetic.best.checkpoint.trial_id)
+def test_scores_stand_at_their_learning_rates(synthetic: Synthetic) -> None:
+    figure = score_by_lr(synthetic.trials, threshold=195.0, winner=present(synthetic.best).checkpoint.trial_id)
     axes = figure.axes[0]
     groups = [c for c in axes.collections if c.get_label() in {"32 · linear", "32 · relu", "64 · linear", "64 · relu"}]
     drawn = {tuple(xy) for collection in groups for xy in np.asarray(collection.get_offsets())}
@@ -87,10 +96,12 @@ def test_scores_stand_at_their_learning_rates(synthetic):
     assert axes.get_xscale() == "log"
     assert axes.get_xlabel() == "lr"
     ring = next(c for c in axes.collections if c.get_label() == "winner")
-    assert np.asarray(ring.get_offsets()).tolist() == [[synthetic.best.point["lr"], synthetic.best.selection_score]]
+    assert np.asarray(ring.get_offsets()).tolist() == [
+        [present(synthetic.best).point["lr"], present(synthetic.best).selection_score]
+    ]
 
 
-def test_trials_that_cannot_win_are_marked_at_the_edge(synthetic):
+def test_trials_that_cannot_win_are_marked_at_the_edge(synthetic: Synthetic) -> None:
     axes = score_by_lr(synthetic.trials).axes[0]
     lost = next(c for c in axes.collections if c.get_label().startswith("no score"))
     assert [x for x, _ in np.asarray(lost.get_offsets())] == [synthetic.trials[3].point["lr"]]
@@ -99,39 +110,39 @@ def test_trials_that_cannot_win_are_marked_at_the_edge(synthetic):
 @pytest.mark.parametrize(
     ("values", "scale"), [([1e-4, 2e-4, 9e-4], "linear"), ([1e-4, 2e-3], "log"), ([0.0, 1.0], "linear")]
 )
-def test_the_axis_is_logarithmic_beyond_a_decade(values, scale):
+def test_the_axis_is_logarithmic_beyond_a_decade(values: list[float], scale: str) -> None:
     sweep = make_sweep(points=[{"gamma": value} for value in values])
     axes = score_by_lr(sweep.trials).axes[0]
     assert (axes.get_xlabel(), axes.get_xscale()) == ("gamma", scale)
 
 
-def test_without_a_searched_number_the_groups_stand_side_by_side():
+def test_without_a_searched_number_the_groups_stand_side_by_side() -> None:
     sweep = make_sweep(points=[{"activation": name} for name in ("relu", "relu", "tanh")])
     axes = score_by_lr(sweep.trials).axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["relu", "tanh"]
     assert axes.get_xlabel() == "activation"
 
 
-def test_lr_is_the_axis_where_there_are_several_numbers():
+def test_lr_is_the_axis_where_there_are_several_numbers() -> None:
     points = [{"gamma": 0.9 + i / 100, "lr": 10.0**-i, "use": bool(i % 2), "fixed": 1} for i in range(1, 4)]
     trials = make_sweep(points=points).trials
     assert numeric_names(trials) == ["lr", "gamma"]
     assert group_names(trials, "lr") == ["gamma", "use"]
 
 
-def test_a_hyperparameter_of_many_values_makes_no_groups():
+def test_a_hyperparameter_of_many_values_makes_no_groups() -> None:
     trials = make_sweep(points=[{"lr": 1e-3, "num_epochs": i} for i in range(1, 9)]).trials
     assert group_names(trials, None) == []
 
 
-def test_groups_differ_in_colour_and_marker(synthetic):
+def test_groups_differ_in_colour_and_marker(synthetic: Synthetic) -> None:
     styles = set(group_styles(synthetic.trials, ["hidden_sizes", "activation"]).values())
     assert len({style.color for style in styles}) == 4
     assert {(style.label.split(" · ")[0], style.marker) for style in styles} == {("32", "o"), ("64", "s")}
     assert {(style.label.split(" · ")[1], style.line) for style in styles} == {("linear", "-"), ("relu", "--")}
 
 
-def test_score_per_episode_has_goal_trend_and_histogram_of_the_last_fifty():
+def test_score_per_episode_has_goal_trend_and_histogram_of_the_last_fifty() -> None:
     scores = np.concatenate([np.arange(150.0), np.full(50, 199.0)])
     figure = score_per_episode(scores, goal=195.0, title="trial t0001")
     left, right = figure.axes
@@ -143,8 +154,8 @@ def test_score_per_episode_has_goal_trend_and_histogram_of_the_last_fifty():
     assert slope == pytest.approx(np.polyfit(np.arange(1, 201), scores, 1)[0])
     mean = next(line for line in left.lines if line.get_label() == "mean of last 100")
     assert mean.get_ydata()[-1] == pytest.approx(scores[-100:].mean())
-    assert sum(patch.get_height() for patch in right.patches) == 50
-    assert max(patch.get_height() for patch in right.patches) == 50
+    assert sum(cast("Any", patch).get_height() for patch in right.patches) == 50
+    assert max(cast("Any", patch).get_height() for patch in right.patches) == 50
     assert right.get_title(loc="left") == "last 50 episodes"
     assert left.get_title(loc="left") == "trial t0001"
     assert "goal 195" in legend_of(figure)
@@ -152,22 +163,22 @@ def test_score_per_episode_has_goal_trend_and_histogram_of_the_last_fifty():
 
 @pytest.mark.parametrize("returns", [[7.0], [0.0, 0.0], [-200.0, -180.0, -90.5]])
 @pytest.mark.parametrize("goal", [None, 0.0])
-def test_few_or_negative_scores_still_draw(returns, goal):
+def test_few_or_negative_scores_still_draw(returns: list[float], goal: float | None) -> None:
     figure = score_per_episode(returns, goal=goal)
-    assert sum(patch.get_height() for patch in figure.axes[1].patches) == len(returns)
+    assert sum(cast("Any", patch).get_height() for patch in figure.axes[1].patches) == len(returns)
     assert ("goal 0" in legend_of(figure)) == (goal is not None)
     if goal is not None:
         assert figure.axes[0].get_ylim()[1] > goal
     assert to_png(figure, dpi=40).startswith(b"\x89PNG")
 
 
-def test_no_episode_is_an_error():
+def test_no_episode_is_an_error() -> None:
     with pytest.raises(ValueError, match="at least one episode"):
         score_per_episode([], goal=1.0)
 
 
 @pytest.mark.parametrize("kind", ["none usable", "one trial", "no results"])
-def test_poor_sweeps_still_draw(kind):
+def test_poor_sweeps_still_draw(kind: str) -> None:
     sweep = {
         "none usable": lambda: make_sweep(failed=range(20)),
         "one trial": lambda: make_sweep(points=[{}]),
@@ -177,7 +188,7 @@ def test_poor_sweeps_still_draw(kind):
         assert to_svg(figure, label="x", prefix="x").startswith("<svg")
 
 
-def test_svg_follows_the_theme_and_keeps_its_ids_apart():
+def test_svg_follows_the_theme_and_keeps_its_ids_apart() -> None:
     figure = score_per_episode([1.0, 2.0, 3.0], goal=2.0)
     svg = to_svg(figure, label='a "label"', prefix="one")
     assert f"var(--ink, {INK})" in svg
@@ -193,7 +204,7 @@ def test_svg_follows_the_theme_and_keeps_its_ids_apart():
 
 
 @pytest.mark.parametrize("text", ["$x^$", "$\\frac{1}$", "<script>alert(1)</script>", "--><img src=x>", "& < >"])
-def test_hostile_labels_are_only_text(text):
+def test_hostile_labels_are_only_text(text: str) -> None:
     sweep = make_sweep(points=[{"activation": text, "lr": 1e-3}, {"activation": "relu", "lr": 2e-3}])
     figures = [
         learning_curves(sweep.trials, sweep.results, threshold=None),
@@ -207,7 +218,7 @@ def test_hostile_labels_are_only_text(text):
         assert "<!--" not in svg
 
 
-def test_no_screen_and_no_pyplot_are_needed():
+def test_no_screen_and_no_pyplot_are_needed() -> None:
     code = (
         "import sys; sys.modules['matplotlib.pyplot'] = None\n"
         "from analysis.plots import score_per_episode\n"

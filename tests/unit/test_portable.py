@@ -6,7 +6,9 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -24,11 +26,14 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError, Spec
 from policies.portable.file import (
     Layer,
     PolicyNetwork,
+    PortablePolicy,
     describe_space,
     read_policy,
     save_policy,
     space_from_description,
 )
+from policies.portable.network import ConvLayer
+from tests.narrowing import present
 from tests.rounding import assert_rounded, dense
 
 register_test_envs()
@@ -36,7 +41,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "TestPushes-v0", "TestWalk-v0"])
-def test_what_is_saved_is_what_is_read(env_id, tmp_path):
+def test_what_is_saved_is_what_is_read(env_id: str, tmp_path: Path) -> None:
     saved = make_portable(env_id, hidden=(5, 7), activation="elu")
     path = save_policy(saved, tmp_path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["policy.json", "policy.safetensors"]
@@ -55,7 +60,9 @@ def test_what_is_saved_is_what_is_read(env_id, tmp_path):
 
 
 @pytest.mark.parametrize("make", [make_image_policy, make_module_portable])
-def test_all_parts_of_a_network_are_read_as_they_were_saved(make, tmp_path):
+def test_all_parts_of_a_network_are_read_as_they_were_saved(
+    make: Callable[..., PortablePolicy], tmp_path: Path
+) -> None:
     saved = make()
     save_policy(saved, tmp_path)
     read = read_policy(tmp_path)
@@ -70,36 +77,36 @@ def test_all_parts_of_a_network_are_read_as_they_were_saved(make, tmp_path):
     for one, other in zip(read.network.conv, saved.network.conv, strict=True):
         assert (one.stride, one.activation) == (other.stride, other.activation)
     if saved.network.module is not None:
-        assert read.network.module.class_path == saved.network.module.class_path
-        assert read.network.module.model_config == saved.network.module.model_config
+        assert present(read.network.module).class_path == saved.network.module.class_path
+        assert present(read.network.module).model_config == saved.network.module.model_config
     else:
-        assert read.network.normalization.clip == saved.network.normalization.clip
+        assert present(read.network.normalization).clip == present(saved.network.normalization).clip
 
 
-def test_files_of_format_1_act_as_they_did():
+def test_files_of_format_1_act_as_they_did() -> None:
     """Written before there were convolutions and statistics."""
     policy = load_policy(Path(__file__).parent / "samples" / "policy_format_1")
     observations = np.array([[0.1, -0.2, 0.03, 0.4], [-1.0, 0.5, -0.2, -0.7]])
     expected = [[0.17224079370498657, 0.17183804512023926], [-0.18863928318023682, 0.07189814746379852]]
-    sizes, num_roundings = dense(policy.portable.network.layers, observations)
-    assert_rounded(policy.outputs(observations), expected, sizes=sizes, num_roundings=num_roundings)
+    sizes, num_roundings = dense(cast("Any", policy).portable.network.layers, observations)
+    assert_rounded(cast("Any", policy).outputs(observations), expected, sizes=sizes, num_roundings=num_roundings)
     np.testing.assert_array_equal(policy.act(observations), [0, 1])
     assert policy.observation_space == gym.make("CartPole-v1").observation_space
 
 
-def test_equal_bounds_are_one_number():
+def test_equal_bounds_are_one_number() -> None:
     description = describe_space(IMAGES)
     assert (description["low"], description["high"]) == (0, 255)
     assert len(json.dumps(description)) < 100
     assert describe_space(gym.spaces.Box(-np.inf, np.inf, (3,)))["low"] == "-inf"
 
 
-def _network(**changes):
+def _network(**changes: Any) -> PortablePolicy:
     policy = make_image_policy()
     return dataclasses.replace(policy, network=dataclasses.replace(policy.network, **changes))
 
 
-def _conv(**changes):
+def _conv(**changes: Any) -> dict[str, tuple[ConvLayer, ConvLayer]]:
     first, second = make_image_policy().network.conv
     return {"conv": (first, dataclasses.replace(second, **changes))}
 
@@ -123,20 +130,20 @@ def _conv(**changes):
         ({"kind": "module", "module": make_module_portable().network.module}, "2 layers, but takes none"),
     ],
 )
-def test_parts_that_form_no_network_are_not_saved(changes, words, tmp_path):
+def test_parts_that_form_no_network_are_not_saved(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=words):
         save_policy(_network(**changes), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_policy_of_a_class_that_is_not_allowed_is_read_but_does_not_act(tmp_path):
+def test_a_policy_of_a_class_that_is_not_allowed_is_read_but_does_not_act(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     save_policy(make_module_portable(), tmp_path)
     with pytest.raises(SpecError, match="no_such_package"):
         load_policy(tmp_path)
 
 
-def test_transposed_weights_are_saved_as_what_they_are(tmp_path):
+def test_transposed_weights_are_saved_as_what_they_are(tmp_path: Path) -> None:
     policy = make_portable("CartPole-v1", hidden=())
     weight = np.asfortranarray(policy.network.layers[0].weight)
     view = Layer(weight, policy.network.layers[0].bias)
@@ -157,7 +164,7 @@ def test_transposed_weights_are_saved_as_what_they_are(tmp_path):
         gym.spaces.Discrete(3, start=-2),
     ],
 )
-def test_spaces_survive_json(space):
+def test_spaces_survive_json(space: gym.spaces.Box | gym.spaces.Discrete) -> None:
     text = json.dumps(describe_space(space), allow_nan=False)
     assert space_from_description(json.loads(text)) == space
 
@@ -174,12 +181,12 @@ def test_spaces_survive_json(space):
         {},
     ],
 )
-def test_a_description_of_no_space_is_refused(description):
+def test_a_description_of_no_space_is_refused(description: dict[str, Any]) -> None:
     with pytest.raises(CheckpointError):
         space_from_description(description)
 
 
-def test_odd_metadata_does_not_spoil_the_json(tmp_path):
+def test_odd_metadata_does_not_spoil_the_json(tmp_path: Path) -> None:
     training = {
         "score": math.nan,
         "lr": np.float32(0.5),
@@ -194,19 +201,19 @@ def test_odd_metadata_does_not_spoil_the_json(tmp_path):
     assert read_policy(tmp_path).training == expected
 
 
-def test_files_may_be_renamed_together(tmp_path):
+def test_files_may_be_renamed_together(tmp_path: Path) -> None:
     save_policy(make_portable("CartPole-v1"), tmp_path, stem="best")
     for suffix in (".json", ".safetensors"):
         (tmp_path / f"best{suffix}").rename(tmp_path / f"mine.v2{suffix}")
     assert read_policy(tmp_path / "mine.v2.json").env_id == "CartPole-v1"
 
 
-def _edit(folder, **changes):
+def _edit(folder: Path, **changes: Any) -> None:
     path = folder / "policy.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def test_missing_files_are_not_found(tmp_path):
+def test_missing_files_are_not_found(tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match=r"policy\.json") as caught:
         read_policy(tmp_path)
     assert caught.value.exit_code == 4
@@ -219,13 +226,13 @@ def test_missing_files_are_not_found(tmp_path):
             read_policy(tmp_path)
 
 
-def test_a_file_of_another_kind_is_refused(tmp_path):
+def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "policy.pkl").write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"neither \.json nor \.safetensors"):
         read_policy(tmp_path / "policy.pkl")
 
 
-def test_a_changed_or_cut_weights_file_fails_its_hash(tmp_path):
+def test_a_changed_or_cut_weights_file_fails_its_hash(tmp_path: Path) -> None:
     save_policy(make_portable("CartPole-v1"), tmp_path)
     weights = tmp_path / "policy.safetensors"
     content = weights.read_bytes()
@@ -268,7 +275,7 @@ def test_a_changed_or_cut_weights_file_fails_its_hash(tmp_path):
         ),
     ],
 )
-def test_a_description_that_does_not_fit_is_refused(changes, words, tmp_path):
+def test_a_description_that_does_not_fit_is_refused(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
     save_policy(make_portable("CartPole-v1"), tmp_path)
     _edit(tmp_path, **changes)
     with pytest.raises(CheckpointError, match=words) as caught:
@@ -277,14 +284,14 @@ def test_a_description_that_does_not_fit_is_refused(changes, words, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\xff", '{"format_version": 1}'])
-def test_json_of_something_else_is_refused(text, tmp_path):
+def test_json_of_something_else_is_refused(text: str, tmp_path: Path) -> None:
     save_policy(make_portable("CartPole-v1"), tmp_path)
     (tmp_path / "policy.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(CheckpointError, match=r"policy\.(json|safetensors)"):
         read_policy(tmp_path)
 
 
-def test_layers_that_form_no_network_are_not_saved(tmp_path):
+def test_layers_that_form_no_network_are_not_saved(tmp_path: Path) -> None:
     policy = make_portable("CartPole-v1")
     for layers in ((), policy.network.layers[:-1], policy.network.layers[::-1]):
         with pytest.raises(CheckpointError):
@@ -292,11 +299,11 @@ def test_layers_that_form_no_network_are_not_saved(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupted_save_is_noticed(tmp_path, monkeypatch):
+def test_an_interrupted_save_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_policy(make_portable("CartPole-v1", seed=1), tmp_path)
     replace = type(tmp_path).replace
 
-    def fail_at_json(self, target):
+    def fail_at_json(self: Path, target: Path) -> Path:
         if target.suffix == ".json":
             raise OSError(28, os.strerror(28))
         return replace(self, target)
@@ -308,7 +315,7 @@ def test_an_interrupted_save_is_noticed(tmp_path, monkeypatch):
         read_policy(tmp_path)
 
 
-def test_reading_needs_neither_ray_nor_torch(tmp_path):
+def test_reading_needs_neither_ray_nor_torch(tmp_path: Path) -> None:
     save_policy(make_portable("CartPole-v1"), tmp_path)
     code = (
         "import sys; from policies.acting.load import load_policy; import policies.acting.evaluate\n"

@@ -28,20 +28,20 @@ SEEDS = {
 
 
 @pytest.mark.parametrize("name", FIRST_DRAWS)
-def test_generators_draw_what_they_always_drew(name):
+def test_generators_draw_what_they_always_drew(name: str) -> None:
     arguments, expected = FIRST_DRAWS[name]
     assert getattr(random_streams, name)(*arguments).integers(0, 2**31, 3).tolist() == expected
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_seeds_are_what_they_always_were(name):
+def test_seeds_are_what_they_always_were(name: str) -> None:
     arguments, expected = SEEDS[name]
     found = getattr(random_streams, name)(*arguments)
     assert found == expected
     assert all(type(item) is int for item in (found if isinstance(found, tuple) else [found]))
 
 
-def test_every_stream_is_tested():
+def test_every_stream_is_tested() -> None:
     here = {
         name
         for name, value in vars(random_streams).items()
@@ -50,7 +50,7 @@ def test_every_stream_is_tested():
     assert {name for name in here if not name.startswith("_")} == FIRST_DRAWS.keys() | SEEDS.keys()
 
 
-def test_no_other_module_derives_a_stream():
+def test_no_other_module_derives_a_stream() -> None:
     found = [
         path.relative_to(ROOT).as_posix()
         for package in ("policies", "analysis", "tune_jobs")

@@ -5,9 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from tests.narrowing import present
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -30,37 +33,37 @@ with reaping():
 """
 
 
-def names_of_children(pid):
+def names_of_children(pid: int) -> list[str]:
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     return [Path(f"/proc/{child}/comm").read_text().strip() for child in children]
 
 
-def wait_until(condition):
+def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 600
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-def test_what_a_raylet_started_ends_with_the_driver_and_nothing_else_does():
+def test_what_a_raylet_started_ends_with_the_driver_and_nothing_else_does() -> None:
     driver = subprocess.Popen(
         [sys.executable, "-c", DRIVER, RAYLET],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
-        told = sorted(driver.stdout.readline().strip() for _ in range(2))
+        told = sorted(present(driver.stdout).readline().strip() for _ in range(2))
         assert told[1] == "up"
         wait_until(lambda: "reaper of 1" in names_of_children(driver.pid))
         driver.send_signal(signal.SIGKILL)
         driver.wait()
         # The user's own process still reads. Its output is the same pipe as that of the raylet's child.
-        driver.stdin.write("go on\n")
-        driver.stdin.flush()
-        assert driver.stdout.readline() == "mine\n"
+        present(driver.stdin).write("go on\n")
+        present(driver.stdin).flush()
+        assert present(driver.stdout).readline() == "mine\n"
         ready, _, _ = select.select([driver.stdout], [], [], 60)
         assert ready
-        assert driver.stdout.read() == ""
+        assert present(driver.stdout).read() == ""
     finally:
         driver.kill()
-        driver.stdin.close()
-        driver.stdout.close()
+        present(driver.stdin).close()
+        present(driver.stdout).close()

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.strategies._internal.lazy import LazyStrategy
 from synthetic_sweep import make_sweep
 
 from analysis.records import (
@@ -19,6 +20,7 @@ from analysis.records import (
     SweepRecord,
     TrialRecord,
 )
+from tests.narrowing import present
 from tune_jobs.store.manifests import read_manifest
 from tune_jobs.store.sweep_store import SweepStore
 
@@ -33,7 +35,7 @@ SAMPLES = {
     IterationRecord: SYNTHETIC.results["t0000"][0],
     ChangeRecord: CHANGE,
     TrialRecord: TRIAL.model_copy(update={"changes": (CHANGE,)}),
-    EvaluationRecord: SYNTHETIC.best.confirmation,
+    EvaluationRecord: present(SYNTHETIC.best).confirmation,
     BestRecord: SYNTHETIC.best,
     SweepRecord: SYNTHETIC.sweep,
 }
@@ -58,7 +60,7 @@ def _values(annotation: Any) -> st.SearchStrategy | None:
     return None
 
 
-def _records(kind):
+def _records(kind: type) -> LazyStrategy:
     """Records of a kind whose numbers may be anything; all else is as in a real one."""
     drawn = {
         name: values for name, field in kind.model_fields.items() if (values := _values(field.annotation)) is not None
@@ -68,14 +70,16 @@ def _records(kind):
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
+def store(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     store = SweepStore(tmp_path_factory.mktemp("storage") / SYNTHETIC.sweep.name)
     store.create()
     store.trial("t0000").folder.mkdir()
     return store
 
 
-def _write(store, record):
+def _write(
+    store: SweepStore, record: BestRecord | CheckpointRecord | IterationRecord
+) -> tuple[BestRecord | CheckpointRecord | IterationRecord, str]:
     """Write a record as the product does; returns what it reads back, and the file's text."""
     trial = store.trial("t0000")
     if isinstance(record, SweepRecord):
@@ -97,15 +101,15 @@ def _write(store, record):
     return found, trial.results_path.read_text()
 
 
-def _refuse(token):
+def _refuse(token) -> None:
     raise ValueError(f"{token} is no JSON")
 
 
 @pytest.mark.parametrize("kind", [IterationRecord, TrialRecord, BestRecord, SweepRecord, CheckpointRecord])
-def test_a_record_with_any_numbers_comes_back_from_its_file(store, kind):
+def test_a_record_with_any_numbers_comes_back_from_its_file(store: SweepStore, kind: type) -> None:
     @ANY_SETTINGS
     @given(record=_records(kind))
-    def check(record):
+    def check(record: BestRecord | CheckpointRecord | IterationRecord) -> None:
         found, text = _write(store, record)
         # By their texts: NaN does not equal itself.
         assert repr(found) == repr(record)
@@ -114,16 +118,18 @@ def test_a_record_with_any_numbers_comes_back_from_its_file(store, kind):
     check()
 
 
-def test_nan_and_the_infinities_are_told_apart_in_files(store):
+def test_nan_and_the_infinities_are_told_apart_in_files(store: SweepStore) -> None:
     values = (math.nan, math.inf, -math.inf, 1.0)
-    record = SAMPLES[IterationRecord].model_copy(update={"episode_returns": values, "learner": {"loss": math.inf}})
+    record = present(SAMPLES[IterationRecord]).model_copy(
+        update={"episode_returns": values, "learner": {"loss": math.inf}}
+    )
     found, text = _write(store, record)
     assert '["NaN","Infinity","-Infinity",1.0]' in text
     assert repr(found.episode_returns) == repr(values)
     assert found.learner == {"loss": math.inf}
 
 
-def test_null_in_files_of_older_versions_is_nan(store):
+def test_null_in_files_of_older_versions_is_nan(store: SweepStore) -> None:
     trial = store.trial("t0000")
     line = {"iteration": 1, "num_env_steps": 9, "num_episodes": 2, "time_s": 1.5, "episode_returns": [None, 3.0]}
     trial.results_path.write_text(json.dumps(line | {"episode_lengths": [4, 5], "learner": {"loss": None}}) + "\n")
@@ -131,9 +137,9 @@ def test_null_in_files_of_older_versions_is_nan(store):
     assert math.isnan(found.episode_returns[0])
     assert found.episode_returns[1] == 3.0
     assert found.learner == {"loss": None}
-    best = json.loads(SAMPLES[BestRecord].model_dump_json()) | {"selection_score": None, "format_version": 1}
+    best = json.loads(present(SAMPLES[BestRecord]).model_dump_json()) | {"selection_score": None, "format_version": 1}
     best["confirmation"]["returns"][0] = None
-    store.write_best(SAMPLES[BestRecord])
+    store.write_best(present(SAMPLES[BestRecord]))
     (store.best_folder / "evaluation.json").write_text(json.dumps(best))
     found = store.read_best()
     assert math.isnan(found.selection_score)
@@ -142,13 +148,13 @@ def test_null_in_files_of_older_versions_is_nan(store):
 
 @ANY_SETTINGS
 @given(record=_records(EvaluationRecord))
-def test_means_of_any_returns_raise_nothing(record):
+def test_means_of_any_returns_raise_nothing(record: EvaluationRecord) -> None:
     assert isinstance(record.mean_return, float)
     assert isinstance(record.std_return, float)
     assert record.solved in (True, False, None)
 
 
-def test_a_score_that_is_not_finite_is_none(store):
+def test_a_score_that_is_not_finite_is_none(store: SweepStore) -> None:
     for value in (math.nan, math.inf, -math.inf):
-        record = SAMPLES[CheckpointRecord].model_copy(update={"evaluation_return": value})
+        record = present(SAMPLES[CheckpointRecord]).model_copy(update={"evaluation_return": value})
         assert CheckpointRecord.model_validate_json(record.model_dump_json()).evaluation_return is None

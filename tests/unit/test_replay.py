@@ -1,7 +1,11 @@
 """Replay memories: what goes in, what comes out, how often."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from policies.hyperparams import DQNHyperparams
 from policies.replay import (
@@ -12,19 +16,25 @@ from policies.replay import (
     Transitions,
     make_replay,
 )
+from tests.narrowing import present
 
 
-def rows(first, count):
+def rows(first: int, count: int) -> Transitions:
     numbers = np.arange(first, first + count, dtype=np.float32)
     obs = np.stack([numbers, -numbers], axis=1)
     return Transitions(obs, (numbers % 3).astype(np.int64), numbers, obs + 0.5, numbers / 10)
 
 
-def fragment(rewards, terminated=(), truncated=(), reset=()):
+def fragment(
+    rewards: Sequence[int] | NDArray[np.int64],
+    terminated: Sequence[int] | NDArray[np.int64] | tuple[Any, ...] = (),
+    truncated: Sequence[int] | tuple[Any, ...] = (),
+    reset: Sequence[int] | tuple[Any, ...] = (),
+) -> dict[str, NDArray[Any]]:
     """One sub-environment's steps; observation t is [t]. `reset` steps only reset."""
     count = len(rewards)
 
-    def flags(steps):
+    def flags(steps: Sequence[int] | NDArray[np.int64] | tuple[Any, ...]) -> NDArray[np.bool_]:
         return np.isin(np.arange(count), steps)[:, None]
 
     return {
@@ -37,7 +47,7 @@ def fragment(rewards, terminated=(), truncated=(), reset=()):
     }
 
 
-def as_rows(transitions):
+def as_rows(transitions: Transitions) -> list[tuple[Any, ...]]:
     return [
         (int(obs[0]), int(action), float(reward), int(following[0]), pytest.approx(float(discount)))
         for obs, action, reward, following, discount in zip(
@@ -51,7 +61,7 @@ def as_rows(transitions):
     ]
 
 
-def test_one_step_transitions_bootstrap_unless_terminated():
+def test_one_step_transitions_bootstrap_unless_terminated() -> None:
     columns = fragment([1, 2, 3, 0, 5], terminated=[1], truncated=[4], reset=[2, 3])
     columns["stepped"][3] = True
     assert as_rows(NStep(1, 1, 0.9).transitions(columns)) == [
@@ -62,7 +72,7 @@ def test_one_step_transitions_bootstrap_unless_terminated():
     ]
 
 
-def test_n_step_sums_stop_at_the_end_of_the_episode():
+def test_n_step_sums_stop_at_the_end_of_the_episode() -> None:
     columns = fragment([1, 1, 1, 1, 0, 1], terminated=[3], reset=[4])
     found = as_rows(NStep(1, 3, 0.5).transitions(columns))
     assert found == [
@@ -74,12 +84,12 @@ def test_n_step_sums_stop_at_the_end_of_the_episode():
     ]
 
 
-def test_truncated_n_step_sums_bootstrap_over_the_steps_they_have():
+def test_truncated_n_step_sums_bootstrap_over_the_steps_they_have() -> None:
     found = as_rows(NStep(1, 3, 0.5).transitions(fragment([1, 1], truncated=[1])))
     assert found == [(0, 0, 1.5, 2, 0.25), (1, 1, 1.0, 2, 0.5)]
 
 
-def test_n_step_sums_go_on_in_the_next_fragment_unless_the_streams_are_reset():
+def test_n_step_sums_go_on_in_the_next_fragment_unless_the_streams_are_reset() -> None:
     n_step = NStep(1, 3, 1.0)
     assert as_rows(n_step.transitions(fragment([1, 2]))) == []
     assert as_rows(n_step.transitions(fragment([3]))) == [(0, 0, 6.0, 1, 1.0)]
@@ -87,7 +97,7 @@ def test_n_step_sums_go_on_in_the_next_fragment_unless_the_streams_are_reset():
     assert as_rows(n_step.transitions(fragment([4, 5]))) == []
 
 
-def test_streams_do_not_mix():
+def test_streams_do_not_mix() -> None:
     columns = fragment([1, 1, 1])
     both = {
         name: np.concatenate([value, value * 10 if name == "rewards" else value], axis=1)
@@ -96,7 +106,7 @@ def test_streams_do_not_mix():
     assert sorted(float(value) for value in NStep(2, 2, 1.0).transitions(both).rewards) == [2, 2, 20, 20]
 
 
-def test_the_oldest_transitions_go_first():
+def test_the_oldest_transitions_go_first() -> None:
     replay = ReplayBuffer(5, np.random.default_rng(0))
     for first in (0, 3, 6):
         replay.add(rows(first, 3))
@@ -105,14 +115,14 @@ def test_the_oldest_transitions_go_first():
     assert set(batch.rewards) == {4.0, 5.0, 6.0, 7.0, 8.0}
 
 
-def test_more_than_fits_keeps_the_newest():
+def test_more_than_fits_keeps_the_newest() -> None:
     replay = ReplayBuffer(4, np.random.default_rng(0))
     replay.add(rows(0, 11))
     (batch,) = replay.batches(1, 200)
     assert set(batch.rewards) == {7.0, 8.0, 9.0, 10.0}
 
 
-def test_rows_stay_together():
+def test_rows_stay_together() -> None:
     replay = ReplayBuffer(7, np.random.default_rng(1))
     replay.add(rows(0, 12))
     for batch in replay.batches(20, 3):
@@ -122,8 +132,8 @@ def test_rows_stay_together():
         np.testing.assert_allclose(batch.discounts, batch.rewards / 10)
 
 
-def test_uniform_draws_every_row_as_often_and_from_its_seed():
-    def draw(seed):
+def test_uniform_draws_every_row_as_often_and_from_its_seed() -> None:
+    def draw(seed: int) -> NDArray[np.float32]:
         replay = ReplayBuffer(10, np.random.default_rng(seed))
         replay.add(rows(0, 10))
         return np.concatenate([batch.rewards for batch in replay.batches(500, 20)])
@@ -135,7 +145,7 @@ def test_uniform_draws_every_row_as_often_and_from_its_seed():
     assert not np.array_equal(draw(3), draw(4))
 
 
-def test_large_rows_are_drawn_in_several_gathers(monkeypatch):
+def test_large_rows_are_drawn_in_several_gathers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("policies.replay._MAX_GATHER_BYTES", 100)
     replay = ReplayBuffer(10, np.random.default_rng(0))
     replay.add(rows(0, 10))
@@ -144,7 +154,7 @@ def test_large_rows_are_drawn_in_several_gathers(monkeypatch):
     assert len({batch.rewards.tobytes() for batch in batches}) > 3
 
 
-def test_no_replay_gives_the_newest_in_order():
+def test_no_replay_gives_the_newest_in_order() -> None:
     replay = LastTransitions(3, np.random.default_rng(0))
     replay.add(rows(0, 2))
     replay.add(rows(2, 3))
@@ -153,7 +163,7 @@ def test_no_replay_gives_the_newest_in_order():
 
 
 @pytest.mark.parametrize("capacity", [1, 5, 8, 1000])
-def test_prioritized_draws_in_proportion(capacity):
+def test_prioritized_draws_in_proportion(capacity: int) -> None:
     replay = PrioritizedReplayBuffer(capacity, np.random.default_rng(0), alpha=1.0, beta=1.0)
     replay.add(rows(0, capacity))
     size = min(capacity, 5)
@@ -165,16 +175,16 @@ def test_prioritized_draws_in_proportion(capacity):
     assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 1)
 
 
-def test_importance_weights_undo_the_preference():
+def test_importance_weights_undo_the_preference() -> None:
     replay = PrioritizedReplayBuffer(4, np.random.default_rng(0), alpha=1.0, beta=1.0)
     replay.add(rows(0, 4))
     replay.set_priorities(np.arange(4), np.array([1.0, 2.0, 4.0, 8.0], dtype=np.float32))
     (batch,) = replay.batches(1, 500)
-    weights = {int(reward): float(weight) for reward, weight in zip(batch.rewards, batch.weights, strict=True)}
+    weights = {int(reward): float(weight) for reward, weight in zip(batch.rewards, present(batch.weights), strict=True)}
     assert weights == pytest.approx({0: 1.0, 1: 0.5, 2: 0.25, 3: 0.125}, rel=1e-4)
 
 
-def test_new_rows_get_the_highest_priority():
+def test_new_rows_get_the_highest_priority() -> None:
     replay = PrioritizedReplayBuffer(100, np.random.default_rng(0), alpha=1.0, beta=0.4)
     replay.add(rows(0, 50))
     replay.set_priorities(np.arange(50), np.full(50, 0.01, dtype=np.float32))
@@ -185,19 +195,19 @@ def test_new_rows_get_the_highest_priority():
     assert list(where) == [50]
 
 
-def test_priorities_that_are_no_numbers_do_not_spoil_the_tree():
+def test_priorities_that_are_no_numbers_do_not_spoil_the_tree() -> None:
     replay = PrioritizedReplayBuffer(4, np.random.default_rng(0), alpha=0.6, beta=0.4)
     replay.add(rows(0, 4))
     replay.set_priorities(np.arange(4), np.array([np.nan, np.inf, 1.0, 1.0], dtype=np.float32))
     (batch,) = replay.batches(1, 100)
-    assert np.all(np.isfinite(batch.weights))
+    assert np.all(np.isfinite(present(batch.weights)))
 
 
 @pytest.mark.parametrize(
     ("replay", "kind", "capacity"),
     [("uniform", ReplayBuffer, 700), ("prioritized", PrioritizedReplayBuffer, 700), ("none", LastTransitions, 32)],
 )
-def test_the_memory_that_the_hyperparameters_name(replay, kind, capacity):
+def test_the_memory_that_the_hyperparameters_name(replay: str, kind: type, capacity: int) -> None:
     made = make_replay(DQNHyperparams(replay=replay, replay_capacity=700, train_batch_size=32), seed=3)
     assert type(made) is kind
     assert made.capacity == capacity
@@ -209,7 +219,7 @@ KINDS = ("uniform", "prioritized", "none")
 
 
 @pytest.mark.parametrize("replay", KINDS)
-def test_no_transitions_change_nothing(replay):
+def test_no_transitions_change_nothing(replay: str) -> None:
     values = DQNHyperparams(replay=replay, replay_capacity=5, train_batch_size=4)
     plain, given_none = make_replay(values, seed=3), make_replay(values, seed=3)
     assert len(given_none.add(rows(0, 0))) == 0
@@ -227,7 +237,7 @@ def test_no_transitions_change_nothing(replay):
         assert (ours.indices is None) == (replay != "prioritized")
 
 
-def test_the_newest_transitions_are_those_that_are_there():
+def test_the_newest_transitions_are_those_that_are_there() -> None:
     replay = LastTransitions(4, np.random.default_rng(0))
     replay.add(rows(0, 3))
     (batch,) = replay.batches(1, 4)
@@ -240,7 +250,7 @@ def test_the_newest_transitions_are_those_that_are_there():
     [(3, 100, 1), (3, 2, 1), (7, 5, 3), (40, 9, 4), (40, 100, 4)],
     ids=["longer than a fragment", "longer than an episode", "both", "longer than the memory", "and no end before it"],
 )
-def test_sums_of_many_steps_fill_every_memory(replay, n_step, episode, length):
+def test_sums_of_many_steps_fill_every_memory(replay: str, n_step: int, episode: int, length: int) -> None:
     """Fragments of some steps; each transition that is complete is there once, whatever the fragments are."""
     num_steps, gamma = 60, 0.9
     memory = make_replay(

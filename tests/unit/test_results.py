@@ -1,18 +1,21 @@
 """What a sweep came to, read from its folder."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
-from synthetic_sweep import make_sweep
+from synthetic_sweep import Synthetic, make_sweep
 
 import tune_jobs
+from tests.narrowing import present
 from tune_jobs.store.sweep_store import SweepStore
 
 
 @pytest.fixture
-def make_store(tmp_path):
-    def make(**given):
+def make_store(tmp_path: Path) -> Callable[..., tuple[SweepStore, Synthetic]]:
+    def make(**given: Any) -> tuple[SweepStore, Synthetic]:
         synthetic = make_sweep(**given)
         store = SweepStore(tmp_path / synthetic.sweep.name)
         store.create()
@@ -27,10 +30,12 @@ def make_store(tmp_path):
 
 
 @pytest.mark.parametrize("chosen", [True, False], ids=["with a best", "before a best is chosen"])
-def test_the_table_says_when_trials_solved_the_env_as_the_report_does(make_store, tmp_path, chosen):
+def test_the_table_says_when_trials_solved_the_env_as_the_report_does(
+    make_store: Callable[..., tuple[SweepStore, Synthetic]], tmp_path: Path, chosen: bool
+) -> None:
     store, synthetic = make_store()
     if chosen:
-        store.write_best(synthetic.best)
+        store.write_best(present(synthetic.best))
     table = tune_jobs.dataframe(store.name, storage=tmp_path)
     solved = table["num_env_steps_to_solve"]
     assert 0 < solved.notna().sum() < len(solved)
@@ -47,7 +52,9 @@ def test_the_table_says_when_trials_solved_the_env_as_the_report_does(make_store
         assert list(written["num_env_steps_to_solve"].astype("Int64")) == list(solved)
 
 
-def test_without_a_threshold_the_stop_rules_return_counts(make_store, tmp_path):
+def test_without_a_threshold_the_stop_rules_return_counts(
+    make_store: Callable[..., tuple[SweepStore, Synthetic]], tmp_path: Path
+) -> None:
     store, synthetic = make_store(env_id="Mine-v0", with_best=False)
     store.write_record(synthetic.sweep.model_copy(update={"spec": {**synthetic.sweep.spec, "stop": {}}}))
     assert tune_jobs.dataframe(store.folder)["num_env_steps_to_solve"].isna().all()
@@ -70,7 +77,9 @@ def test_without_a_threshold_the_stop_rules_return_counts(make_store, tmp_path):
         ("new/film.gif", "new/film"),
     ],
 )
-def test_a_film_goes_where_output_says(tmp_path, monkeypatch, output, expected):
+def test_a_film_goes_where_output_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str | Path | None, expected: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("there").mkdir()
     asked = []

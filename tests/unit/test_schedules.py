@@ -10,18 +10,18 @@ from policies.networks.epsilon import EpsilonSchedule
 from policies.schedules import linear
 
 
-def test_schedules():
+def test_schedules() -> None:
     assert linear(0.3, None, None, 50) == 0.3
     assert linear(0.3, 0.1, 100, 50) == pytest.approx(0.2)
     assert linear(0.3, 0.0, 100, 0) == 0.3
     assert linear(0.3, 0.0, 100, 500) == 0.0
 
 
-def test_a_schedule_to_nothing_or_in_no_steps_stays():
+def test_a_schedule_to_nothing_or_in_no_steps_stays() -> None:
     assert linear(0.3, 0.0, None, 7) == linear(0.3, None, 100, 7) == 0.3
 
 
-def test_epsilon_has_the_bits_of_its_own_formula():
+def test_epsilon_has_the_bits_of_its_own_formula() -> None:
     """Shares are rounded once, then the product, then the sum; another order gives other last bits."""
     rng = np.random.default_rng(0)
     base = EpsilonSchedule.of(DQNHyperparams())

@@ -2,6 +2,8 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,22 +14,22 @@ from tune_jobs.spec.domains import DOMAIN_KINDS, Domain, draw_points
 ADAPTER = TypeAdapter(Domain)
 
 
-def domain(**raw):
+def domain(**raw: Sequence[Any]) -> Any:
     return ADAPTER.validate_python(raw)
 
 
-def samples(parsed, num=2_000):
+def samples(parsed: Any, num: int = 2_000) -> list[bool | float]:
     rng = np.random.default_rng(0)
     return [parsed.sample(rng) for _ in range(num)]
 
 
-def message(raw):
+def message(raw: float | dict[str, Sequence[float]]) -> str:
     with pytest.raises(ValidationError) as caught:
         ADAPTER.validate_python(raw)
     return str(caught.value)
 
 
-def test_uniform_fills_its_range_evenly():
+def test_uniform_fills_its_range_evenly() -> None:
     drawn = samples(domain(uniform=[2, 10]))
     assert all(isinstance(value, float) and 2 <= value < 10 for value in drawn)
     assert abs(np.mean(drawn) - 6) < 0.2
@@ -35,7 +37,7 @@ def test_uniform_fills_its_range_evenly():
     assert max(drawn) > 9.9
 
 
-def test_loguniform_gives_each_decade_the_same_share():
+def test_loguniform_gives_each_decade_the_same_share() -> None:
     drawn = samples(domain(loguniform=[1e-5, 1e-1]))
     shares = Counter(math.floor(math.log10(value)) for value in drawn)
     assert set(shares) == {-5, -4, -3, -2}
@@ -58,7 +60,9 @@ def test_loguniform_gives_each_decade_the_same_share():
         ({"grid": [True, False]}, {True, False}),
     ],
 )
-def test_whole_and_quantised_domains_give_exactly_their_values(raw, expected):
+def test_whole_and_quantised_domains_give_exactly_their_values(
+    raw: dict[str, Any], expected: set[bool | float] | None
+) -> None:
     parsed = domain(**raw)
     drawn = samples(parsed)
     if expected is None:
@@ -72,7 +76,7 @@ def test_whole_and_quantised_domains_give_exactly_their_values(raw, expected):
         assert parsed.bounds == (min(expected), max(expected))
 
 
-def test_the_log_form_favours_small_values():
+def test_the_log_form_favours_small_values() -> None:
     counts = Counter(samples(domain(lograndint=[1, 9])))
     assert counts[1] > 2 * counts[4] > 0
 
@@ -103,15 +107,15 @@ def test_the_log_form_favours_small_values():
         (0.01, "fix it under hyperparams"),
     ],
 )
-def test_wrong_domains_are_refused_with_their_values(raw, part):
+def test_wrong_domains_are_refused_with_their_values(raw: float | dict[str, list[Any]] | list[int], part: str) -> None:
     assert part in message(raw)
 
 
-def test_values_that_python_calls_equal_are_different_in_a_grid():
+def test_values_that_python_calls_equal_are_different_in_a_grid() -> None:
     assert domain(grid=[1, True, 1.0]).values == (1, True, 1.0)
 
 
-def test_every_domain_survives_json():
+def test_every_domain_survives_json() -> None:
     numbers = {"grid": [[32], "relu", None], "choice": [1, 2]}
     for kind in DOMAIN_KINDS:
         parsed = domain(**{kind: numbers.get(kind, [2, 64, 2] if kind.startswith("q") else [2, 64])})
@@ -125,7 +129,7 @@ SPACE = {
 }
 
 
-def test_points_go_through_the_grid_once_a_sample_in_file_order():
+def test_points_go_through_the_grid_once_a_sample_in_file_order() -> None:
     points = draw_points(SPACE, 2, sweep_seed=0)
     combinations = [([32], "linear"), ([32], "relu"), ([64], "linear"), ([64], "relu")]
     assert [(point["hidden"], point["act"]) for point in points] == combinations * 2
@@ -133,17 +137,17 @@ def test_points_go_through_the_grid_once_a_sample_in_file_order():
     assert len({point["lr"] for point in points}) == 8
 
 
-def test_more_samples_change_no_earlier_point():
+def test_more_samples_change_no_earlier_point() -> None:
     assert draw_points(SPACE, 5, sweep_seed=3)[:8] == draw_points(SPACE, 2, sweep_seed=3)
 
 
-def test_the_sweep_seed_decides_the_points():
+def test_the_sweep_seed_decides_the_points() -> None:
     first, again, other = (draw_points(SPACE, 2, sweep_seed=seed) for seed in (0, 0, 1))
     assert first == again
     assert {point["lr"] for point in first}.isdisjoint(point["lr"] for point in other)
 
 
-def test_points_are_what_they_always_were():
+def test_points_are_what_they_always_were() -> None:
     # A change here breaks `extend` and `resume` of the sweeps people already have.
     space = {"lr": domain(loguniform=[1e-5, 1e-2]), "n": domain(randint=[0, 1000])}
     assert draw_points(space, 2, sweep_seed=7) == [
@@ -151,7 +155,7 @@ def test_points_are_what_they_always_were():
     ]
 
 
-def test_an_empty_space_is_one_point_a_sample():
+def test_an_empty_space_is_one_point_a_sample() -> None:
     assert draw_points({}, 3, 0) == [{}, {}, {}]
 
 
@@ -162,7 +166,7 @@ def test_an_empty_space_is_one_point_a_sample():
         {"uniform": [-1e308, 1e308]}, {"quniform": [0, 1e300, 1e-300]}, {"qloguniform": [1e-300, 1e300, 1e-300]},
     ],
 )  # fmt: skip
-def test_a_range_that_nothing_can_be_drawn_from_is_refused(raw):
+def test_a_range_that_nothing_can_be_drawn_from_is_refused(raw: dict[str, Any]) -> None:
     assert "goes from" in message(raw)
     (kind,) = raw
     # Half as wide, or nearly so, is drawn from.

@@ -11,7 +11,9 @@ from analysis.selection import NoUsableTrialError, best_checkpoint, error_summar
 from policies.errors import NotFoundError
 
 
-def checkpoint(trial_id, iteration, evaluation, *, steps=None, training=None):
+def checkpoint(
+    trial_id: str, iteration: int, evaluation: float | None, *, steps: int | None = None, training: float | None = None
+) -> CheckpointRecord:
     return CheckpointRecord(
         trial_id=trial_id,
         iteration=iteration,
@@ -21,7 +23,16 @@ def checkpoint(trial_id, iteration, evaluation, *, steps=None, training=None):
     )
 
 
-def trial(index, *evaluations, point=None, seed_index=0, status="completed", steps=None, error=None, training=None):
+def trial(
+    index: int,
+    *evaluations: float | None,
+    point: int | None = None,
+    seed_index: int = 0,
+    status: str = "completed",
+    steps: int | None = None,
+    error: str | None = None,
+    training: float | None = None,
+) -> TrialRecord:
     trial_id = f"t{index:04d}"
     return TrialRecord(
         trial_id=trial_id,
@@ -38,49 +49,51 @@ def trial(index, *evaluations, point=None, seed_index=0, status="completed", ste
     )
 
 
-def test_the_highest_evaluation_return_wins_wherever_in_the_trial_it_was():
+def test_the_highest_evaluation_return_wins_wherever_in_the_trial_it_was() -> None:
     best = select_best([trial(0, 100.0, 50.0), trial(1, 40.0, 180.0, 20.0), trial(2, 150.0)])
     assert (best.trial.trial_id, best.checkpoint.iteration, best.score) == ("t0001", 2, 180.0)
     assert [point.point_index for point in best.ranking] == [1, 2, 0]
 
 
-def test_training_return_decides_nothing():
+def test_training_return_decides_nothing() -> None:
     assert select_best([trial(0, 10.0, training=500.0), trial(1, 20.0, training=1.0)]).trial.index == 1
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, None])
-def test_a_score_that_is_not_finite_never_wins(value):
+def test_a_score_that_is_not_finite_never_wins(value: float | None) -> None:
     assert select_best([trial(0, value, -7.0), trial(1, value)]).score == -7.0
     assert score_trial(trial(0, value)) is None
 
 
-def test_a_not_finite_score_never_wins_even_where_a_record_skipped_validation():
+def test_a_not_finite_score_never_wins_even_where_a_record_skipped_validation() -> None:
     bad = checkpoint("t0000", 1, 1.0).model_copy(update={"evaluation_return": math.nan})
     assert score_trial(trial(0).model_copy(update={"checkpoints": (bad,)})) is None
 
 
-def test_a_failed_trial_never_wins():
+def test_a_failed_trial_never_wins() -> None:
     assert select_best([trial(0, 500.0, status="failed", error="boom"), trial(1, 0.0)]).trial.index == 1
 
 
 @pytest.mark.parametrize("status", ["running", "paused", "completed", "stopped"])
-def test_a_trial_that_did_not_fail_may_win(status):
+def test_a_trial_that_did_not_fail_may_win(status: str) -> None:
     assert select_best([trial(0, 5.0, status=status)]).trial.status == status
 
 
-def test_a_score_of_zero_is_a_score():
+def test_a_score_of_zero_is_a_score() -> None:
     best = select_best([trial(0, 0.0), trial(1, -1.0)])
     assert (best.trial.index, best.score) == (0, 0.0)
 
 
-def test_ties_go_to_fewer_env_steps_then_to_the_lower_trial_index():
+def test_ties_go_to_fewer_env_steps_then_to_the_lower_trial_index() -> None:
     assert select_best([trial(0, 9.0, steps=500), trial(1, 9.0, steps=400)]).trial.index == 1
     assert select_best([trial(3, 9.0, steps=400), trial(1, 9.0, steps=400)]).trial.index == 1
     assert select_best([trial(0, 9.0, 9.0)]).checkpoint.iteration == 1
 
 
 @pytest.mark.parametrize("scores", list(itertools.product([None, 0.0, 5.0], repeat=4)))
-def test_of_a_trial_as_it_grows_the_earliest_of_the_highest_is_kept(scores):
+def test_of_a_trial_as_it_grows_the_earliest_of_the_highest_is_kept(
+    scores: tuple[float | None, float | None, float | None, float | None],
+) -> None:
     known = [checkpoint("t0000", number, score) for number, score in enumerate(scores, start=1)]
     scored = [item for item in known if item.evaluation_return is not None]
     assert best_checkpoint(known) == max(
@@ -90,12 +103,12 @@ def test_of_a_trial_as_it_grows_the_earliest_of_the_highest_is_kept(scores):
     assert (won and won.checkpoint) == best_checkpoint(known)
 
 
-def test_trial_index_orders_as_a_number():
+def test_trial_index_orders_as_a_number() -> None:
     # As text t10000 comes before t9999.
     assert select_best([trial(10_000, 9.0, steps=1), trial(9_999, 9.0, steps=1)]).trial.index == 9_999
 
 
-def test_a_point_scores_the_mean_of_its_seeds_and_its_best_seed_is_taken():
+def test_a_point_scores_the_mean_of_its_seeds_and_its_best_seed_is_taken() -> None:
     trials = [
         trial(0, 100.0, point=0, seed_index=0),
         trial(1, 20.0, point=0, seed_index=1),
@@ -117,7 +130,7 @@ def test_a_point_scores_the_mean_of_its_seeds_and_its_best_seed_is_taken():
         None,
     ],
 )
-def test_a_lost_seed_does_not_flatter_its_point(lost):
+def test_a_lost_seed_does_not_flatter_its_point(lost: TrialRecord | None) -> None:
     trials = [
         trial(0, 200.0, point=0, seed_index=0),
         trial(2, 70.0, point=1, seed_index=0),
@@ -130,7 +143,7 @@ def test_a_lost_seed_does_not_flatter_its_point(lost):
     assert [point.score for point in best.ranking] == [75.0, 200.0]
 
 
-def test_incomplete_points_win_where_no_point_is_complete():
+def test_incomplete_points_win_where_no_point_is_complete() -> None:
     trials = [
         trial(0, 200.0, point=0, seed_index=0),
         trial(1, point=0, seed_index=1, status="failed"),
@@ -140,13 +153,13 @@ def test_incomplete_points_win_where_no_point_is_complete():
     assert select_best(trials).trial.index == 0
 
 
-def test_the_order_of_the_trials_does_not_matter():
+def test_the_order_of_the_trials_does_not_matter() -> None:
     trials = [trial(0, 9.0, steps=5), trial(1, 9.0, steps=5), trial(2, 9.0, steps=4), trial(3, 1.0)]
     for order in itertools.permutations(trials):
         assert [point.point_index for point in rank_points(order)] == [2, 0, 1, 3]
 
 
-def test_no_usable_trial_says_why():
+def test_no_usable_trial_says_why() -> None:
     trials = [
         trial(2, status="failed", error="ValueError: second"),
         trial(1, status="failed", error="ZeroDivisionError: the pole\n  at line 3"),
@@ -166,7 +179,7 @@ def test_no_usable_trial_says_why():
     assert "t0001" in caught.value.hint
 
 
-def test_no_usable_trial_has_a_hint_for_each_reason():
+def test_no_usable_trial_has_a_hint_for_each_reason() -> None:
     hints = set()
     for trials in ([], [trial(0, status="pending")], [trial(0)], [trial(0, status="failed")]):
         assert rank_points(trials) == []
@@ -177,7 +190,7 @@ def test_no_usable_trial_has_a_hint_for_each_reason():
     assert len(hints) == 4
 
 
-def test_the_error_is_a_not_found_error_that_pickles():
+def test_the_error_is_a_not_found_error_that_pickles() -> None:
     assert issubclass(NoUsableTrialError, NotFoundError)
     assert NoUsableTrialError.exit_code == 4
     with pytest.raises(NoUsableTrialError) as caught:
@@ -196,9 +209,9 @@ def test_the_error_is_a_not_found_error_that_pickles():
         ("Traceback (most recent call last):\n  File x", "Traceback (most recent call last):"),
     ],
 )
-def test_error_summary_is_the_line_that_names_the_error(error, line):
+def test_error_summary_is_the_line_that_names_the_error(error: str | None, line: str) -> None:
     assert error_summary(error) == line
 
 
-def test_error_summary_is_short():
+def test_error_summary_is_short() -> None:
     assert len(error_summary("x" * 5000)) == 300

@@ -3,6 +3,9 @@
 import importlib
 import re
 import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +16,7 @@ from policies.envs import modules as env_modules
 from policies.envs.make import check_env
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError
+from policies.hyperparams import Algorithm
 
 NUMBERS = spaces.Box(-1, 1, (3,), np.float32)
 OBSERVATIONS = {
@@ -49,30 +53,30 @@ BEYOND = {
 }
 
 
-class Odd(gym.Env):
+class Odd(gym.Env[Any, Any]):
     """Of any spaces; refuses an action that is not in its own."""
 
-    def __init__(self, observations, actions):
+    def __init__(self, observations, actions) -> None:
         self.observation_space, self.action_space = observations, actions
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         return self.observation_space.sample(), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         assert self.action_space.contains(action), action
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
 @pytest.fixture
-def refusal(monkeypatch):
+def refusal(monkeypatch: pytest.MonkeyPatch):
     """What check_env says of an env of these spaces."""
     monkeypatch.setattr(env_modules, "_allowed", set())
     monkeypatch.setitem(gym.registry, "Odd-v0", None)
 
-    def refuse(observations, actions, algorithm="ppo"):
+    def refuse(observations, actions, algorithm: Algorithm = "ppo"):
         del gym.registry["Odd-v0"]
-        gym.register("Odd-v0", lambda: Odd(observations, actions))
+        gym.register("Odd-v0", cast("Any", lambda: Odd(observations, actions)))
         with pytest.raises(EnvError) as caught:
             check_env("Odd-v0", None, algorithm)
         return caught.value
@@ -81,11 +85,11 @@ def refusal(monkeypatch):
 
 
 @pytest.fixture
-def own_module(tmp_path, monkeypatch):
+def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Writes a module of the user's own, as docs/guides/own-environment.md shows one, with an expression in it."""
     monkeypatch.syspath_prepend(tmp_path)
 
-    def write(expression):
+    def write(expression) -> None:
         (tmp_path / "wrapped_envs.py").write_text(
             "import gymnasium\nimport numpy\n\n\n"
             f"def make(render_mode=None):\n    return {expression}\n\n\n"
@@ -105,7 +109,7 @@ def expression_in(error):
 
 
 @pytest.mark.parametrize("kind", OBSERVATIONS)
-def test_the_wrapper_that_is_named_makes_observations_that_are_taken(kind, refusal, own_module):
+def test_the_wrapper_that_is_named_makes_observations_that_are_taken(kind: str, refusal, own_module) -> None:
     error = refusal(OBSERVATIONS[kind], spaces.Discrete(2))
     assert "Odd-v0 has" in error.message
     own_module(expression_in(error))
@@ -119,7 +123,7 @@ def test_the_wrapper_that_is_named_makes_observations_that_are_taken(kind, refus
 
 
 @pytest.mark.parametrize("kind", ACTIONS)
-def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(kind, refusal, own_module):
+def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(kind: str, refusal, own_module) -> None:
     own_module(expression_in(refusal(NUMBERS, ACTIONS[kind])))
     info = check_env("wrapped_envs:Wrapped-v0", None, "ppo")
     env, space = gym.make("Wrapped-v0"), info.action_space
@@ -127,25 +131,27 @@ def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(kind, refusal
     actions = range(int(space.n)) if isinstance(space, spaces.Discrete) else [space.sample() for _ in range(5)]
     sent = []
     step = env.unwrapped.step
-    env.unwrapped.step = lambda action: sent.append(tuple(np.ravel(action))) or step(action)
+    env.unwrapped.step = lambda action: sent.append(tuple(np.ravel(action))) or step(action)  # type: ignore[method-assign]
     for action in actions:
         env.step(action)
     assert len(set(sent)) == len(actions)
 
 
 @pytest.mark.parametrize("kind", BEYOND)
-def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind, refusal):
+def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind: str, refusal) -> None:
     observations, actions, words = BEYOND[kind]
     assert words in refusal(observations, actions).hint
 
 
-def test_a_class_of_a_module_is_made_as_such(monkeypatch):
+def test_a_class_of_a_module_is_made_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     from policies.envs.space_hints import observation_hint
 
     assert "wrappers.FlattenObservation(my_envs.Walk())" in observation_hint("my_envs:Walk", spaces.Discrete(2))
 
 
-def test_frozen_lake_can_be_trained_on_in_the_wrapper_that_is_named(own_module, monkeypatch):
+def test_frozen_lake_can_be_trained_on_in_the_wrapper_that_is_named(
+    own_module, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     with pytest.raises(EnvError) as caught:
         check_env("FrozenLake-v1", None, "ppo")

@@ -2,15 +2,18 @@
 
 import pickle
 import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from pydantic import BaseModel
 from spec_errors import MINIMAL, write
 
 from policies.errors import SpecError
-from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.plan.sweep_plan import TrialPlan, make_plan
 from tune_jobs.spec.domains import DOMAIN_KINDS
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -27,7 +30,7 @@ WRONG = [
 ]  # fmt: skip
 
 
-def sections(model=SweepSpec, path=()):
+def sections(model: type = SweepSpec, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     """The path of every field of the sweep file."""
     for name, field in model.model_fields.items():
         yield (*path, name)
@@ -35,7 +38,7 @@ def sections(model=SweepSpec, path=()):
             yield from sections(field.annotation, (*path, name))
 
 
-def with_value(path, value):
+def with_value(path: tuple[str, ...], value: Any) -> dict[str, Any]:
     data = {**MINIMAL, "env": {"id": "CartPole-v1"}}
     *parents, last = path
     section = data
@@ -45,7 +48,7 @@ def with_value(path, value):
     return data
 
 
-def problem_with(data):
+def problem_with(data: dict[str, Any]) -> str | None:
     """The message, or None if it is right; nothing but a message may come."""
     try:
         load_spec(data)
@@ -54,13 +57,13 @@ def problem_with(data):
     return None
 
 
-def shown_without_values(message):
+def shown_without_values(message: str) -> str:
     """The message without what it quotes: that is the user's own."""
     return re.sub(r"'[^']*'|\"[^\"]*\"", "", message)
 
 
 @pytest.mark.parametrize("path", list(sections()), ids=".".join)
-def test_no_field_of_the_sweep_file_answers_in_foreign_words(path):
+def test_no_field_of_the_sweep_file_answers_in_foreign_words(path: tuple[str, ...]) -> None:
     told = [(value, problem_with(with_value(path, value))) for value in WRONG]
     # A field that takes anything would make this say nothing.
     assert any(message is not None for _, message in told)
@@ -74,7 +77,7 @@ def test_no_field_of_the_sweep_file_answers_in_foreign_words(path):
     ("algorithm", "name"),
     [(algorithm, name) for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items() for name in model.model_fields],
 )
-def test_no_hyperparameter_does(algorithm, name):
+def test_no_hyperparameter_does(algorithm: Algorithm, name: str) -> None:
     refused = 0
     for value in WRONG:
         fixed = {**MINIMAL, "algorithm": algorithm, "hyperparams": {name: value}}
@@ -88,7 +91,7 @@ def test_no_hyperparameter_does(algorithm, name):
 
 
 @pytest.mark.parametrize("kind", DOMAIN_KINDS)
-def test_no_domain_does(kind):
+def test_no_domain_does(kind: str) -> None:
     for value in [*WRONG, [1], [1, 2, 3, 4], ["a", "b"], [None, 1], [2, 1], [0.1, 0.2, 0], [1e-4, 1e-3]]:
         message = problem_with({**MINIMAL, "space": {"lr": {kind: value}}})
         if message is not None:
@@ -97,7 +100,7 @@ def test_no_domain_does(kind):
 
 
 @pytest.mark.parametrize("value", WRONG)
-def test_no_whole_sweep_does(value):
+def test_no_whole_sweep_does(value: Any) -> None:
     message = problem_with(value) if isinstance(value, dict) else problem_with({**MINIMAL, "space": {"lr": value}})
     if message is not None:
         assert not FOREIGN.search(shown_without_values(message)), message
@@ -133,11 +136,11 @@ def test_no_whole_sweep_does(value):
         ({"space": [1]}, "space: [1] is not allowed: it should be a mapping of names to values"),
     ],
 )
-def test_what_is_said_of_common_mistakes(fields, message):
+def test_what_is_said_of_common_mistakes(fields: dict[str, Any], message: str) -> None:
     assert f"sweep: {message}" in problem_with({**MINIMAL, **fields})
 
 
-def test_a_search_that_is_no_is_told_where_it_stands(tmp_path):
+def test_a_search_that_is_no_is_told_where_it_stands(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r"sweep.yaml, line 3, column 9: no may mean false or a text"):
         load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nsearch: no\n"))
 
@@ -145,11 +148,11 @@ def test_a_search_that_is_no_is_told_where_it_stands(tmp_path):
 # -- one number where a list of one is meant
 
 
-def planned(**fields):
+def planned(**fields: Any) -> tuple[TrialPlan, ...]:
     return make_plan(load_spec({**MINIMAL, **fields}), Machine(2)).trials
 
 
-def test_one_hidden_size_is_one_hidden_layer():
+def test_one_hidden_size_is_one_hidden_layer() -> None:
     (fixed,) = planned(hyperparams={"hidden_sizes": 8})
     assert fixed.hyperparams["hidden_sizes"] == [8]
     trials = planned(space={"hidden_sizes": {"grid": [64, [32, 32], 128]}})
@@ -161,7 +164,7 @@ def test_one_hidden_size_is_one_hidden_layer():
         assert len(make_plan(load_spec(MINIMAL, overrides), Machine(2)).trials) == 20
 
 
-def test_one_number_is_a_continuous_action():
+def test_one_number_is_a_continuous_action() -> None:
     fields = {"env": "Pendulum-v1", "algorithm": "constant", "hyperparams": {"action": 0.5}}
     assert make_plan(load_spec(fields), Machine(1)).trials[0].hyperparams["action"] == [0.5]
 
@@ -170,7 +173,7 @@ def test_one_number_is_a_continuous_action():
 
 
 @pytest.mark.parametrize("make", [lambda fields: SweepSpec(**fields), SweepSpec.model_validate])
-def test_a_spec_that_is_made_in_python_is_told_in_the_same_words(make):
+def test_a_spec_that_is_made_in_python_is_told_in_the_same_words(make: Callable[..., Any]) -> None:
     wrong = {**MINIMAL, "algorithm": "pp0", "stop": 3, "enviroment": 1, "space": {"lr": {"uniform": [1]}}}
     with pytest.raises(SpecError) as caught:
         make(wrong)
@@ -180,6 +183,10 @@ def test_a_spec_that_is_made_in_python_is_told_in_the_same_words(make):
     assert "enviroment: there is no field 'enviroment' here. Did you mean 'env'?" in message
     assert not FOREIGN.search(shown_without_values(message.removeprefix("SweepSpec")))
     again = pickle.loads(pickle.dumps(caught.value))
-    assert (again.message, again.hint, again.problems) == (message, caught.value.hint, caught.value.problems)
+    assert (again.message, again.hint, again.problems) == (
+        message,
+        caught.value.hint,
+        cast("Any", caught.value).problems,
+    )
     with pytest.raises(SpecError):
         SweepSpec.model_validate(3)

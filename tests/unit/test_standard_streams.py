@@ -35,7 +35,7 @@ Path("said.json").write_text(json.dumps(said))
 
 
 @pytest.mark.parametrize("closed", [[1], [2], [0, 1, 2]])
-def test_a_process_without_standard_streams_works_and_stays_without(tmp_path, closed):
+def test_a_process_without_standard_streams_works_and_stays_without(tmp_path: Path, closed: list[int]) -> None:
     subprocess.run(
         [sys.executable, "-c", SCRIPT, json.dumps(closed)], check=True, cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
@@ -47,7 +47,7 @@ def test_a_process_without_standard_streams_works_and_stays_without(tmp_path, cl
 
 
 @pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
-def test_commands_run_where_nobody_listens(tmp_path, closed):
+def test_commands_run_where_nobody_listens(tmp_path: Path, closed: tuple[int, ...]) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tune_jobs.cli.commands", "list", "--storage", str(tmp_path)],
         preexec_fn=lambda: [os.close(number) for number in closed],
@@ -56,7 +56,7 @@ def test_commands_run_where_nobody_listens(tmp_path, closed):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_streams_that_are_there_stay_as_they_are():
+def test_streams_that_are_there_stay_as_they_are() -> None:
     before = [(os.fstat(number), getattr(sys, name)) for number, name in enumerate(("stdin", "stdout", "stderr"))]
     with standard_streams():
         now = [(os.fstat(number), getattr(sys, name)) for number, name in enumerate(("stdin", "stdout", "stderr"))]

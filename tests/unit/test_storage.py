@@ -1,8 +1,10 @@
 """Which folder a new sweep gets, also when several begin at once; which sweeps can be extended."""
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from spec_errors import MINIMAL
@@ -19,11 +21,11 @@ from tune_jobs.sweeps.drive import write_new
 from tune_jobs.sweeps.storage import create_store, storage_folder
 
 
-def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path):
+def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path: Path) -> None:
     number = 16
     barrier = threading.Barrier(number)
 
-    def begin(_):
+    def begin(_: int) -> str:
         barrier.wait()
         return create_store(None, "mine", tmp_path).name
 
@@ -32,15 +34,19 @@ def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path):
     assert names == {"mine", *(f"mine-{index}" for index in range(2, number + 1))}
 
 
-def test_an_automatic_name_that_is_taken_meanwhile_gives_way_to_the_next(tmp_path, monkeypatch):
+def test_an_automatic_name_that_is_taken_meanwhile_gives_way_to_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from tune_jobs.sweeps import storage
 
-    def choose(name, stem, folder, real=storage.choose_store):
+    def choose(
+        name: str | None, stem: str, folder: Path, real: Callable[..., Any] = storage.choose_store
+    ) -> SweepStore:
         store = real(name, stem, folder)
         if store.name == "mine":
             # Another process makes it between the look and the making.
             store.folder.mkdir()
-        return store
+        return cast("SweepStore", store)
 
     monkeypatch.setattr(storage, "choose_store", choose)
     assert create_store(None, "mine", tmp_path).name == "mine-2"
@@ -48,7 +54,7 @@ def test_an_automatic_name_that_is_taken_meanwhile_gives_way_to_the_next(tmp_pat
         create_store("mine", "x", tmp_path)
 
 
-def test_what_a_killed_launch_left_is_not_to_be_resumed(tmp_path):
+def test_what_a_killed_launch_left_is_not_to_be_resumed(tmp_path: Path) -> None:
     """It has no sweep.json yet."""
     create_store("mine", "x", tmp_path)
     with pytest.raises(SpecError, match=r"remove that folder: it has no sweep\.json") as caught:
@@ -56,7 +62,9 @@ def test_what_a_killed_launch_left_is_not_to_be_resumed(tmp_path):
     assert "resume" not in str(caught.value)
 
 
-def test_storage_is_what_is_given_else_the_environments_else_here(tmp_path, monkeypatch):
+def test_storage_is_what_is_given_else_the_environments_else_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
     assert storage_folder(None) == tmp_path / "sweeps"
@@ -74,7 +82,9 @@ def test_storage_is_what_is_given_else_the_environments_else_here(tmp_path, monk
         ({"hyperparams": {"lr": "x"}}, "spec.hyperparams.lr: 'x'"),
     ],
 )
-def test_a_spec_that_was_changed_in_the_sweeps_record_is_told_in_its_words(tmp_path, change, part):
+def test_a_spec_that_was_changed_in_the_sweeps_record_is_told_in_its_words(
+    tmp_path: Path, change: dict[str, int | dict[str, str] | None], part: str
+) -> None:
     spec = load_spec(MINIMAL)
     store = create_store("mine", "x", tmp_path)
     write_new(store, spec, make_plan(spec, Machine(1)), None)
@@ -90,7 +100,9 @@ def test_a_spec_that_was_changed_in_the_sweeps_record_is_told_in_its_words(tmp_p
 @pytest.mark.parametrize(
     ("space", "why"), [({}, "it has no space"), ({"lr": {"grid": [0.1, 0.2]}}, "its space has grids alone")]
 )
-def test_a_sweep_of_the_same_points_again_is_not_extended(tmp_path, space, why):
+def test_a_sweep_of_the_same_points_again_is_not_extended(
+    tmp_path: Path, space: dict[str, dict[str, list[float]]], why: str
+) -> None:
     spec = load_spec({**MINIMAL, "space": space})
     store = create_store("mine", "x", tmp_path)
     write_new(store, spec, make_plan(spec, Machine(1)), None)
@@ -111,7 +123,9 @@ def test_a_sweep_of_the_same_points_again_is_not_extended(tmp_path, space, why):
         EnvGuard().start,
     ],
 )
-def test_a_working_directory_that_was_deleted_is_said(tmp_path, monkeypatch, use):
+def test_a_working_directory_that_was_deleted_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[..., Any]
+) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
@@ -120,7 +134,9 @@ def test_a_working_directory_that_was_deleted_is_said(tmp_path, monkeypatch, use
         use()
 
 
-def test_where_the_working_directory_was_deleted_whole_paths_do(tmp_path, monkeypatch):
+def test_where_the_working_directory_was_deleted_whole_paths_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()

@@ -1,16 +1,19 @@
 """What every store promises of checkpoints, copies and what is set aside, as its contract says it."""
 
 import json
+from pathlib import Path
 
 import pytest
-from store_parts import fill, killed, make_checkpoint, make_iteration, make_sweep, make_trial, numbers
+from store_parts import Reopen, fill, killed, make_checkpoint, make_iteration, make_sweep, make_trial, numbers
+from stores import Harness
 
 from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.store.contract import Sweep, Trial
 
 # -- checkpoints
 
 
-def test_a_checkpoint_comes_back_as_it_was_written(sweep, trial, another):
+def test_a_checkpoint_comes_back_as_it_was_written(sweep: Sweep, trial: Trial, another: Reopen) -> None:
     for iteration in (900, 1_000_001, 20):
         trial.write_checkpoint(make_checkpoint(iteration, evaluation_return=iteration / 2), fill)
     found = another().trial("t0000")
@@ -21,7 +24,7 @@ def test_a_checkpoint_comes_back_as_it_was_written(sweep, trial, another):
         assert (folder / "state" / "weights").read_text() == "abc"
 
 
-def test_a_checkpoint_is_seen_when_it_is_whole(trial, another):
+def test_a_checkpoint_is_seen_when_it_is_whole(trial: Trial, another: Reopen) -> None:
     seen = []
     trial.write_checkpoint(
         make_checkpoint(1), lambda folder: seen.append((list(folder.iterdir()), numbers(another))) or fill(folder)
@@ -30,8 +33,8 @@ def test_a_checkpoint_is_seen_when_it_is_whole(trial, another):
     assert numbers(another) == [1]
 
 
-def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial, another):
-    def fails(folder):
+def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial: Trial, another: Reopen) -> None:
+    def fails(folder: Path) -> None:
         fill(folder, "other")
         raise OSError(28, "No space left on device")
 
@@ -44,8 +47,8 @@ def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial, another):
 
 
 def test_of_a_checkpoint_whose_writer_is_killed_nothing_is_seen_and_the_next_owner_clears_it_away(
-    harness, trial, another
-):
+    harness: Harness, trial: Trial, another: Reopen
+) -> None:
     trial.write_checkpoint(make_checkpoint(3), fill)
     before = harness.keys("mine")
     killed(lambda die: trial.write_checkpoint(make_checkpoint(4), lambda folder: (fill(folder), die())))
@@ -54,7 +57,7 @@ def test_of_a_checkpoint_whose_writer_is_killed_nothing_is_seen_and_the_next_own
     assert harness.keys("mine") == before
 
 
-def test_a_checkpoint_is_replaced_and_deleted(trial, another):
+def test_a_checkpoint_is_replaced_and_deleted(trial: Trial, another: Reopen) -> None:
     trial.write_checkpoint(make_checkpoint(3, evaluation_return=1.0), lambda folder: fill(folder, "old"))
     trial.write_checkpoint(make_checkpoint(3, evaluation_return=2.0), lambda folder: fill(folder, "new"))
     trial.write_checkpoint(make_checkpoint(4), fill)
@@ -83,7 +86,9 @@ PLACE = "trials/t0000/checkpoints/000003/"
         ("manifest.json", b"{}", "manifest"),
     ],
 )
-def test_a_damaged_checkpoint_is_found_before_it_is_read(harness, trial, key, content, what):
+def test_a_damaged_checkpoint_is_found_before_it_is_read(
+    harness: Harness, trial: Trial, key: str, content: bytes | None, what: str
+) -> None:
     trial.write_checkpoint(make_checkpoint(3), fill)
     if content is None:
         harness.remove("mine", PLACE + key)
@@ -95,7 +100,7 @@ def test_a_damaged_checkpoint_is_found_before_it_is_read(harness, trial, key, co
     assert trial.checkpoint_iterations() == [3]
 
 
-def test_an_edited_score_and_another_checkpoints_manifest_are_refused(harness, trial):
+def test_an_edited_score_and_another_checkpoints_manifest_are_refused(harness: Harness, trial: Trial) -> None:
     trial.write_checkpoint(make_checkpoint(3, evaluation_return=1.0), fill)
     trial.write_checkpoint(make_checkpoint(4, evaluation_return=2.0), fill)
     data = json.loads(harness.content("mine", PLACE + "manifest.json"))
@@ -108,7 +113,7 @@ def test_an_edited_score_and_another_checkpoints_manifest_are_refused(harness, t
     assert trial.checkpoint(4).evaluation_return == 2.0
 
 
-def test_the_engine_that_is_named_is_in_the_manifest(harness, trial):
+def test_the_engine_that_is_named_is_in_the_manifest(harness: Harness, trial: Trial) -> None:
     trial.write_checkpoint(make_checkpoint(3), fill, engine="packed")
     assert json.loads(harness.content("mine", PLACE + "manifest.json"))["engine"] == "packed"
 
@@ -116,7 +121,7 @@ def test_the_engine_that_is_named_is_in_the_manifest(harness, trial):
 # -- checkpoints of others, and what was damaged
 
 
-def test_a_copy_stays_when_its_checkpoint_is_deleted(sweep, trial, another):
+def test_a_copy_stays_when_its_checkpoint_is_deleted(sweep: Sweep, trial: Trial, another: Reopen) -> None:
     other = sweep.trial("t0001")
     record = make_checkpoint(4, trial_id="t0001")
     assert not trial.copied_checkpoint(7).exists()
@@ -134,7 +139,9 @@ def test_a_copy_stays_when_its_checkpoint_is_deleted(sweep, trial, another):
     assert not another().trial("t0000").copied_checkpoint(9).exists()
 
 
-def test_nothing_is_copied_of_a_checkpoint_that_is_damaged_or_gone(harness, sweep, trial):
+def test_nothing_is_copied_of_a_checkpoint_that_is_damaged_or_gone(
+    harness: Harness, sweep: Sweep, trial: Trial
+) -> None:
     other = sweep.trial("t0001")
     other.write_checkpoint(make_checkpoint(3, trial_id="t0001"), fill)
     trial.copy_checkpoint(other.checkpoint_folder(3), 7)
@@ -148,7 +155,7 @@ def test_nothing_is_copied_of_a_checkpoint_that_is_damaged_or_gone(harness, swee
     assert (trial.copied_checkpoint(7) / "state" / "weights").read_text() == "abc"
 
 
-def test_what_is_set_aside_is_kept_and_taken_for_nothing(harness, trial, another):
+def test_what_is_set_aside_is_kept_and_taken_for_nothing(harness: Harness, trial: Trial, another: Reopen) -> None:
     assert trial.latest_damaged() == 0
     trial.take()
     places = []
@@ -168,7 +175,7 @@ def test_what_is_set_aside_is_kept_and_taken_for_nothing(harness, trial, another
     assert harness.content("mine", "trials/t0000/results.damaged") == b"\xff\n{\n[\n"
 
 
-def test_leftovers_of_a_sweep_are_removed_and_nothing_else(harness, sweep, trial):
+def test_leftovers_of_a_sweep_are_removed_and_nothing_else(harness: Harness, sweep: Sweep, trial: Trial) -> None:
     sweep.write_record(make_sweep())
     trial.write_record(make_trial(status="completed"))
     trial.write_checkpoint(make_checkpoint(3), fill)

@@ -2,10 +2,13 @@
 
 import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tests.narrowing import present
 from tune_jobs.store import contract, names, trial_contract
 
 ROOT = Path(__file__).parents[2]
@@ -23,13 +26,13 @@ FILE = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(FILES, key=len, 
 HANDED_OUT = {
     node.name
     for module in (contract, trial_contract)
-    for node in ast.walk(ast.parse(Path(module.__file__).read_text()))
+    for node in ast.walk(ast.parse(Path(present(module.__file__)).read_text()))
     if isinstance(node, ast.FunctionDef) and node.returns is not None and "Path" in ast.unparse(node.returns)
 } | {"sweep_folder", "storage"}
 ADDING = {"joinpath", "with_name", "with_stem", "with_suffix", "glob", "rglob", "iterdir", "relative_to", "parent"}
 
 
-def known(source):
+def known(source: str) -> Iterator[tuple[int, str]]:
     """What a module knows of the files in a sweep: lines, and what stands there."""
     tree = ast.parse(source)
     documentation = {
@@ -64,7 +67,7 @@ def known(source):
                 yield node.lineno, "tune_jobs.store.places"
 
 
-def is_handed_out(node):
+def is_handed_out(node: Any) -> bool:
     match node:
         case ast.Attribute(attr=name) | ast.Subscript(slice=ast.Constant(value=name)):
             return name in HANDED_OUT
@@ -98,7 +101,7 @@ def is_handed_out(node):
         "storage / name",
     ],
 )
-def test_such_knowledge_is_found(source):
+def test_such_knowledge_is_found(source: str) -> None:
     assert list(known(source)) != []
 
 
@@ -113,11 +116,11 @@ def test_such_knowledge_is_found(source):
         "folder.num_steps / 3",
     ],
 )
-def test_nothing_else_is(source):
+def test_nothing_else_is(source: str) -> None:
     assert list(known(source)) == []
 
 
-def test_nobody_but_the_store_knows_a_file_of_a_sweep():
+def test_nobody_but_the_store_knows_a_file_of_a_sweep() -> None:
     assert len(SOURCES) > 50
     assert {
         f"{path.relative_to(ROOT)}:{line}: {what}" for path in SOURCES for line, what in known(path.read_text())

@@ -18,11 +18,11 @@ from policies.suggestions import did_you_mean
         ("x", [], ""),
     ],
 )
-def test_the_nearest_name(name, known, expected):
+def test_the_nearest_name(name: int | str, known: list[str], expected: str) -> None:
     assert did_you_mean(name, known) == expected
 
 
-def test_several_that_are_near():
+def test_several_that_are_near() -> None:
     known = ["Ant-v4", "Ant-v5", "Hopper-v5"]
     assert did_you_mean("ant-v3", known, at_most=3, cutoff=0.7) == " Did you mean 'Ant-v5' or 'Ant-v4'?"
     assert did_you_mean("ant-v3", known, at_most=3, cutoff=0.9) == ""

@@ -1,12 +1,14 @@
 """DataFrames and CSV files of trials and iterations."""
 
 import math
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
-from synthetic_sweep import make_sweep
+from synthetic_sweep import Synthetic, make_sweep
 
-from analysis.records import IterationRecord
+from analysis.records import IterationRecord, TrialRecord
 from analysis.selection import score_trial
 from analysis.tables import (
     cell_value,
@@ -18,14 +20,15 @@ from analysis.tables import (
     write_csv,
 )
 from policies.errors import CannotRunError
+from tests.narrowing import present
 
 
 @pytest.fixture(scope="module")
-def synthetic():
+def synthetic() -> Synthetic:
     return make_sweep(failed={3}, pending={5})
 
 
-def iteration(number, *, episodes, training):
+def iteration(number: int, *, episodes: int, training: float | None) -> IterationRecord:
     return IterationRecord(
         iteration=number, num_env_steps=1000 * number, num_episodes=episodes, time_s=1.0, training_return=training
     )
@@ -35,12 +38,12 @@ def iteration(number, *, episodes, training):
     ("value", "expected"),
     [([64, 64], "64x64"), ((32,), "32"), ("relu", "relu"), (0, 0), (False, False), (None, None), (1e-7, 1e-7)],
 )
-def test_a_value_becomes_a_cell(value, expected):
+def test_a_value_becomes_a_cell(value: Any, expected: bool | float | str | None) -> None:
     assert cell_value(value) == expected
     assert type(cell_value(value)) is type(expected)
 
 
-def test_one_row_a_trial(synthetic):
+def test_one_row_a_trial(synthetic: Synthetic) -> None:
     frame = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
     assert len(frame) == 20
     assert list(frame.columns[:5]) == ["trial_id", "status", "hidden_sizes", "activation", "lr"]
@@ -48,34 +51,34 @@ def test_one_row_a_trial(synthetic):
     assert frame["lr"].tolist() == [trial.point["lr"] for trial in synthetic.trials]
     assert frame["seed"].tolist() == [trial.seed for trial in synthetic.trials]
     row = frame.set_index("trial_id").loc["t0001"]
-    assert row["score"] == score_trial(synthetic.trials[1]).score
-    assert row["score_num_env_steps"] == score_trial(synthetic.trials[1]).checkpoint.num_env_steps
+    assert row["score"] == present(score_trial(synthetic.trials[1])).score
+    assert row["score_num_env_steps"] == present(score_trial(synthetic.trials[1])).checkpoint.num_env_steps
 
 
-def test_rows_are_in_order_of_index_whatever_the_order_given(synthetic):
+def test_rows_are_in_order_of_index_whatever_the_order_given(synthetic: Synthetic) -> None:
     frame = trials_frame(synthetic.trials[::-1])
     assert frame["trial_id"].tolist() == [trial.trial_id for trial in synthetic.trials]
 
 
-def test_failed_and_pending_trials_are_rows_without_a_score(synthetic):
+def test_failed_and_pending_trials_are_rows_without_a_score(synthetic: Synthetic) -> None:
     frame = trials_frame(synthetic.trials, synthetic.results).set_index("trial_id")
     assert frame.loc["t0003", "status"] == "failed"
-    assert math.isnan(frame.loc["t0003", "score"])
-    assert frame.loc["t0003", "error"].startswith("RuntimeError: env.step raised")
+    assert math.isnan(present(frame.loc["t0003", "score"]))
+    assert present(frame.loc["t0003", "error"]).startswith("RuntimeError: env.step raised")
     assert "\n" not in frame.loc["t0003", "error"]
     assert frame.loc["t0005", "status"] == "pending"
-    assert math.isnan(frame.loc["t0005", "training_return"])
+    assert math.isnan(present(frame.loc["t0005", "training_return"]))
     assert frame.loc["t0005", "num_env_steps"] == 0
 
 
-def test_a_score_of_zero_is_not_missing():
+def test_a_score_of_zero_is_not_missing() -> None:
     trial = make_sweep(points=[{"lr": 1e-3}]).trials[0]
     zero = trial.checkpoints[0].model_copy(update={"evaluation_return": 0.0})
     frame = trials_frame([trial.model_copy(update={"checkpoints": (zero,)})])
     assert frame["score"].tolist() == [0.0]
 
 
-def test_solved_needs_the_return_and_a_hundred_episodes():
+def test_solved_needs_the_return_and_a_hundred_episodes() -> None:
     rows = [
         iteration(1, episodes=20, training=200.0),
         iteration(2, episodes=100, training=None),
@@ -90,14 +93,14 @@ def test_solved_needs_the_return_and_a_hundred_episodes():
     assert env_steps_to(0.0, [iteration(1, episodes=100, training=0.0)]) == 1000
 
 
-def test_no_trials_give_an_empty_table_with_its_columns():
+def test_no_trials_give_an_empty_table_with_its_columns() -> None:
     frame = trials_frame([])
     assert len(frame) == 0
     assert "score" in frame.columns
     assert len(iterations_frame({})) == 0
 
 
-def test_one_row_an_iteration(synthetic):
+def test_one_row_an_iteration(synthetic: Synthetic) -> None:
     frame = iterations_frame(synthetic.results)
     assert len(frame) == sum(len(rows) for rows in synthetic.results.values())
     first = frame.iloc[0]
@@ -106,7 +109,7 @@ def test_one_row_an_iteration(synthetic):
     assert frame["evaluation_return"].isna().sum() > 0
 
 
-def test_groups_count_who_solved_and_how_fast(synthetic):
+def test_groups_count_who_solved_and_how_fast(synthetic: Synthetic) -> None:
     frame = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
     groups = groups_frame(synthetic.trials, synthetic.results, ["hidden_sizes", "activation"], threshold=195.0)
     assert groups["num_trials"].tolist() == [5, 5, 5, 5]
@@ -120,7 +123,9 @@ def test_groups_count_who_solved_and_how_fast(synthetic):
     assert unsolved["best_score"].is_monotonic_decreasing
 
 
-def points_that_solve_at(*points, unfinished=()):
+def points_that_solve_at(
+    *points: tuple[int | None, ...], unfinished: tuple[int, ...] = ()
+) -> tuple[list[TrialRecord], dict[str, list[IterationRecord]]]:
     """Trials whose seeds solve (training return 195) at these iterations, 1,000 env steps each; None: never."""
     seeds_per_point = len(points[0])
     points_of_lr = [{"lr": 10.0 ** -(index + 1)} for index in range(len(points))]
@@ -140,7 +145,7 @@ def points_that_solve_at(*points, unfinished=()):
     return trials, results
 
 
-def test_steps_to_solve_are_medians_over_the_seeds_of_a_point():
+def test_steps_to_solve_are_medians_over_the_seeds_of_a_point() -> None:
     trials, results = points_that_solve_at((9, 2, 4), (5, None, 3), (None, 1, None), (None, None, None))
     frame = steps_to_solve_frame(trials, results, threshold=195.0)
     # Of three seeds one that never solves is the slowest: the median is the slower of the two others.
@@ -154,27 +159,27 @@ def test_steps_to_solve_are_medians_over_the_seeds_of_a_point():
     assert seeds.iloc[1].tolist() == [5000, pd.NA, 3000]
 
 
-def test_the_fewest_median_steps_come_first_not_the_luckiest_seed():
+def test_the_fewest_median_steps_come_first_not_the_luckiest_seed() -> None:
     trials, results = points_that_solve_at((1, 9), (3, 4))
     frame = steps_to_solve_frame(trials, results, threshold=195.0)
     assert frame["point_index"].tolist() == [1, 0]
     assert frame["median_num_env_steps"].tolist() == [3500, 5000]
 
 
-def test_a_seed_that_still_runs_may_solve_yet():
+def test_a_seed_that_still_runs_may_solve_yet() -> None:
     trials, results = points_that_solve_at((2, None), unfinished=(1,))
     (row,) = steps_to_solve_frame(trials, results, threshold=195.0).to_dict("records")
     assert (row["num_seeds"], row["num_solved"], row["median_num_env_steps"]) == (1, 1, 2000)
 
 
-def test_without_a_threshold_or_trials_nothing_is_solved(synthetic):
+def test_without_a_threshold_or_trials_nothing_is_solved(synthetic: Synthetic) -> None:
     frame = steps_to_solve_frame(synthetic.trials, synthetic.results, threshold=None)
     assert len(frame) == 20
     assert frame["num_solved"].sum() == 0
     assert steps_to_solve_frame([], {}, threshold=195.0).empty
 
 
-def test_steps_to_solve_agree_with_the_table_of_trials(synthetic, tmp_path):
+def test_steps_to_solve_agree_with_the_table_of_trials(synthetic: Synthetic, tmp_path: Path) -> None:
     frame = steps_to_solve_frame(synthetic.trials, synthetic.results, threshold=195.0)
     trials = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
     assert sorted(frame["median_num_env_steps"].dropna()) == sorted(trials["num_env_steps_to_solve"].dropna())
@@ -182,7 +187,7 @@ def test_steps_to_solve_agree_with_the_table_of_trials(synthetic, tmp_path):
     assert len(pd.read_csv(tmp_path / "s.csv")) == 20
 
 
-def test_csv_reads_back(synthetic, tmp_path):
+def test_csv_reads_back(synthetic: Synthetic, tmp_path: Path) -> None:
     frame = trials_frame(synthetic.trials, synthetic.results, threshold=195.0)
     write_csv(tmp_path / "deep" / "trials.csv", frame)
     back = pd.read_csv(tmp_path / "deep" / "trials.csv")
@@ -197,18 +202,18 @@ def test_csv_reads_back(synthetic, tmp_path):
 
 
 @pytest.mark.parametrize("start", ["=", "+", "-", "@"])
-def test_csv_text_is_no_spreadsheet_formula(tmp_path, start):
+def test_csv_text_is_no_spreadsheet_formula(tmp_path: Path, start: str) -> None:
     synthetic = make_sweep(points=[{"lr": 1e-3}], failed={0}, error=f"{start}HYPERLINK(1)")
     write_csv(tmp_path / "t.csv", trials_frame(synthetic.trials))
     assert pd.read_csv(tmp_path / "t.csv")["error"].tolist() == [f"'{start}HYPERLINK(1)"]
 
 
-def test_csv_leaves_numbers_alone(tmp_path):
+def test_csv_leaves_numbers_alone(tmp_path: Path) -> None:
     write_csv(tmp_path / "t.csv", pd.DataFrame({"score": [-7.5, 3.0]}))
     assert (tmp_path / "t.csv").read_text() == "score\n-7.5\n3.0\n"
 
 
-def test_a_csv_that_cannot_be_written_says_so(tmp_path):
+def test_a_csv_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CannotRunError, match="file"):
         write_csv(tmp_path / "file" / "t.csv", pd.DataFrame({"a": [1]}))

@@ -5,6 +5,7 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from synthetic_sweep import make_sweep
@@ -17,12 +18,12 @@ crc32c = pytest.importorskip("tensorboardX.crc32c")
 ROOT = Path(__file__).parents[2]
 
 
-def masked(data):
+def masked(data: bytes) -> int:
     crc = crc32c.crc32c(data)
-    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+    return cast("int", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
 
 
-def read(path):
+def read(path: Path) -> list[Any]:
     """Every event of a file, its checksums checked."""
     data, events = path.read_bytes(), []
     while data:
@@ -35,11 +36,11 @@ def read(path):
     return events
 
 
-def files(folder, trial_id):
+def files(folder: Path, trial_id: str) -> list[Path]:
     return sorted((folder / "trials" / trial_id / "tensorboard").glob("events.out.tfevents.*"))
 
 
-def test_scalars_are_read_back(tmp_path):
+def test_scalars_are_read_back(tmp_path: Path) -> None:
     first, second = make_sweep().trials[:2]
     first = first.model_copy(update={"num_env_steps": 300_000, "time_s": 2.0, "training_return": -3.5})
     writer = ScalarWriter(SweepStore(tmp_path))
@@ -63,7 +64,7 @@ def test_scalars_are_read_back(tmp_path):
     assert [value.tag for value in read(path)[1].summary.value] == ["num_episodes"]
 
 
-def test_a_run_that_goes_on_writes_a_file_of_its_own(tmp_path):
+def test_a_run_that_goes_on_writes_a_file_of_its_own(tmp_path: Path) -> None:
     trial = make_sweep().trials[0]
     for _ in range(2):
         writer = ScalarWriter(SweepStore(tmp_path))
