@@ -333,7 +333,7 @@ def rows_of_updates(**values: Any) -> tuple[PPOStack, list[NDArray[np.float32]],
     ((group, batch),) = sampled.groups
     update, seen = group._update, []
 
-    def reading(outputs: torch.Tensor, value: torch.Tensor, minibatch: Minibatch) -> Any:
+    def reading(outputs: torch.Tensor, value: torch.Tensor, minibatch: Minibatch) -> torch.Tensor | None:
         seen.append(minibatch.advantages[1].numpy().copy())
         return update(outputs, value, minibatch)
 

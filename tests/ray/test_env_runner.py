@@ -1,8 +1,10 @@
 """ArrayEnvRunner gives the episodes that RLlib's own runner gives, to the last bit."""
 
+from __future__ import annotations
+
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,9 @@ from numpy.typing import NDArray
 
 from policies.errors import EnvError
 from policies.hyperparams import Algorithm, DQNHyperparams, PPOHyperparams
+
+if TYPE_CHECKING:
+    from policies.rllib.env_runner import ArrayEnvRunner
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -40,7 +45,7 @@ def make_config(algorithm: Algorithm, env: str) -> Any:
     return build_algorithm_config(hyperparams, env_id=env_id, env_args=env_args, seed=SEED)
 
 
-def make_runners(algorithm: Algorithm, env: str) -> tuple[Any, Any]:
+def make_runners(algorithm: Algorithm, env: str) -> tuple[ArrayEnvRunner, Any]:
     """(ours, RLlib's), with the same weights and seeds."""
     from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 

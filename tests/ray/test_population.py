@@ -1,10 +1,12 @@
 """Who of a population goes on from whom, as Ray Tune is told: no process, no training, scores that are drawn."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 import numpy as np
@@ -15,11 +17,18 @@ from policies.errors import CheckpointError
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 
+if TYPE_CHECKING:
+    from tune_jobs.ray_tune.population import PopulationScheduler
+
 pytestmark = pytest.mark.ray
 
 RECORDED = Path(__file__).parent / "samples" / "population_decisions.json"
 """What was decided when Ray Tune's own population based training did, by the same draws."""
 MAX_ENV_STEPS = 1_600
+Read = Callable[[str], TrialRecord]
+Become = Callable[[TrialRecord], TrialRecord]
+Change = Callable[[str, Become], None]
+Make = Callable[[SweepSpec, Any, Read, Change], "PopulationScheduler"]
 
 
 class Trial:
@@ -84,7 +93,7 @@ class Controller:
         return Future(number, None if draw < 0.2 else Saved(f"checkpoint {number}", {}))
 
 
-def simulated(seed: int, make: Callable[..., Any]) -> list[list[Any]]:
+def simulated(seed: int, make: Make) -> list[list[Any]]:
     """Everything that is decided in a random sweep, as JSON.
 
     Args:
@@ -114,10 +123,10 @@ def simulated(seed: int, make: Callable[..., Any]) -> list[list[Any]]:
         for index in range(num_trials)
     }  # fmt: skip
 
-    def change(trial_id: str, become: Callable[[TrialRecord], TrialRecord]) -> None:
+    def change(trial_id: str, become: Become) -> None:
         records[trial_id] = become(records[trial_id])
 
-    def copy(source: Any, target: Any, iteration: int) -> SimpleNamespace:
+    def copy(source: SimpleNamespace, target: SimpleNamespace, iteration: int) -> SimpleNamespace:
         if rng.random() < 0.1:
             raise CheckpointError("It is damaged.")
         return SimpleNamespace(iteration=iteration)
@@ -166,7 +175,7 @@ def simulated(seed: int, make: Callable[..., Any]) -> list[list[Any]]:
     return found
 
 
-def made(spec: SweepSpec, store: Any, read: Callable[[str], TrialRecord], change: Callable[..., None]) -> Any:
+def made(spec: SweepSpec, store: Any, read: Read, change: Change) -> PopulationScheduler:
     from tune_jobs.ray_tune.population import PopulationScheduler
 
     return PopulationScheduler(spec, store, read, change)
