@@ -53,7 +53,7 @@ _HOME = {
     **dict.fromkeys(_SWEEPS, "tune_jobs.sweeps.verbs"),
 }
 
-# Before anything of policies or analysis is imported.
+# This comes before anything of policies or analysis is imported.
 _own_packages.install()
 
 

@@ -146,7 +146,7 @@ def bad_node(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iter
 BAD_NODES = {
     "storage_not_shared": "does not see the sweep folder",
     "storage_read_only": "Read-only file system",
-    "without_tune_jobs": "has no tune-jobs that works: ModuleNotFoundError: No module named 'tune_jobs'",
+    "without_tune_jobs": "has no working tune-jobs: ModuleNotFoundError: No module named 'tune_jobs'",
     "other_version": "has tune-jobs 99.9",
 }
 

@@ -112,7 +112,7 @@ def test_a_signal_while_ray_starts(launch: Start, tmp_path: Path) -> None:
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=240)
     assert process.returncode == 130, out + err
-    assert err.strip().splitlines()[-1].endswith("Go on with: tune-jobs resume cut"), err
+    assert err.strip().splitlines()[-1].endswith("Continue with: tune-jobs resume cut"), err
     assert state(folder) == "interrupted"
     assert half_made(folder) == set()
 

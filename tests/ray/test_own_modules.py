@@ -120,7 +120,7 @@ def test_a_module_that_is_gone_is_an_error(
 @pytest.mark.parametrize(
     ("algorithm", "values", "name", "words"),
     [
-        ("ppo", {}, "NUMBER", "is 3, which is no RLModule class"),
+        ("ppo", {}, "NUMBER", "is 3, which is not an RLModule class"),
         ("ppo", {}, "NoValues", "no ValueFunctionAPI"),
         ("dqn", {}, "OwnPPO", "no QNetAPI"),
         ("ppo", {}, "Nothing", "nothing called 'Nothing'"),

@@ -185,7 +185,7 @@ def test_errors_end_with_message_hint_and_exit_code(run: RunCommand, sweeps: Fak
     result = run("launch", "x")
     assert result.exit_code == code
     message = getattr(error, "message", "Interrupted.")
-    hint = "nothing was kept." if isinstance(error, SweepInterrupted) else "`tune-jobs resume SWEEP` goes on with it."
+    hint = "nothing was kept." if isinstance(error, SweepInterrupted) else "`tune-jobs resume SWEEP` continues it."
     assert f"error: {message}" in result.stderr
     assert getattr(error, "hint", hint) in result.stderr
     document = json.loads(run("launch", "x", "--json").stdout)
@@ -195,7 +195,7 @@ def test_errors_end_with_message_hint_and_exit_code(run: RunCommand, sweeps: Fak
 @pytest.mark.parametrize(
     ("state", "told"),
     [
-        ("interrupted", "Interrupted; what is done is kept. Go on with: tune-jobs resume mine"),
+        ("interrupted", "Interrupted; what is done is kept. Continue with: tune-jobs resume mine"),
         ("completed", "Interrupted; all trials are done. Make what is missing with: tune-jobs resume mine"),
     ],
 )

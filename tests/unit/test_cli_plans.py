@@ -30,7 +30,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(run: RunCommand, tmp_path:
         "CartPole-v0 (solved at 195)",
         "20: 20 points",
         "packed; environments: vectorised, ",
-        " us a step",
+        " us per step",
         "1 in 1 pack of up to 1, each pack on 1 CPU",
         "at most 2,020,620",
         "MB",

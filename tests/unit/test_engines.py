@@ -166,5 +166,5 @@ def test_a_manifest_of_before_is_told_by_what_its_folder_holds(tmp_path: Path, n
     assert "engine" not in json.loads((folder / "manifest.json").read_text())
     assert engine_of_checkpoint(folder).name == name
     (folder / name).rename(folder / "something")
-    with pytest.raises(CheckpointError, match="the state of no engine"):
+    with pytest.raises(CheckpointError, match="does not hold the state of any engine"):
         engine_of_checkpoint(folder)

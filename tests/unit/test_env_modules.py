@@ -197,7 +197,7 @@ def test_a_class_that_no_other_process_finds_is_refused(own: Path, monkeypatch: 
     monkeypatch.setattr(sys.modules["__main__"], "Script", in_script, raising=False)
     with pytest.raises(SpecError, match="Script is defined in the main script"):
         path_of(in_script, "environment")
-    with pytest.raises(SpecError, match=r"is no gymnasium\.Env"):
+    with pytest.raises(SpecError, match=r"is not a gymnasium\.Env"):
         load_source({"env": dict, "algorithm": "ppo"})
     assert allowed_modules() == ()
 

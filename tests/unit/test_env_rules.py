@@ -59,7 +59,7 @@ def test_images_go_with_convolutions_and_vectors_without(algorithm: Algorithm) -
         (
             IMAGES,
             {"hyperparams": {"conv_filters": [[8, 17, 1]]}},
-            r"hyperparams\.conv_filters does not go with odd_envs:Images: .*17 x 17",
+            r"hyperparams\.conv_filters does not fit odd_envs:Images: .*17 x 17",
         ),
     ],
 )

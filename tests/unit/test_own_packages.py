@@ -150,7 +150,7 @@ def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(
     _, stderr = project("import tune_jobs\nimport policies.envs.spaces\n", files)
     warnings = [line for line in stderr.splitlines() if "UserWarning" in line]
     assert len(warnings) == 1
-    assert f"policies{os.sep}envs: `import policies.envs` gives tune-jobs' own" in warnings[0]
+    assert f"policies{os.sep}envs: `import policies.envs` imports the one of tune-jobs" in warnings[0]
 
 
 def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(

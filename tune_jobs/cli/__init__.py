@@ -1,1 +1,1 @@
-"""The command line: parse, call the verbs of `tune_jobs.sweeps.verbs`, print."""
+"""The command line: it parses, calls the functions of `tune_jobs.sweeps.verbs`, and prints."""

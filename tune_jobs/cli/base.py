@@ -1,4 +1,4 @@
-"""What every command shares: options, errors as messages with exit codes, a clean standard output."""
+"""What all commands share: options, errors as messages with exit codes, a clean standard output."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NOBODY_READS = (errno.EPIPE, errno.EIO)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UNCHANGED = {
     "launch": "No trial had begun, and nothing was kept.",
-    "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` goes on with it.",
+    "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` continues it.",
     "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
 }
 _JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
@@ -34,7 +34,7 @@ class CommandGroup(click.Group):
     """A group whose commands end with a clear message and the right exit code, never with a traceback."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the chosen command; exit codes as in the design."""
+        """Run the chosen command; docs/design.md lists the exit codes."""
         try:
             return super().invoke(ctx)
         except (click.exceptions.Exit, click.Abort, BrokenPipeError):
@@ -54,11 +54,11 @@ class CommandGroup(click.Group):
             _print_error(ctx, error.message, error.hint, error.exit_code)
             ctx.exit(error.exit_code)
         except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback on a user's terminal
-            # Of a file of ours it would be a CannotRunError, with the file's name.
+            # An error of a file that we write would be a CannotRunError with the file's name.
             if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
                 _write_nowhere(1)
                 said = f"The output of this command cannot be written: {error.strerror}."
-                _print_error(ctx, said, "Free space where it goes, or send it elsewhere.", _CANNOT_PRINT)
+                _print_error(ctx, said, "Free space on its disk, or send the output elsewhere.", _CANNOT_PRINT)
                 ctx.exit(_CANNOT_PRINT)
             message = f"Unexpected {type(error).__name__}: {said_by(error)}"
             if ctx.meta.get(DEBUG):
@@ -75,7 +75,7 @@ def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
 
     if isinstance(interruption, SweepInterrupted):
         return _UNCHANGED[command]
-    return "What is done is kept; `tune-jobs resume SWEEP` goes on with it." if command in _UNCHANGED else ""
+    return "What is done is kept; `tune-jobs resume SWEEP` continues it." if command in _UNCHANGED else ""
 
 
 def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) -> None:
@@ -104,7 +104,7 @@ def _remember_json(ctx: click.Context, _: click.Parameter, value: bool) -> bool:
 
 
 def print_version(ctx: click.Context, _: click.Parameter, value: bool) -> None:  # noqa: FBT001 - click's signature
-    """Callback of --version: print it and leave."""
+    """Print the version and exit; the callback of --version."""
     if not value or ctx.resilient_parsing:
         return
     from importlib import metadata
@@ -149,7 +149,7 @@ env_option = click.option(
 
 
 def _read_action(_: click.Context, __: click.Parameter, text: str | None) -> int | tuple[float, ...] | None:
-    """A whole number, or numbers with commas between them: brackets may stand around those."""
+    """Read a whole number, or numbers with commas between them, which may be in brackets."""
     if text is None:
         return None
     try:
@@ -162,12 +162,12 @@ def _read_action(_: click.Context, __: click.Parameter, text: str | None) -> int
 
 action_option = click.option(
     "--action", metavar="VALUE", callback=_read_action,
-    help="What 'constant' does: a number, or a list such as [0.5,-1].  [default: 0]",
+    help="The action of 'constant': a number, or a list such as [0.5,-1].  [default: 0]",
 )  # fmt: skip
 
 
 def run_options(command: _Command) -> _Command:
-    """Options of the commands that run trials."""
+    """Add the options of the commands that run trials."""
     for option in (
         click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report."),
         click.option("--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."),
@@ -182,16 +182,16 @@ def run_options(command: _Command) -> _Command:
 
 @contextlib.contextmanager
 def stdout_for(*, as_json: bool) -> Iterator[None]:
-    """With --json nothing but the document may reach standard output, whatever a library prints."""
+    """With --json, let only the JSON document reach standard output, whatever libraries print."""
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         yield
 
 
 def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> SweepResult:
-    """What a launch, resume or extend came to, also where a signal ended it.
+    """Return the result of a launch, resume or extend, also if a signal ended it.
 
     Raises:
-        KeyboardInterrupt: It ended before the sweep had begun.
+        KeyboardInterrupt: A signal ended it before the sweep had begun.
     """
     from tune_jobs.sweeps.interrupted import SweepInterrupted
 
@@ -205,9 +205,9 @@ def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> Sw
 
 @contextlib.contextmanager
 def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT001
-    """Of what may go away: who read a command's output from a pipe, its terminal, and if it was interrupted anything.
+    """Ignore errors of printing in the block if the reader of a pipe or the terminal is gone, or on an interrupt.
 
-    A sweep that was run is not told as failed for that.
+    A sweep that has run does not count as failed because of that.
     """
     try:
         yield
@@ -220,7 +220,7 @@ def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT0
 
 
 def _write_nowhere(*numbers: int) -> None:
-    """From now on: Python flushes standard output and error once more when it ends."""
+    """Send descriptors to nowhere from now on, as Python flushes standard output and error once more at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for number in numbers:
         os.dup2(nowhere, number)

@@ -1,7 +1,7 @@
-"""The command line: parse, call `tune_jobs.sweeps.verbs`, print.
+"""The commands: each parses its arguments, calls `tune_jobs.sweeps.verbs`, and prints the result.
 
-Importing this imports neither ray nor torch, so help, validation and dry runs answer at once. With `--json`
-standard output holds one JSON document, also when a command fails; everything else goes to standard error.
+Importing this module imports neither ray nor torch, so help, validation and dry runs answer at once. With `--json`,
+standard output is one JSON document, also when a command fails; everything else goes to standard error.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def launch(
     **options: Any,
 ) -> None:
     """Run a sweep: all trials, then the best policy, its video and a report."""
-    # Its child starts while this process still imports what it needs itself.
+    # The guard's child starts while this process still imports its own modules.
     ctx.with_resource(guarding(start=True))
     if dry_run:
         from tune_jobs.cli import plan_view as cli_plan

@@ -1,4 +1,4 @@
-"""What the commands print: tables for people, one JSON document for programs."""
+"""Print the results of commands: tables for people, one JSON document for programs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tune_jobs.spec.file import Preset
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
-# Derived figures that a reader of the JSON would otherwise compute anew.
+# Derived values, so that readers of the JSON need not compute them.
 _DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
 _STATUS_STYLES: dict[TrialStatus, str] = {
     "completed": "green",
@@ -38,7 +38,7 @@ _STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "run
 
 
 def to_json(value: Any) -> Any:
-    """Records, dataclasses and paths as JSON-like data; a number that isn't finite becomes null."""
+    """Turn records, dataclasses and paths into JSON-like data; a number that isn't finite becomes null."""
     if isinstance(value, BaseModel):
         data = {name: getattr(value, name) for name in type(value).model_fields}
         data |= {name: getattr(value, name) for name in _DERIVED if hasattr(type(value), name)}
@@ -60,7 +60,7 @@ def print_json(value: Any) -> None:
 
 
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
-    """Print what a launch, resume or extend came to, and where everything lies."""
+    """Print the result of a launch, resume or extend, and the paths of its files."""
     at = "" if storage is None else f" --storage {shlex.quote(storage)}"
     if result.sweep.address is not None:
         at += f" --address {shlex.quote(result.sweep.address)}"
@@ -82,7 +82,7 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
             console.print(f"note: {note}", style="yellow")
     if result.interrupted:
         done = result.sweep.state == "completed"
-        kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Go on with"
+        kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Continue with"
         click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
 
 
@@ -100,7 +100,7 @@ def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None
 
 
 def _print_trial_notes(console: Console, trials: Sequence[TrialRecord]) -> None:
-    """Print what of trials was damaged; they went on from something else than their latest checkpoint or results."""
+    """Print what was damaged in trials; they went on from something other than their latest checkpoint or results."""
     for trial in trials:
         for note in trial.notes:
             console.print(f"{trial.trial_id}: {note}", style="yellow")
@@ -143,7 +143,7 @@ def show_status(status: SweepStatus, *, as_json: bool) -> None:
 
 
 def _state(status: SweepStatus) -> str:
-    # A sweep whose process was killed still calls itself running.
+    # The record of a sweep whose process was killed still says running.
     gone = status.sweep.state == "running" and not status.alive
     return "interrupted" if gone else status.sweep.state
 
@@ -153,7 +153,7 @@ def _counts(status: SweepStatus) -> str:
 
 
 def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
-    """Print one line a trial."""
+    """Print one line per trial."""
     if as_json:
         print_json(trials)
         return
@@ -184,7 +184,7 @@ def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:
-    """Print the winner, what it was chosen by and what it was confirmed at."""
+    """Print the winner, the score it was chosen by, and its confirmation."""
     if as_json:
         print_json(best)
     else:
@@ -215,7 +215,7 @@ def show_evaluation(policy: EvaluationRecord, random: EvaluationRecord, *, as_js
 
 
 def span(seeds: Sequence[int]) -> str:
-    """The first and the last of them."""
+    """Return the range of seeds as "first to last"."""
     return f"{seeds[0]} to {seeds[-1]}"
 
 
@@ -246,13 +246,13 @@ def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
     if as_json:
         print_json({"sweep": sweep, "was_running": was_running})
     elif was_running:
-        click.echo(f"{sweep} stops after the iterations now running; `tune-jobs resume {sweep}` goes on with it.")
+        click.echo(f"{sweep} stops after the iterations now running; `tune-jobs resume {sweep}` continues it.")
     else:
         click.echo(f"{sweep} is not running.")
 
 
 def show_presets(presets: Sequence[Preset], *, as_json: bool) -> None:
-    """Print one line a preset: what it is, what it reaches, and what that costs."""
+    """Print one line per preset: what it is, what it reaches, and what that costs."""
     if as_json:
         print_json([preset._asdict() for preset in presets])
         return
@@ -262,7 +262,7 @@ def show_presets(presets: Sequence[Preset], *, as_json: bool) -> None:
     details = ("what", "expected", "env steps", "time on 2 cores")
     table = make_table("preset", *details, wrapped=details)
     for preset in presets:
-        # As texts, or a title in brackets would be read as a style.
+        # Passed as Text, because rich would read a title in brackets as a style.
         cells = (preset.title, preset.expected, preset.env_steps, preset.time.removesuffix(" on 2 cores"))
         table.add_row(preset.name, *(Text(cell) for cell in cells))
     console.print(table)
@@ -278,16 +278,16 @@ def show_preset(preset: Preset, *, as_json: bool) -> None:
 
 
 def make_console() -> Console:
-    """Where tables are printed: they end at the terminal's width."""
+    """Return the console that tables are printed to; they end at the terminal's width."""
     from rich.console import Console
 
-    # A pipe or a log has no width: 80 columns would cut tables and paths for nothing.
+    # A pipe or a log has no width, and 80 columns would cut tables and paths needlessly.
     width = None if sys.stdout.isatty() else 200
     return Console(markup=False, highlight=False, emoji=False, width=width, soft_wrap=False)
 
 
 def make_table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Table:
-    """A table without rows; the columns of `wrapped` break where others are cut."""
+    """Return a table without rows; text wraps in the columns of `wrapped`, and is cut in others."""
     from rich import box
     from rich.table import Table
 
@@ -298,13 +298,13 @@ def make_table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -
 
 
 def print_facts(console: Console, facts: Mapping[str, str]) -> None:
-    """Print names and what belongs to them, one a line."""
+    """Print facts, one name with its text per line."""
     from rich.table import Table
     from rich.text import Text
 
     grid = Table.grid(padding=(0, 2))
     grid.add_column(style="bold", no_wrap=True)
-    # Paths are to be copied whole: folded, never cut with an ellipsis.
+    # Paths are wrapped and never cut with an ellipsis, so that they can be copied.
     grid.add_column(overflow="fold")
     for name, value in facts.items():
         grid.add_row(Text(name), Text(value))

@@ -1,4 +1,4 @@
-"""What a dry run prints: the plan of a sweep."""
+"""Print the plan of a sweep, for dry runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MAX_TRIALS_SHOWN = 24
 
 
 def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
-    """Print what a sweep would do."""
+    """Print the plan of a sweep."""
     if as_json:
         print_json({"spec": spec.model_dump(mode="json"), "plan": plan.to_json()})
         return
@@ -68,12 +68,12 @@ def _engine_fact(plan: SweepPlan) -> str:
     if packs is None:
         return told
     kind = (
-        f"{counted(packs.num_env_processes, 'process', 'processes')} a pack"
+        f"{counted(packs.num_env_processes, 'process', 'processes')} per pack"
         if packs.num_env_processes
         else packs.env_kind
     )
     if packs.env_kind == "vectorised" and packs.env_step_us is not None:
-        return f"{told}; environments: {kind}, {packs.env_step_us:.3g} us a step"
+        return f"{told}; environments: {kind}, {packs.env_step_us:.3g} us per step"
     return f"{told}; environments: {kind}" + (f" ({packs.why_env_kind})" if packs.why_env_kind else "")
 
 
@@ -97,7 +97,7 @@ def _search_fact(spec: SweepSpec) -> str:
 
 
 def _plan_table(plan: SweepPlan) -> Table:
-    # The first trial's point is known; where a searcher chooses the later ones, they have none yet.
+    # The first trial's point is known; a search method may choose the points of later ones when they start.
     names = list(plan.trials[0].point)
     engines_differ = len(plan.engines) > 1
     table = make_table("trial", "seed", *names, *(["engine"] if engines_differ else []))

@@ -1,1 +1,1 @@
-"""What will run, on which engine, how large; refuses what cannot."""
+"""Plan a sweep: which trials run, on which engine, and how large they get; refuse what cannot run."""

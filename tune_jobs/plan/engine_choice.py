@@ -1,4 +1,4 @@
-"""Which engine of the table (`tune_jobs.spec.engines`) trains a trial.
+"""Choose the engine of the table in `tune_jobs.spec.engines` that trains a trial.
 
 Words: a *pack* is one process of the packed engine; its trials are its *members*. Members whose *key* is the same are
 *stacked*: their weights lie in one array each, and one operation computes all of them.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sweep_spec import SweepSpec
 
 _MOST_NAMED = 8
-"""So many trials are named in a note; more are counted."""
+"""The most trials that a note lists by name; more are counted."""
 
 
 @dataclass(frozen=True)
@@ -36,26 +36,26 @@ class PackPlan:
 
     num_packs: int
     slots: int
-    """Most trials of one pack at once."""
+    """The most trials that one pack trains at once."""
     cpus_per_pack: float
-    """With those of its environments' processes."""
+    """CPUs of a pack, including those of its environments' processes."""
     gpus_per_pack: float
     trial_ids: tuple[str, ...]
-    """The packed trials in the order in which they are handed out: those that are stacked follow each other."""
+    """The packed trials in the order in which they begin; trials that can be stacked follow each other."""
     env_kind: EnvKind
-    """How the environments of a pack step."""
+    """How the environments of a pack are stepped."""
     env_step_us: float | None
-    """Microseconds of one env step, as measured; None: the env raised an error before one could be."""
+    """Microseconds per env step, as measured; None: the env raised an error before a step could be measured."""
     num_env_processes: int
-    """Processes that step environments for one pack; 0: its own does."""
+    """Processes that step environments for one pack; 0: the pack's own process steps them."""
     notes: tuple[str, ...] = ()
-    """Why there are fewer packs or slots than there would be."""
+    """Notes on why there are fewer packs or slots than CPUs would allow."""
     why_env_kind: str = ""
-    """In a phrase."""
+    """The reason for `env_kind`, as a phrase."""
 
     @property
     def max_concurrent(self) -> int:
-        """Trials at once, of all packs."""
+        """How many trials all packs train at once."""
         return min(len(self.trial_ids), self.num_packs * self.slots)
 
 
@@ -64,16 +64,16 @@ class EngineChoice:
     """The engine of each trial."""
 
     engines: tuple[str, ...]
-    """Their names, by the trial's index."""
+    """The engines' names, by the trial's index."""
     notes: tuple[str, ...] = ()
-    """Which trials are not trained by the engine that would come first, and why."""
+    """Notes on which trials the first engine of the table cannot train, and why."""
 
 
 def pack_key(hyperparams: Hyperparams) -> tuple[Any, ...]:
-    """What the members of a stack have in common; all else may differ between them."""
+    """Return what the members of a stack have in common; everything else may differ between them."""
     if isinstance(hyperparams, RandomHyperparams):
         raise TypeError("Trials that do not learn are never packed.")
-    # Beside what a stack's program needs: what lets more members into one group.
+    # Not needed by a stack's program, but members with the same activation and sizes can be in one group.
     key = (shared_of(hyperparams), len(hyperparams.hidden_sizes))
     if isinstance(hyperparams, DQNHyperparams):
         return (*key, hyperparams.target_update_interval is None, hyperparams.tau == 1.0)
@@ -83,13 +83,13 @@ def pack_key(hyperparams: Hyperparams) -> tuple[Any, ...]:
 def why_not(
     engine: Engine, spec: SweepSpec, hyperparams: Hyperparams | None = None, env: EnvInfo | None = None
 ) -> str | None:
-    """Why an engine cannot train a trial, or None if it can, as long as its environment's seeds are not looked at.
+    """Return why an engine cannot train a trial, or None if it can; whether its env can be seeded is not checked.
 
     Args:
         engine: The engine.
         spec: The sweep.
-        hyperparams: Of the trial; None: its point is not known, and may be any of the space.
-        env: The sweep's environment; None: it is not looked at.
+        hyperparams: The trial's; None: its point is not known yet, and may be any of the space.
+        env: The sweep's environment; None: it is not checked.
     """
     if (reason := why_none(engine, spec)) is not None:
         return reason
@@ -98,7 +98,7 @@ def why_not(
 
 
 def _convolutions(spec: SweepSpec, hyperparams: Hyperparams | None, env: EnvInfo | None) -> Iterator[str]:
-    """What of a trial needs convolutions."""
+    """Yield the settings of a trial that need convolutions."""
     if hyperparams is not None:
         filters = None if isinstance(hyperparams, RandomHyperparams) else hyperparams.conv_filters
     else:
@@ -123,18 +123,18 @@ def choose_engines(
     recorded: Mapping[str, str],
     place: Callable[[int], str],
 ) -> EngineChoice:
-    """Choose the engine of each trial: the first of the table that can train it, or the one that is wished for.
+    """Choose the engine of each trial: the first of the table that can train it, or the one that the sweep sets.
 
     Args:
-        spec: The sweep; its `engine` is a wish.
+        spec: The sweep; `engine` may be `auto`.
         env: Its environment.
-        trials: Id and hyperparameters of each; None: they are chosen when it starts.
-        recorded: Engines of trials that are there already: they go on with them.
-        place: What messages call the trial of an index.
+        trials: Id and hyperparameters of each trial; None: they are chosen when it starts.
+        recorded: Engines of trials that exist already, which keep them.
+        place: Returns what messages call the trial of an index.
 
     Raises:
-        SpecError: The wish is one engine, and it cannot train one of them.
-        CheckpointError: A trial's record names an engine that there is none of.
+        SpecError: The sweep sets an engine that cannot train one of the trials.
+        CheckpointError: A trial's record names an unknown engine.
     """
     able = engines_for(spec.algorithm)
     wished = tuple(engine for engine in able if engine.name == spec.engine)
@@ -166,7 +166,7 @@ def choose_engines(
 
 
 class _Seeding:
-    """Whether the environment's episodes depend on their seeds alone; looked at once, and only if somebody asks."""
+    """Finds out, once and only if it is needed, whether the environment's episodes depend only on their seeds."""
 
     def __init__(self, spec: SweepSpec) -> None:
         self._spec = spec
@@ -174,7 +174,7 @@ class _Seeding:
         self._fault: str | None = None
 
     def why_not(self, engine: Engine) -> str | None:
-        """Why an engine cannot train in this environment, or None if it can."""
+        """Return why an engine cannot train in this environment, or None if it can."""
         if "unseeded" not in engine.lacks:
             return None
         if not self._is_checked:
@@ -183,7 +183,7 @@ class _Seeding:
 
 
 def _seed_fault(spec: SweepSpec) -> str | None:
-    """Why the environment's episodes do not depend on their seeds alone, or None if they do."""
+    """Return why the environment's episodes depend on more than their seeds, or None if they don't."""
     from policies.guard.guarded import check_seedable
 
     try:

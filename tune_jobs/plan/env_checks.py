@@ -1,4 +1,4 @@
-"""What has to be true of a sweep's environment and its other settings together; refused before anything starts."""
+"""Check a sweep's other settings against its environment, before anything starts."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _EXAMPLE = "[[16, 8, 4], [32, 4, 2]]"
 
 
 def check_env_args(spec: SweepSpec) -> None:
-    """Refuse wrappers among the constructor's arguments: they have fields of their own.
+    """Refuse wrappers among the constructor's arguments, because they have fields of their own.
 
     Raises:
-        SpecError: One is there.
+        SpecError: There is one.
     """
     for name in (FRAME_STACK, PIXELS, "failure_penalty"):
         if name in spec.env.args:
             raise SpecError(
-                f"env.args.{name} is {spec.env.args[name]!r}, but {name} is no argument of an env's constructor.",
+                f"env.args.{name} is {spec.env.args[name]!r}, but {name} is not an argument of an env's constructor.",
                 f"Write it as env.{name}, beside env.id.",
             )
 
@@ -41,10 +41,10 @@ def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperpa
     Args:
         spec: The sweep.
         env: Its environment, with its wrappers.
-        hyperparams: Of every point.
+        hyperparams: The hyperparameters of every point.
 
     Raises:
-        SpecError: A penalty without failure, an image encoder on a flat observation, or an image without one; a
+        SpecError: There is a penalty but no failure; convolutions but no images, or images but no convolutions; or a
             constant action that the environment does not have.
     """
     _check_constant_actions(spec, env, hyperparams)
@@ -82,7 +82,7 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
     shape = tuple(env.observation_space.shape or ())
     domain = spec.space.get("conv_filters")
     place = "hyperparams.conv_filters" if domain is None else "space.conv_filters"
-    # A search method may choose the points later: every value that it can choose counts.
+    # A search method may choose the points later, so every value that it can choose is checked.
     searched = [] if domain is None else [value for _, value in domain.probes()]
     for filters in [*searched, *(values.conv_filters for values in hyperparams)]:
         if filters is None:
@@ -102,4 +102,4 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
         try:
             output_shape(shape, filters)
         except SpecError as error:
-            raise SpecError(f"{place} does not go with {env.env_id}: {error.message}", error.hint) from error
+            raise SpecError(f"{place} does not fit {env.env_id}: {error.message}", error.hint) from error

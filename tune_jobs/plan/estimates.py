@@ -1,4 +1,4 @@
-"""How large a trial gets: upper bounds of its env steps, of what it writes to disk, and of its memory in a pack."""
+"""Estimate upper bounds of a trial's env steps, of what it writes to disk, and of its memory in a pack."""
 
 from __future__ import annotations
 
@@ -13,68 +13,68 @@ if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
     from tune_jobs.spec.sweep_spec import SweepSpec
 
-# Measured with Ray 2.60 and rounded up: an RLlib checkpoint without its weights, and a line of results with its
-# TensorBoard scalars.
+# The sizes of an RLlib checkpoint without its weights, and of a line of results with its TensorBoard scalars; they
+# were measured with Ray 2.60 and rounded up.
 _CHECKPOINT_BASE_BYTES = 250_000
 _ITERATION_BYTES = 10_000
 _BYTES_PER_NUMBER = 4
-# The network, its copy for sampling, DQN's target network, and Adam's two moments.
+# The copies of the weights: the network, its copy for sampling, DQN's target network, and Adam's two moments.
 _COPIES_OF_WEIGHTS = 6
-# A train batch as sampled, in the order of its minibatches, and what a gradient step makes of it.
+# The copies of a train batch: as sampled, in the order of its minibatches, and in a gradient step.
 _COPIES_OF_BATCH = 3
-# Beside the observation, of each env step: action, reward, ends, value, advantage, target, the action's distribution.
+# The numbers of an env step besides the observation: action, reward, ends, value, advantage, target, distribution.
 _NUMBERS_PER_STEP = 12
 
 
 def max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
-    """Most env steps of one trial: it ends with the iteration in which it reaches its cap."""
+    """Return the most env steps of one trial, which ends with the iteration in which it reaches its cap."""
     iteration = _iteration_env_steps(spec, values)
     return min(spec.stop.num_env_steps - 1 + iteration, spec.stop.num_iterations * iteration)
 
 
 def max_iterations(spec: SweepSpec, values: Hyperparams) -> int:
-    """Most iterations of one trial."""
+    """Return the most iterations of one trial."""
     return min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
 
 
 def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
-    """Most env steps of one iteration: all sub-environments step together, so the last step overshoots."""
+    """Return the most env steps of one iteration; all sub-environments step together, so the last step overshoots."""
     wanted, num_runners = _wanted_env_steps(values), max(1, spec.resources.num_env_runners)
     if isinstance(values, DQNHyperparams):
-        # It ends with a sampling phase, in which each runner makes its share of train_freq.
+        # An iteration ends with a sampling phase, in which each env runner makes its share of train_freq.
         return wanted - 1 + num_runners * (math.ceil(values.train_freq / num_runners) - 1 + values.num_envs)
     together = values.num_envs * num_runners
     return (math.ceil(wanted / together) + 1) * together
 
 
 def _wanted_env_steps(values: Hyperparams) -> int:
-    """Env steps an iteration has at least."""
+    """Return the env steps that an iteration has at least."""
     return values.train_batch_size if isinstance(values, PPOHyperparams) else values.env_steps_per_iteration
 
 
 def max_disk_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
-    """Most bytes that one trial's folder holds, as an estimate."""
+    """Estimate the most bytes that one trial's folder holds."""
     iterations = max_iterations(spec, values)
     checkpoint = _CHECKPOINT_BASE_BYTES + _num_weights(env, values) * _BYTES_PER_NUMBER * _COPIES_OF_WEIGHTS
     kept = min(spec.checkpoints.keep + 2, math.ceil(iterations / spec.checkpoints.every_iterations) + 2)
-    # One more while a new one is being written and the old one not yet deleted.
+    # There is one checkpoint more while a new one is written and the old one is not yet deleted.
     return (kept + 1) * checkpoint + iterations * _ITERATION_BYTES
 
 
 def member_bytes(env: EnvInfo, values: Hyperparams) -> int:
-    """Memory that one trial takes in a pack, as an estimate: weights, train batch and replay memory."""
+    """Estimate the memory of one trial in a pack, in bytes: weights, train batch and replay memory."""
     observation = math.prod(env.observation_space.shape or ())
     total = _num_weights(env, values) * _COPIES_OF_WEIGHTS
     if isinstance(values, PPOHyperparams):
         step = _COPIES_OF_BATCH * (observation + _NUMBERS_PER_STEP) + 2 * sum(values.hidden_sizes)
         total += values.train_batch_size * step
     elif isinstance(values, DQNHyperparams):
-        # Observation before and after, action (8 bytes), reward and discount.
+        # The observations before and after, the action (8 bytes), reward and discount.
         transition = 2 * observation + 4
         total += values.train_batch_size * (_COPIES_OF_BATCH * transition + 2 * sum(values.hidden_sizes))
         total += (0 if values.replay == "none" else values.replay_capacity) * transition
         if values.replay == "prioritized":
-            # A tree of sums with two nodes of 8 bytes for each place, whose number is rounded up to a power of 2.
+            # A tree of sums, two nodes of 8 bytes per transition, whose number is rounded up to a power of 2.
             total += 4 * (1 << (values.replay_capacity - 1).bit_length())
     return total * _BYTES_PER_NUMBER
 

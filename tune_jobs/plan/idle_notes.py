@@ -1,7 +1,8 @@
-"""Hyperparameters of a sweep that can't act: refused if a search over one could change nothing, else told.
+"""Find a sweep's idle hyperparameters: refuse a search over one that changes nothing, and note the others.
 
-When a hyperparameter is idle is the affair of `policies.idle.find`. Here: of which points, and what is said. A search
-is refused only where no value that its space may give could differ from another; a fixed value never is.
+`policies.idle.find` decides when a hyperparameter is idle. This module finds the points where it is, and words the
+notes. A search is refused only if no two values of its space could give different trials; a fixed value is never
+refused.
 """
 
 from __future__ import annotations
@@ -24,26 +25,26 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sweep_spec import SweepSpec
 
 _MOST_COMBINATIONS = 20_000
-"""Of other searched values that are looked at before a search is refused; beyond, it isn't."""
+"""The most combinations of other searched values that are checked; with more, a search is not refused."""
 _MOST_NAMED = 8
-"""So many points are named in a note; more are counted."""
+"""The most points that a note lists by number; more are counted."""
 _LEAST_SHARE = 0.1
-"""Of the points, from which on it is told that values of a range act alike."""
+"""The share of the points from which on a note says that values of a range act alike."""
 
 
 @dataclass(frozen=True)
 class _Points:
-    """What a sweep's points are known to be."""
+    """What is known about a sweep's points."""
 
     spec: SweepSpec
     env: EnvInfo
     values: tuple[Hyperparams | None, ...]
-    """All hyperparameters of each; None: the search method chooses them when the trial starts."""
+    """All hyperparameters of each point; None: the search method chooses them when the trial starts."""
     is_packed: tuple[bool, ...]
 
     @functools.cached_property
     def known(self) -> list[tuple[int, Hyperparams, Limits]]:
-        """(index, values, limits) of those that are known."""
+        """The index, the hyperparameters and the limits of each point that is known."""
         return [
             (index, values, self.limits(values, is_packed=is_packed))
             for index, (values, is_packed) in enumerate(zip(self.values, self.is_packed, strict=True))
@@ -51,7 +52,7 @@ class _Points:
         ]
 
     def limits(self, values: Hyperparams, *, is_packed: bool) -> Limits:
-        """Of a trial with these values."""
+        """Return the limits of a trial with these hyperparameters."""
         return Limits(
             num_env_steps=max_env_steps(self.spec, values),
             num_iterations=max_iterations(self.spec, values),
@@ -68,17 +69,17 @@ def idle_notes(
     *,
     may_refuse: bool = True,
 ) -> tuple[str, ...]:
-    """What to say of hyperparameters that can't act, for the plan.
+    """Return the plan's notes on hyperparameters that can't act.
 
     Args:
         spec: The sweep.
         env: Its environment.
-        values: All hyperparameters of each point; None: they are not known yet. At least one is.
+        values: All hyperparameters of each point; None: not known yet. At least one point is known.
         is_packed: Whether a pack trains each point's trials.
-        may_refuse: Whether the sweep is new. One that is there goes on, whatever it searches.
+        may_refuse: Whether the sweep is new. One that exists already may continue, whatever it searches.
 
     Raises:
-        SpecError: A search can't change anything, and the sweep is new.
+        SpecError: The sweep is new, and a search in it can't change anything.
     """
     points = _Points(spec, env, tuple(values), tuple(is_packed))
     names = [name for name in (*spec.space, *spec.hyperparams) if _is_looked_at(spec, name)]
@@ -110,7 +111,7 @@ def _listed(names: Mapping[str, Any]) -> str:
 
 def _is_looked_at(spec: SweepSpec, name: str) -> bool:
     if spec.rl_module is not None and name.startswith("epsilon_"):
-        return False  # the module is a user's own, and explores as it likes
+        return False  # the module is a user's own, and may explore as it likes
     return bool(RULES[spec.algorithm][name])
 
 
@@ -119,7 +120,7 @@ def _place(spec: SweepSpec, name: str) -> str:
 
 
 def _values_of(domain: Domain) -> list[Any]:
-    """Values that stand for all of a domain: rules change at most once between the ends of a range."""
+    """Return values that represent a domain; a rule changes at most once between the ends of a range."""
     if isinstance(domain, Listed):
         return list(domain.values)
     assert isinstance(domain, Range)
@@ -129,16 +130,16 @@ def _values_of(domain: Domain) -> list[Any]:
 
 
 def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_search: bool) -> str | None:
-    """Why no value of a hyperparameter acts, whatever the space gives the others; None: one may.
+    """Return why no value of a hyperparameter acts, whatever values the others have; None if one may act.
 
     Args:
-        points: The sweep's.
-        name: Of the hyperparameter.
+        points: The sweep's points.
+        name: The hyperparameter's name.
         own: Its values.
-        is_search: Whether values that act alike count as idle, since there are no others; a single one acts.
+        is_search: Whether the hyperparameter is searched: then values that all act alike count as idle.
     """
     if not is_search and (own[0] is None or own[0] is False):
-        return None  # switched off
+        return None  # it is switched off
     spec = points.spec
     rules = [rule for rule in RULES[spec.algorithm][name] if is_search or not (rule.of_value or rule is NO_UPDATE)]
     reads = {read for rule in rules for read in rule.reads} - {name}
@@ -153,7 +154,7 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
         if any(one is None for one in found):
             return None
         classes = {rule for rule, _ in filter(None, found) if rule.of_value}
-        if len(classes) > 1:  # two kinds of values that act alike: one of each acts differently
+        if len(classes) > 1:  # values of different classes act differently
             return None
         for rule, reason in filter(None, found):
             why.setdefault(rule, reason)
@@ -169,7 +170,7 @@ def _first_rule(points: _Points, rules: Sequence[Rule], values: Hyperparams) -> 
 
 
 def _partial_notes(points: _Points, name: str) -> list[str]:
-    """Of a searched hyperparameter that acts in some points, or may."""
+    """Return the notes on a searched hyperparameter that acts, or may act, in some points only."""
     spec, by_rule = points.spec, dict[Rule, tuple[str, list[int]]]()
     for index, found, limits in points.known:
         if (rule := idle_rule(spec.algorithm, name, found, limits)) is not None:
@@ -177,7 +178,7 @@ def _partial_notes(points: _Points, name: str) -> list[str]:
     notes = []
     for rule, (reason, indexes) in by_rule.items():
         if rule is NO_UPDATE:
-            continue  # told once for all of them
+            continue  # noted once for all hyperparameters
         if rule.of_value:
             values = {repr(getattr(points.values[index], name)) for index in indexes}
             is_rare = isinstance(spec.space[name], Range) and len(indexes) < _LEAST_SHARE * len(points.known)
@@ -197,7 +198,7 @@ def _later(spec: SweepSpec, name: str, rule: Rule) -> str:
 
 
 def _no_update_notes(points: _Points) -> list[str]:
-    """Trials of DQN that never learn."""
+    """Return the notes on DQN trials that never learn."""
     found: dict[str, list[int]] = {}
     for index, values, limits in points.known:
         if isinstance(values, DQNHyperparams) and NO_UPDATE.holds(values, limits):
@@ -206,7 +207,7 @@ def _no_update_notes(points: _Points) -> list[str]:
 
 
 def _which(points: _Points, indexes: Sequence[int]) -> str:
-    """Points in words."""
+    """Describe some points in words."""
     num = len(points.known)
     what = "points" if num == len(points.values) else "points that are known"
     if len(indexes) == num:

@@ -1,4 +1,4 @@
-"""What there is to run on: CPUs, GPUs and memory of this machine or of a cluster, and how much fits on it at once."""
+"""Find the CPUs, GPUs and memory of this machine or of a cluster, and how many processes fit on it at once."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ _MEMORY_INFO = Path("/proc/meminfo")
 
 @dataclass(frozen=True)
 class Machine:
-    """What there is to run on."""
+    """The CPUs, GPUs and memory that a sweep can use."""
 
     num_cpus: float
     num_gpus: float = 0.0
     source: str = "this machine"
     nodes: tuple[tuple[float, float], ...] = ()
-    """(CPUs, GPUs) of each node of a cluster; empty: one node that has everything."""
+    """The CPUs and the GPUs of each node of a cluster; empty: one node has everything."""
     memory_bytes: float | None = None
-    """Memory that is available; on a cluster as if each CPU had as much as those of the node that has least a CPU.
-    None: not known."""
+    """Available memory, in bytes; None: not known. On a cluster, every CPU counts with the memory per CPU of the node
+    that has the least."""
     more: str = "launch on a larger cluster with --address"
-    """How to get more of it, for hints."""
+    """How to get more resources, for hints."""
 
     def fitting(self, cpus: float, gpus: float) -> float:
-        """How many processes with so many CPUs and GPUs fit at once, each on one node; infinite if it is 0 of both."""
+        """Return how many processes with these CPUs and GPUs fit at once, each on one node; infinite if both are 0."""
         nodes = self.nodes or ((self.num_cpus, self.num_gpus),)
         return sum(
             min(node_cpus // cpus if cpus else math.inf, _times(node_gpus, gpus) if gpus else math.inf)
@@ -35,11 +35,11 @@ class Machine:
         )
 
     def memory_per_process(self, num_processes: int, cpus: float) -> float | None:
-        """Bytes that each of some processes may have, on the node where they get least; None: not known.
+        """Return the bytes that each process may use on the node where they get the least; None: not known.
 
         Args:
-            num_processes: How many there are; all of them may come to lie on one node if it has the CPUs.
-            cpus: CPUs of each of them.
+            num_processes: The number of processes; all of them may run on one node if it has the CPUs.
+            cpus: CPUs of each process.
         """
         if self.memory_bytes is None or not self.num_cpus:
             return None
@@ -52,12 +52,12 @@ class Machine:
 
 
 def local_machine() -> Machine:
-    """What this process may use: CPUs and memory (affinity and the container's limits count), and the GPUs it sees."""
+    """Return what this process may use: CPUs and memory within affinity and container limits, and visible GPUs."""
     return Machine(num_cpus=_usable_cpus(), num_gpus=_visible_gpus(), memory_bytes=_usable_memory())
 
 
 def _times(available: float, wanted: float) -> int:
-    """How often `wanted` GPUs fit; a share of a GPU never spreads over two, 3 x 1/3 fit despite rounding."""
+    """Return how often `wanted` GPUs fit; a share of a GPU is never split over two; 3 x 1/3 fit despite rounding."""
     if wanted > 1:
         return int(available // wanted)
     return int(available) * math.floor(1 / wanted + 1e-9)
@@ -66,12 +66,12 @@ def _times(available: float, wanted: float) -> int:
 def _usable_cpus() -> float:
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     quota = _cgroup_quota(_CGROUPS)
-    # Ray counts whole CPUs; half a CPU still is one process.
+    # Ray counts whole CPUs; half a CPU still runs one process.
     return float(affinity if quota is None else max(1, min(affinity, math.ceil(quota))))
 
 
 def _cgroup_quota(root: Path) -> float | None:
-    """CPUs a container may use by its cgroup (v2, then v1), None if it isn't limited."""
+    """Return the CPUs that a container may use by its cgroup (v2, then v1), or None if it isn't limited."""
     try:
         quota, period = (root / "cpu.max").read_text(encoding="ascii").split()
         return None if quota == "max" else int(quota) / int(period)
@@ -92,13 +92,13 @@ def _visible_gpus() -> float:
 
 
 def _usable_memory() -> float | None:
-    """Bytes that are available here; None where the system does not say."""
+    """Return the bytes that are available here, or None if the system does not say."""
     known = [bytes_ for bytes_ in (_available_memory(_MEMORY_INFO), _cgroup_memory(_CGROUPS)) if bytes_ is not None]
     return min(known, default=None)
 
 
 def _available_memory(path: Path) -> float | None:
-    """Linux's estimate of what can be used without swapping."""
+    """Return Linux's estimate of the memory that can be used without swapping."""
     try:
         lines = path.read_text(encoding="ascii").splitlines()
         return next(float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
@@ -107,7 +107,7 @@ def _available_memory(path: Path) -> float | None:
 
 
 def _cgroup_memory(root: Path) -> float | None:
-    """What a container's limit (cgroup v2, then v1) leaves; None if it has none. Files kept in memory can go."""
+    """Return what a container's memory limit (cgroup v2, then v1) leaves, or None without one; file caches are free."""
     for limit, usage, files in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),

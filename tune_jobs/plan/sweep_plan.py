@@ -1,7 +1,7 @@
-"""What a sweep will do, before anything starts: trials, seeds, resources, upper bounds of env steps and disk.
+"""Plan a sweep before anything starts: trials, seeds, resources, and upper bounds of env steps and disk space.
 
-A plan is a function of the sweep and the machine alone, and its trials of the sweep alone: planning the same
-sweep with more samples gives the same trials first. What can't run is refused here, with the numbers.
+A plan depends only on the sweep and the machine, and its trials only on the sweep: planning the same sweep with more
+samples gives the same trials first. A sweep that can't run is refused here, with the numbers.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 NUM_CONFIRMATION_EPISODES = 100
 MAX_TRIALS = 100_000
 
-# What is made once, rounded up: videos, report, Ray Tune's own state.
+# The size of what is made once per sweep, rounded up: videos, report, Ray Tune's own state.
 _SWEEP_BYTES = 20_000_000
-_FOR_EVER = "It would wait for ever."
+_FOR_EVER = "It would wait forever."
 
 _Point = tuple[dict[str, Any] | None, Hyperparams | None]
-"""The sampled values, and all values; both None: the search method chooses them when the trial starts."""
+"""The sampled values and all hyperparameters; both are None if the search method chooses them at the trial's start."""
 
 
 @dataclass(frozen=True)
@@ -56,27 +56,27 @@ class SweepPlan:
     cpus_per_trial: int
     gpus_per_trial: float
     max_concurrent: int
-    """Trials at once, those in packs too."""
+    """How many trials run at once, including those in packs."""
     evaluation_seeds: tuple[int, ...]
     confirmation_seeds: tuple[int, ...]
     max_env_steps: int
-    """Upper bound over all trials, if none is retried; evaluation episodes don't count."""
+    """Upper bound of the env steps of all trials without retries and evaluation episodes."""
     max_disk_bytes: int
-    """Estimate of the most the sweep folder will hold."""
+    """Estimate of the most bytes that the sweep folder will hold."""
     env: EnvInfo
     machine: Machine
     notes: tuple[str, ...] = ()
-    """What the sweep's author may not have meant, and which trials are not packed."""
+    """Notes on settings that may not be meant, and on trials that are not packed."""
     packs: PackPlan | None = None
-    """Of the packed trials that have not ended; None: there are none."""
+    """The packs of the packed trials that have not ended; None: there are none."""
 
     @property
     def engines(self) -> dict[str, int]:
-        """Number of trials by engine."""
+        """The number of trials by engine."""
         return dict(Counter(trial.engine for trial in self.trials))
 
     def to_json(self) -> dict[str, Any]:
-        """The plan as JSON-like data, without the environment's spaces."""
+        """Return the plan as JSON-like data, without the environment's spaces."""
         apart = ("trials", "env", "machine", "packs")
         data = {name: value for name, value in vars(self).items() if name not in apart}
         env = {"id": self.env.env_id, "args": self.env.env_args, "threshold": self.env.threshold}
@@ -91,7 +91,7 @@ class SweepPlan:
 
 
 def trial_id(index: int) -> str:
-    """Name of a trial, such as t0007; sorts by index up to 10,000 trials."""
+    """Return the id of a trial, such as t0007; ids sort by index up to 10,000 trials."""
     return f"t{index:04d}"
 
 
@@ -104,14 +104,14 @@ def make_plan(
     Args:
         spec: The sweep.
         machine: What it runs on.
-        records: Of its trials that are there already: they go on with the engines they have.
-        retry_failed: Whether the failed ones of those run again.
+        records: The records of trials that exist already, which keep their engines.
+        retry_failed: Whether the failed ones of them run again.
 
     Raises:
-        EnvError: The environment isn't registered, can't be made, or doesn't go with the algorithm.
-        SpecError: A point's values contradict each other or the environment, there are too many trials, something is
-            in a module that is not allowed, trials that are to be packed can't be, or a new sweep searches what can't
-            act.
+        EnvError: The environment isn't registered, can't be made, or doesn't fit the algorithm.
+        SpecError: A point's values contradict each other or the environment, there are too many trials, a class is in
+            a module that is not allowed, trials can't be packed though the sweep asks for it, or a new sweep searches
+            a hyperparameter that can't act.
         CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
     if spec.search.type == "tpe":
@@ -172,7 +172,7 @@ def _num_trials(spec: SweepSpec) -> int:
 
 
 def _points(spec: SweepSpec) -> list[_Point]:
-    """Each point with all its hyperparameters."""
+    """Return each point with all its hyperparameters."""
     return [
         (None, None) if point is None else (point, point_hyperparams(spec, point, index))
         for index, point in enumerate(planned_points(spec))
@@ -182,7 +182,7 @@ def _points(spec: SweepSpec) -> list[_Point]:
 def _trials(
     spec: SweepSpec, env: EnvInfo, points: Sequence[_Point], records: Sequence[TrialRecord]
 ) -> tuple[tuple[TrialPlan, ...], tuple[str, ...]]:
-    """The trials, and the notes on their engines."""
+    """Return the trials, and the notes on their engines."""
     seeds = trial_seeds(spec.seed, len(points) * spec.seeds_per_point)
     trials: list[TrialPlan] = []
     for point_index, (point, values) in enumerate(points):
@@ -215,14 +215,14 @@ def _trials(
 
 
 def _is_packed(trial: TrialPlan) -> bool:
-    """Whether a pack trains it, together with others."""
+    """Whether a pack trains a trial together with others."""
     return engine_named(trial.engine).trains_many
 
 
 def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequence[float]) -> list[TrialToPack]:
-    """Those of the trials that are packed; `memory` is of each point's trials."""
+    """Return the trials that are packed; `memory` is the memory of a trial of each point."""
     members = []
-    # Points that are chosen later have as many sub-environments as the others, or it is not known how many.
+    # Points that are chosen later have equally many sub-environments as the others, or the number is not known.
     fewest_known = min((values.num_envs for _, values in points if values is not None), default=1)
     for trial in to_run:
         if _is_packed(trial):
@@ -234,7 +234,7 @@ def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequ
 
 
 def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]:
-    """For each point the hyperparameters whose trials are the largest it may have."""
+    """Return, for each point, the hyperparameters that its largest trials may have."""
     if spec.scheduler.type == "pbt":
         return [[values, *largest_hyperparams(spec, known)] for values in known]
     unknown = spec.num_samples - len(known) if spec.search.type == "tpe" else 0
@@ -242,7 +242,7 @@ def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]
 
 
 def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], int]) -> list[int]:
-    """The largest measure of each point's; a list that stands for many points is gone through once."""
+    """Return the largest measure for each point; a list that is shared by many points is measured once."""
     known: dict[int, int] = {}
     for values in sizes:
         if id(values) not in known:
@@ -251,10 +251,10 @@ def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], in
 
 
 def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int) -> Hyperparams:
-    """All values of a point's trials, validated.
+    """Return all hyperparameters of a point's trials, validated.
 
     Raises:
-        SpecError: They don't go together.
+        SpecError: The values contradict each other.
     """
     place = _place(spec, point, point_index)
     try:
@@ -283,7 +283,7 @@ def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: in
 
 
 def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int) -> str:
-    """What messages call a point."""
+    """Return what messages call a point."""
     if point is None:
         shown = f"chosen by {spec.search.type}"
     else:
@@ -292,11 +292,10 @@ def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int) -
 
 
 def _max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
-    """How many trials run at once; refuses a trial that would wait for ever."""
+    """Return how many trials run at once; a trial that would wait forever is refused."""
     cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
     _refuse_too_large(spec, machine)
-    # Env runners are placed one by one and may lie on other nodes; the rest of a trial is one process on one
-    # node.
+    # Env runners are placed one by one and may be on other nodes; the rest of a trial is one process on one node.
     whole = cpus if spec.resources.num_env_runners == 0 else 0
     limits = [machine.fitting(whole, gpus), machine.num_cpus // cpus, num_trials]
     if spec.resources.max_concurrent is not None:
@@ -335,7 +334,7 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
 
 
 def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
-    """`concurrent`: trials at once; None: packs hold as many as are wanted, or have a note of their own."""
+    """Return notes on the sweep; `concurrent` is how many trials run at once, or None if packs need no such note."""
     notes = []
     if (
         spec.search.type == "random"

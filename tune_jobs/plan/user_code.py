@@ -1,7 +1,7 @@
-"""A user's own classes in a sweep: an environment or an RLModule, given to a Python call or named as `module:Name`.
+"""Handle a user's own environment or RLModule in a sweep, passed to a Python call or named as `module:Name`.
 
-What a sweep file names is imported only from modules that were allowed (see `policies.envs.modules`). A class that a
-Python call was given is code that runs in this process already, so its module is allowed by that.
+Classes that a sweep file names are imported only from modules that were allowed (see `policies.envs.modules`). The code
+of a class that is passed to a Python call runs in this process already, so passing it allows its module.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ Source = str | Path | Mapping[str, Any] | SweepSpec
 
 
 def load_source(source: Source, overrides: Sequence[str] = (), rl_module: type[Any] | str | None = None) -> SweepSpec:
-    """Read and validate a sweep that a Python call was given, with classes of the caller's own in it.
+    """Read and validate a sweep that was passed to a Python call, possibly with classes of the caller's own.
 
     Args:
         source: In a mapping, `env`, `env.id` and `rl_module` may be classes.
-        overrides: As `load_spec`.
-        rl_module: An RLModule class, or `module:Class` in a module that is allowed by this; None: the source's.
+        overrides: The same as for `load_spec`.
+        rl_module: An RLModule class, or `module:Class`, whose module is allowed by this; None: the source's.
 
     Raises:
-        SpecError: The sweep is wrong, or a class is where no other process finds it.
+        SpecError: The sweep is wrong, or a class is defined where other processes cannot find it.
     """
     if isinstance(source, SweepSpec):
         source = dict(source)
@@ -59,27 +59,27 @@ def _with_names(source: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _env_name(env: Any) -> Any:
-    """A class's name; whatever else it is, it is checked as part of the spec."""
+    """Return a class's name; other values are returned as they are, and checked as part of the spec."""
     if not isinstance(env, type):
         return env
     if not issubclass(env, gym.Env):
         raise SpecError(
-            f"env is the class {env.__qualname__}, which is no gymnasium.Env.",
+            f"env is the class {env.__qualname__}, which is not a gymnasium.Env.",
             "Derive it from gymnasium.Env, or give a Gymnasium id such as 'CartPole-v1'.",
         )
     return path_of(env, "environment")
 
 
 def modules_of(spec: SweepSpec) -> tuple[str, ...]:
-    """The modules of a user's own that a sweep needs: what `sweep.json` allows its trials."""
+    """Return the modules of a user's own that a sweep needs; `sweep.json` allows them for its trials."""
     return tuple(sorted({module for path in (spec.env.id, spec.rl_module or "") if (module := module_of(path))}))
 
 
 def check_rl_module(spec: SweepSpec) -> None:
-    """Check that a sweep's RLModule may be imported and is one.
+    """Check that a sweep's RLModule may be imported and is an RLModule class.
 
     Raises:
-        SpecError: It is not allowed, not there, or none; or the algorithm has no network.
+        SpecError: It is not allowed, not found, or not an RLModule class; or the algorithm has no network.
     """
     if spec.rl_module is None:
         return
@@ -92,10 +92,10 @@ def check_rl_module(spec: SweepSpec) -> None:
         found = import_allowed(spec.rl_module)
     except SpecError as error:
         raise SpecError(f"rl_module is {spec.rl_module}. {error.message}", error.hint) from error
-    # By name, because importing RLlib takes seconds; its checkpoints need a class, not a function that makes one.
+    # Checked by name, because importing RLlib takes seconds. RLlib's checkpoints need a class, not a factory function.
     bases = found.__mro__ if isinstance(found, type) else ()
     if not any(base.__name__ == "RLModule" and base.__module__.startswith("ray.rllib.") for base in bases):
         raise SpecError(
-            f"rl_module is {spec.rl_module}, which is no RLModule class but {found!r}.",
+            f"rl_module is {spec.rl_module}, which is not an RLModule class but {found!r}.",
             "Derive it from RLlib's RLModule, or from one of policies.networks.",
         )

@@ -1,1 +1,1 @@
-"""What a run changes of the process it is in: signals, streams, names of packages."""
+"""Change the process that runs a sweep, and restore it afterwards: signals, streams, package names."""

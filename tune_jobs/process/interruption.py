@@ -1,14 +1,14 @@
-"""Signals while a sweep is launched, resumed or extended: they end it in order, wherever it is.
+"""Handle signals while a sweep is launched, resumed or extended: they end it cleanly at any moment.
 
 Ctrl-C (SIGINT), SIGTERM and a terminal that went away (SIGHUP) mean the same. While trials run, the first one asks
-them to save a checkpoint and stop; the second ends them. Everywhere else the first one ends what is being done. In
-both cases the records are written, Ray is shut down and the locks are freed before `SweepInterrupted` is raised.
+them to save a checkpoint and stop; the second ends them. At any other time the first one ends the present work.
+In both cases the records are written, Ray is shut down and the locks are freed before `SweepInterrupted` is raised.
 
-A SIGHUP is never a second one: for one terminal that goes, a shell and the system may both send it, and who sends
-SIGTERM may send it too. A SIGHUP that this process ignores stays ignored: nohup means it. `ASKED`, by which a process
-asks one that runs a sweep for it, is never a second one either: a terminal's Ctrl-C reaches both.
+A SIGHUP never counts as the second signal: when a terminal goes away, a shell and the system may both send it, and a
+sender of SIGTERM may send it too. If this process ignores SIGHUP, as nohup wants, it stays ignored. `ASKED`, which a
+process sends to another that runs a sweep for it, never counts as the second one either, as Ctrl-C reaches both.
 
-Signals are the main thread's. A sweep that is run for another thread is run in a process of its own.
+Python handles signals in the main thread. A sweep for another thread is run in a process of its own.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interruption:
-    """What signals do at the moment, and whether one came.
+    """Decides what signals do at the moment, and knows whether one came.
 
     Args:
-        has_acted: Whether one ended what was before.
+        has_acted: Whether a signal has ended an earlier part of the run.
     """
 
     def __init__(self, *, has_acted: bool = False) -> None:
         self.came = False
         """Whether a signal came."""
         self._has_acted = has_acted
-        """Whether one asked or raised, and was not only noted."""
+        """Whether a signal had an effect, and was not only noted."""
         self._num_shields = 0
         self._ask: Callable[[], None] | None = None
 
     def take(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 (the signature of a handler)
-        """The handler: ask, note or raise.
+        """Handle a signal: ask the trials to stop, only note it, or raise an error.
 
         Raises:
-            KeyboardInterrupt: Nobody is to be asked (any more), and nothing is under way that must not be cut short.
+            KeyboardInterrupt: There is nothing to ask (any more), and nothing that must not be cut short.
         """
         global _num_taken  # noqa: PLW0603 (a process has one set of handlers)
         _num_taken += 1
@@ -54,7 +54,7 @@ class Interruption:
         is_echo = number in (signal.SIGHUP, ASKED) and self._has_acted
         self._has_acted = True
         if ask is not None:
-            # Nobody is impatient yet: what comes while it is asked was sent together with this one.
+            # Not a second signal: one that comes at this moment was sent together with this one.
             with self.shielded():
                 ask()
         elif not is_echo:
@@ -89,25 +89,25 @@ _num_taken = 0
 
 
 def current() -> Interruption:
-    """Of the sweep that this process runs in its main thread; to other threads no signal comes."""
+    """Return the interruption of the sweep that the main thread runs; other threads get no signals."""
     return _current if _is_main_thread() else Interruption()
 
 
 def can_drive() -> bool:
-    """Whether a sweep can be run here: by the main thread, of a process that runs none.
+    """Whether a sweep can be run here: in the main thread, of a process that runs no other sweep.
 
-    Who runs one owns the process's signals, its standard output and its connection to Ray.
+    A running sweep owns the process's signals, its standard output and its connection to Ray.
     """
     return _is_main_thread() and not _is_driving
 
 
 def num_taken() -> int:
-    """How many signals have come to the sweeps that this process has run in its main thread."""
+    """Return how many signals have come to the sweeps that this process has run in its main thread."""
     return _num_taken
 
 
 def main_thread_was_interrupted() -> bool:
-    """Whether a KeyboardInterrupt that nobody caught has ended the main thread, and the process waits for others."""
+    """Whether an uncaught KeyboardInterrupt has ended the main thread, and the process waits for other threads."""
     ended_by = getattr(sys, "last_type", None)
     return not threading.main_thread().is_alive() and ended_by is not None and issubclass(ended_by, KeyboardInterrupt)
 
@@ -121,11 +121,11 @@ def taking_signals() -> Iterator[Interruption]:
     """Handle this process's signals while the block runs a sweep.
 
     Raises:
-        RuntimeError: `can_drive` says no.
+        RuntimeError: `can_drive` is false.
     """
     global _current, _is_driving
     if not can_drive():
-        raise RuntimeError("A sweep is run by the main thread, of a process that runs no other.")
+        raise RuntimeError("A sweep must be run by the main thread of a process that runs no other sweep.")
     interruption = Interruption()
     try:
         _current, _is_driving = interruption, True
@@ -136,10 +136,10 @@ def taking_signals() -> Iterator[Interruption]:
 
 
 def end_in_order(*more: int) -> None:
-    """From now on let SIGTERM and SIGHUP do what Ctrl-C does: for a program of ours, whatever it is doing.
+    """Let SIGTERM and SIGHUP do what Ctrl-C does from now on, for a program of ours.
 
     Args:
-        more: Further signals that do.
+        more: More signals that shall do the same.
     """
     for number in (*_SIGNALS, *more):
         if not _is_ignored(number):
@@ -147,7 +147,7 @@ def end_in_order(*more: int) -> None:
 
 
 def _take_now(number: int, frame: FrameType | None) -> None:
-    """The handler outside of sweeps: what comes after one may be an echo of what ended it."""
+    """Handle a signal outside of sweeps; one that comes soon after a sweep may be an echo of the one that ended it."""
     _current.take(number, frame)
 
 
@@ -161,7 +161,7 @@ def _handled(interruption: Interruption) -> Iterator[None]:
     try:
         for number in _SIGNALS:
             handler = signal.getsignal(number)
-            # None: it was not set from Python, and could not be set again.
+            # None: the handler was not set from Python, so it could not be restored.
             if handler is not None and not _is_ignored(number):
                 before[number] = handler
                 signal.signal(number, interruption.take)

@@ -1,13 +1,13 @@
-"""`policies` and `analysis` mean the packages beside this one, whatever folders of a user's own have these names.
+"""Make `policies` and `analysis` mean the packages beside this one, even if a user's own folders have these names.
 
 Both names are common in this field. The folder of a script comes first on its path, Ray puts the driver's folders
-first on its workers' paths, and there a user's folder or file of that name would hide ours. A finder before all others
-settles the two names. It is installed when tune_jobs is imported, and each of ours imports tune_jobs first. What
-another process unpickles before anything else must be of a module in tune_jobs, or a user's folder could come first.
+first on its workers' paths, and there a user's folder or file of that name would hide our package. A finder before all
+others decides what the two names mean. It is installed when tune_jobs is imported, and both packages import tune_jobs
+first. What another process unpickles first must be from a module in tune_jobs, or a user's folder could come first.
 
-The user's own stay usable. A submodule that ours does not have is looked for in theirs (`import analysis.my_plots`),
-and so is a name (`from analysis import plot_all`); that is when their `__init__.py` runs, as merely lying on the path
-is no reason to run it.
+The user's own packages stay usable. A submodule that our package does not have is looked for in the user's
+(`import analysis.my_plots`), and so is a name (`from analysis import plot_all`). Only then does the user's
+`__init__.py` run: that it is on the path is no reason to run it.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from types import ModuleType
 from typing import Any
 
 NAMES = ("policies", "analysis")
-# As sys.path and __path__ are: strings.
+# Strings, as in sys.path and __path__.
 _ROOT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))  # noqa: PTH100, PTH118, PTH120
 _INIT = "__init__.py"
 _PYTHONS_OWN = (BuiltinImporter, FrozenImporter, PathFinder)
 _SHARED = ("__all__", "__version__")
 
 _theirs: dict[str, ModuleType] = {}
-"""The user's own package or module of each name, where it was loaded."""
+"""The user's own package or module of each name, if it was loaded."""
 
 
 def install() -> None:
-    """Make the two names mean ours from now on; only the first call does anything.
+    """Make the two names mean our packages from now on; only the first call does anything.
 
     Raises:
-        ImportError: The user's own package has a module that ours has too, and it is already imported.
+        ImportError: A module of the user's own package is already imported, and ours has one of the same name.
     """
     if not any(isinstance(finder, _Names) for finder in sys.meta_path):
         for name in NAMES:
@@ -52,12 +52,12 @@ def install() -> None:
 
 
 def run(path: str, *args: Any) -> Any:
-    """Call what `path`, as `module:function`, names: the beginning of child processes."""
+    """Call the function that `path` names as `module:function`; child processes begin with it."""
     return pkgutil.resolve_name(path)(*args)
 
 
 class _Names:
-    """Finds the packages themselves; first of all finders."""
+    """Finds the two packages; it comes before all other finders."""
 
     def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
         """See `importlib.abc.MetaPathFinder.find_spec`."""
@@ -70,7 +70,7 @@ class _Names:
 
 
 class _Loader(SourceFileLoader):
-    """Loads one of the packages, with the names of the user's own behind it."""
+    """Loads one of the packages, and lets it fall back to the names of the user's own."""
 
     def exec_module(self, module: ModuleType) -> None:
         """See `importlib.abc.Loader.exec_module`."""
@@ -79,7 +79,7 @@ class _Loader(SourceFileLoader):
 
 
 class _TheirSubmodules:
-    """Finds what ours does not have in the user's own; last of all finders, so ours were looked for before."""
+    """Finds submodules of the user's own package; it comes after all other finders, which look in ours."""
 
     def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
         """See `importlib.abc.MetaPathFinder.find_spec`."""
@@ -99,7 +99,7 @@ def _is_ours(spec: ModuleSpec, name: str) -> bool:
 
 
 def _is_folder_of_ours(place: str, name: str) -> bool:
-    """Whether it is this package or another copy of it, such as a checkout; none is a user's own."""
+    """Whether a folder is this package or another copy of it, such as a checkout, and not a user's own."""
     copy = os.path.join(os.path.dirname(place), "tune_jobs", _INIT)  # noqa: PTH118, PTH120
     return os.path.realpath(place) == os.path.realpath(_folder(name)) or os.path.isfile(copy)  # noqa: PTH113
 
@@ -109,12 +109,12 @@ def _places(spec: ModuleSpec) -> Sequence[str]:
 
 
 def _their_specs(name: str) -> Iterator[ModuleSpec]:
-    """The user's own packages and modules of a name, in the order of the path, which may have changed meanwhile."""
+    """Yield the user's own packages and modules of a name, in the present order of the path."""
     for entry in sys.path:
         spec = PathFinder.find_spec(name, [entry or os.getcwd()])  # noqa: PTH109
         if spec is not None and not _is_ours(spec, name):
             yield spec
-    # A project that is installed editable may be found by a finder of its own.
+    # A project in an editable installation may have a finder of its own.
     for finder in sys.meta_path:
         known = finder in (BuiltinImporter, FrozenImporter, PathFinder) or isinstance(
             finder, (_Names, _TheirSubmodules)
@@ -126,7 +126,7 @@ def _their_specs(name: str) -> Iterator[ModuleSpec]:
 
 
 def _modules_in(folder: str) -> dict[str, str]:
-    """The modules and packages in a folder: name -> what it lies in."""
+    """Return the modules and packages in a folder, as a map from name to path."""
     try:
         entries = os.listdir(folder)  # noqa: PTH208
     except OSError:
@@ -139,7 +139,7 @@ def _modules_in(folder: str) -> dict[str, str]:
 
 
 def _folders_of_code(folder: str) -> dict[str, str]:
-    """Folders in a folder that are packages without an `__init__.py`: name -> path."""
+    """Return the packages without an `__init__.py` in a folder, as a map from name to path."""
     try:
         entries = [entry for entry in os.scandir(folder) if entry.is_dir() and entry.name.isidentifier()]
         return {
@@ -156,7 +156,7 @@ def _add_fallback(module: ModuleType) -> None:
 
     def look_in_theirs(attribute: str) -> Any:
         missing = f"module {name!r} has no attribute {attribute!r}"
-        # The import system asks for dunders and for submodules before it loads these: no reason to run their code.
+        # The import system asks for dunders and submodules before it loads them; this is no reason to run their code.
         is_dunder = attribute.startswith("__") and attribute not in _SHARED
         if is_dunder or attribute in _modules_in(_folder(name)):
             raise AttributeError(missing, name=attribute, obj=module)
@@ -171,12 +171,12 @@ def _add_fallback(module: ModuleType) -> None:
 
 
 def _load_theirs(name: str) -> ModuleType | None:
-    """The user's own package or module, executed once under its own name but not in `sys.modules`."""
+    """Load the user's own package or module once, under its own name but not in `sys.modules`."""
     if name not in _theirs:
         spec = next((spec for spec in _their_specs(name) if spec.loader is not None), None)
         if spec is None or spec.loader is None:
             return None
-        # Known before it is executed: its own modules may ask for it meanwhile.
+        # Stored before it is executed, because its own modules may ask for it meanwhile.
         module = _theirs[name] = module_from_spec(spec)
         try:
             spec.loader.exec_module(module)
@@ -196,14 +196,14 @@ def _refuse_loaded_clash(name: str) -> None:
             continue
         raise ImportError(
             f"tune_jobs cannot be imported: it has a module {name}.{submodule}, and {file}, which is imported already, "
-            "has the same name. Rename that file or the folder it lies in.",
+            "has the same name. Rename that file or its folder.",
             name=f"{name}.{submodule}",
             path=file,
         )
 
 
 def _take_over(name: str) -> None:
-    """Put ours in the place of what was imported under its name before."""
+    """Put our package in the place of what was imported under its name before."""
     before = sys.modules.get(name)
     if before is None:
         return
@@ -216,7 +216,7 @@ def _take_over(name: str) -> None:
 
 
 def _warn_of_hidden(name: str) -> None:
-    """Say which modules of the user's own cannot be imported any more; once, not in each process of a sweep."""
+    """Warn of the user's modules that cannot be imported any more; once, not in each process of a sweep."""
     multiprocessing = sys.modules.get("multiprocessing")
     if multiprocessing is not None and multiprocessing.parent_process() is not None:
         return
@@ -231,6 +231,6 @@ def _warn_of_hidden(name: str) -> None:
     if hidden:
         warnings.warn(
             f"tune-jobs has a package {name} too, with modules of the same names as {', '.join(hidden.values())}: "
-            f"`import {name}.{next(iter(hidden))}` gives tune-jobs' own. Rename yours to import them.",
+            f"`import {name}.{next(iter(hidden))}` imports the one of tune-jobs. Rename your modules to import them.",
             stacklevel=4,
         )

@@ -1,6 +1,6 @@
-"""What running a sweep changes of its process, and gives back: the script or notebook around it goes on as before.
+"""Restore what running a sweep changes in its process, so that the script or notebook around it can continue.
 
-Ray and Ray Tune set environment variables, handlers of signals and exceptions, loggers and limits, and leave them.
+Ray and Ray Tune set environment variables, handlers of signals and exceptions, loggers and limits, and leave them so.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ import numpy as np
 from policies.envs.modules import allowed_again
 from policies.standard_streams import standard_streams
 
-# What a user's own module sets when it is imported is not among them: it would not be set again.
+# Variables that a user's own module sets when it is imported are kept, because it is not imported again.
 _VARIABLES = ("RAY_", "TUNE_", "GRPC_", "PYTHONPATH", "PYTHONBREAKPOINT", "SDL_", "PYGAME_HIDE_SUPPORT_PROMPT")
 
 
 @contextlib.contextmanager
 def given_back() -> Iterator[None]:
-    """Give back what the block changes of this process."""
+    """Restore what the block changes in this process."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(standard_streams())
         stack.enter_context(warnings.catch_warnings())
@@ -40,11 +40,11 @@ def given_back() -> Iterator[None]:
 
 
 _before_sweep: dict[str, str] | None = None
-"""Our variables as they were before the sweep that this process runs."""
+"""The variables of Ray and tune-jobs as they were before the sweep that this process runs."""
 
 
 def environment() -> dict[str, str]:
-    """This process's variables, without what the sweep that it runs has changed: for a process that runs another."""
+    """Return this process's environment variables as before its sweep, for a process that runs another sweep."""
     ours, before = _our_variables(), _before_sweep
     if before is None:
         return dict(os.environ)
@@ -89,14 +89,14 @@ def _signal_handlers() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            # None: it was not set from Python, and cannot be set again from there.
+            # None: the handler was not set from Python, so it cannot be restored from Python.
             if handler is not None and signal.getsignal(number) != handler:
                 signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def _loggers() -> Iterator[None]:
-    """Those there are: what importing ray sets up for its own stays, as it would with any import."""
+    """Restore the loggers that exist; what importing ray sets up for its own loggers stays, as with any import."""
     factory = logging.getLogRecordFactory()
     names = [None, *logging.root.manager.loggerDict]
     before = {name: _settings(logging.getLogger(name)) for name in names}
@@ -118,7 +118,7 @@ def _settings(logger: logging.Logger) -> tuple[int, list[logging.Handler], bool,
 
 @contextlib.contextmanager
 def _random_numbers() -> Iterator[None]:
-    """The state of the generators that are everybody's; of torch's only where it is loaded already."""
+    """Restore the state of the global generators; torch's only if torch is already loaded."""
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (other people's)
     torch: Any = sys.modules.get("torch")
     drawn = None if torch is None else (torch.get_rng_state(), torch.get_num_threads())
@@ -135,7 +135,7 @@ def _random_numbers() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _file_limit() -> Iterator[None]:
-    """Ray raises how many files this process, and what it starts, may have open."""
+    """Restore the limit of open files, which Ray raises for this process and its children."""
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
         yield

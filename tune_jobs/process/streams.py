@@ -1,4 +1,4 @@
-"""Standard output and error while a sweep runs: sent to a file, beside a stream to the real standard error."""
+"""Send standard output and error to a file while a sweep runs, and keep a stream to the real standard error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tune_jobs.process.interruption import current
 
 
 class _PatientStream(io.TextIOWrapper):
-    """Drops what cannot be written: its terminal may have gone, or who read it from a pipe, and the sweep goes on."""
+    """Drops what cannot be written, because the terminal or the reader of the pipe is gone; the sweep continues."""
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError):
@@ -32,16 +32,16 @@ class _PatientStream(io.TextIOWrapper):
 
 
 _shown_on: list[_PatientStream] = []
-"""Where standard error leads to, while it is sent to a file."""
+"""The descriptor of the real standard error while number 2 is sent to a file."""
 
 
 def standard_error() -> int:
-    """The descriptor of the real standard error, wherever number 2 leads meanwhile."""
+    """Return the descriptor of the real standard error, also while number 2 is sent to a file."""
     return _shown_on[-1].fileno() if _shown_on else 2
 
 
 def say_at_last(text: str) -> None:
-    """Tell something on the real standard error, from a process that ends now."""
+    """Write a text to the real standard error, in a process that is about to end."""
     for stream in _shown_on[-1:]:
         stream.write(f"{text}\n")
         stream.flush()
@@ -49,7 +49,7 @@ def say_at_last(text: str) -> None:
 
 @contextlib.contextmanager
 def quiet(log: Path) -> Iterator[IO[str]]:
-    """Send standard output and error to a file, C++ included; gives a stream to the real standard error."""
+    """Send standard output and error to a file, those of C++ code too; yields a stream to the real standard error."""
     _flush()
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(open_to_append(log))
@@ -66,7 +66,7 @@ def quiet(log: Path) -> Iterator[IO[str]]:
 
 @contextlib.contextmanager
 def _elsewhere(number: int, file: IO[bytes]) -> Iterator[None]:
-    """Let a descriptor of this process lead to a file."""
+    """Redirect a descriptor of this process to a file."""
     original = os.dup(number)
     try:
         os.dup2(file.fileno(), number)
@@ -79,6 +79,6 @@ def _elsewhere(number: int, file: IO[bytes]) -> Iterator[None]:
 
 def _flush() -> None:
     for stream in (sys.stdout, sys.stderr):
-        # A notebook's need not be files; a terminal's may be gone.
+        # In a notebook these need not be files, and a terminal may be gone.
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

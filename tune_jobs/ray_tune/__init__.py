@@ -1,1 +1,1 @@
-"""Everything that is Ray or Ray Tune."""
+"""Everything that uses Ray Core or Ray Tune."""

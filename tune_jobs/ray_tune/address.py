@@ -1,4 +1,4 @@
-"""Checks a cluster's address before ray is imported, let alone asked: it would retry a dead one for minutes."""
+"""Check a cluster's address before Ray is imported, because Ray would retry a dead one for minutes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _FORMS = "Give `auto`, HOST:PORT (`ray start` prints it) or ray://HOST:PORT, or 
 
 
 def check_address(address: str) -> None:
-    """Check that an address is one, and that something listens there.
+    """Check the form of an address, and that something listens there.
 
     Args:
         address: `auto`, `host:port` or `ray://host:port`.
 
     Raises:
-        SpecError: It has another form.
-        CannotRunError: Nothing listens there; with `auto`: no cluster is known on this machine.
+        SpecError: The address has another form.
+        CannotRunError: Nothing listens there; with `auto`, no cluster is known on this machine.
     """
     where = ""
     if address == "auto":
@@ -40,17 +40,17 @@ def check_address(address: str) -> None:
 
 
 def check_form(address: str) -> None:
-    """Check that an address is one, and ask nobody: what it leads to may not be there yet.
+    """Check only the form of an address, because the cluster may not be there yet.
 
     Raises:
-        SpecError: It has another form than `auto`, `host:port` or `ray://host:port`.
+        SpecError: The address has another form than `auto`, `host:port` or `ray://host:port`.
     """
     if address != "auto":
         _host_and_port(address, "")
 
 
 def recorded_cluster() -> str | None:
-    """The address of the cluster that `ray start` last started or joined on this machine, if it left one."""
+    """Return the address of the cluster that `ray start` last started or joined on this machine, if it is recorded."""
     try:
         return _record_path().read_text(encoding="utf-8").strip() or None
     except OSError:
@@ -58,19 +58,19 @@ def recorded_cluster() -> str | None:
 
 
 def _record_path() -> Path:
-    # Where Ray 2.60 keeps it (ray._common.utils.get_ray_address_file), without importing ray.
+    # The file where Ray 2.60 keeps it (ray._common.utils.get_ray_address_file), found without importing ray.
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"  # noqa: S108 (Ray's own default)
     return Path(folder, "ray", "ray_current_cluster")
 
 
 def _find_cluster() -> tuple[str, str]:
-    """What `auto` means: the address, and the words that say where it comes from."""
+    """Return the address that `auto` means, and words for messages that say where it comes from."""
     address = os.environ.get("RAY_ADDRESS")
     if address:
         return address, " (from RAY_ADDRESS)"
     address = recorded_cluster()
     if address is None:
-        # Ray would now join any Ray it finds among this machine's processes: another sweep's own, which ends with it.
+        # Ray would now join any Ray among this machine's processes, such as that of another sweep, which ends with it.
         raise CannotRunError(
             "No Ray cluster is known on this machine: RAY_ADDRESS is not set, and `ray start` left no address in "
             f"{_record_path()}.",

@@ -1,7 +1,6 @@
-"""Where a sweep runs: this machine, a Ray cluster it is part of, or one it reaches as a Ray client.
+"""Connect to where a sweep runs: this machine, a Ray cluster that it is part of, or one reached as a Ray client.
 
-The same sweep runs on all of them; what differs is how Ray is joined and how it is known that every node reaches the
-storage.
+The same sweep runs on all of them; only joining Ray, and checking that every node reaches the storage, differs.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ from tune_jobs.store.probe import answer
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
-# A node's first process imports torch and RLlib for it, from a disk that may be slow and cold.
+# The first process on a node imports torch and RLlib, from a disk that may be slow and cold.
 _PROBE_TIMEOUT_S = 180.0
 _MAX_JOIN_ATTEMPTS = 4
 _QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
@@ -58,19 +57,19 @@ class Connection:
 
     address: str | None
     is_client: bool
-    """Joined by `ray://`: the trials' driver has to run on the cluster."""
+    """Whether it was joined by `ray://`: then the trials' driver has to run on the cluster."""
     machine: Machine
 
 
 @contextlib.contextmanager
 def connect(address: str | None, machine: Machine | None = None, *, is_users: bool = False) -> Iterator[Connection]:
-    """Join a cluster, or start Ray on this machine, for the time of the block.
+    """Join a cluster, or start Ray on this machine, for the duration of the block.
 
-    A connection that the caller already has is used and kept, if it is to the wanted address or none is given.
+    A connection that the caller already has is used and kept if it is to the wanted address, or if none is given.
 
     Args:
         address: None: this machine; `auto`, `host:port` or `ray://host:port`.
-        machine: What to start Ray with on this machine.
+        machine: The CPUs and GPUs to start Ray with on this machine.
         is_users: Whether the connection stands for one that the caller has in another process.
 
     Raises:
@@ -98,7 +97,7 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
             source = "this machine" if address is None else f"the cluster at {address}"
             yield Connection(address, is_client(), cluster_machine(source))
         finally:
-            # Ray half shut down would be in the way of the next one, and its processes would live on.
+            # A Ray that is shut down only in part would block the next one, and its processes would live on.
             with current().shielded():
                 ray.shutdown()
                 logger.setLevel(level)
@@ -106,10 +105,10 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
 
 @contextlib.contextmanager
 def _keeping_sigterm() -> Iterator[None]:
-    """Let SIGTERM do afterwards, and in the block, what it did before.
+    """Keep the present handler of SIGTERM, in the block and after it.
 
-    Ray 2.60's `init` sets a handler that ends the process at once. And its native code puts another one before Python's
-    (Abseil's, for failures): it calls Python's, and aborts the process 3 s later, whatever that is saving then.
+    Ray 2.60's `init` sets a handler that ends the process at once. Its native code puts another one before Python's
+    (Abseil's, for failures), which calls Python's handler and aborts the process 3 s later, even if that still saves.
     """
     utils = ray._private.utils  # noqa: SLF001 (nothing public keeps it from that)
     original = utils.set_sigterm_handler
@@ -120,19 +119,19 @@ def _keeping_sigterm() -> Iterator[None]:
         utils.set_sigterm_handler = original
         handler = signal.getsignal(signal.SIGTERM)
         if threading.current_thread() is threading.main_thread() and handler is not None:
-            # For Python nothing has changed; it sets what the system calls anew all the same.
+            # Python's handler is the same as before; this still restores the one that the system calls.
             signal.signal(signal.SIGTERM, handler)
             if current().came:
-                # It may have come while theirs was set.
+                # A signal may have come while Ray's handler was set.
                 signal.alarm(0)
 
 
 @contextlib.contextmanager
 def _deaf_to_hangups() -> Iterator[None]:
-    """Processes that are started in the block get no SIGHUP: a terminal that goes sends it to all that run in it.
+    """Let processes that are started in the block ignore SIGHUP, which a closed terminal sends to all its processes.
 
-    Ray 2.60 does so with SIGINT. It would be gone before the trials have saved; here the signal waits for the end of
-    the block.
+    Ray 2.60 does the same with SIGINT. Otherwise Ray would end before the trials have saved. In this process the signal
+    is handled at the end of the block.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
@@ -142,7 +141,7 @@ def _deaf_to_hangups() -> Iterator[None]:
 
 
 def _start(machine: Machine | None) -> None:
-    # A local sweep sends nothing anywhere; who wants Ray's usage statistics sets the variable.
+    # A local sweep sends nothing anywhere; users who want Ray's usage statistics can set the variable.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     provide_token()
     resources: dict[str, Any] = {}
@@ -150,22 +149,22 @@ def _start(machine: Machine | None) -> None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
     try:
         with _finding_own_modules():
-            # "local": a cluster of this sweep's own, even where one happens to run already.
+            # "local": a cluster of this sweep's own, even if another one runs already.
             ray.init(
                 address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
             )
     except Exception as error:
         raise CannotRunError(
             f"Ray cannot be started on this machine: {_first_line(error)}",
-            "See the Ray logs in /tmp/ray/session_latest/logs.",
+            "Look for the cause in Ray's logs in /tmp/ray/session_latest/logs.",
         ) from error
 
 
 @contextlib.contextmanager
 def _finding_own_modules() -> Iterator[None]:
-    """Let the processes that Ray starts find the modules of the user's own where this process found them.
+    """Let the processes that Ray starts find the user's own modules where this process found them.
 
-    Ray itself gives them this process's working directory and the main script's folder, but not the rest of its path.
+    Ray itself passes on this process's working directory and the main script's folder, but not the rest of its path.
     """
     before = os.environ.get("PYTHONPATH")
     folders = [*module_folders(), *([before] if before else [])]
@@ -200,11 +199,11 @@ def _join(address: str) -> None:
             ) from error
     joined = ray.get_runtime_context().gcs_address if address == "auto" else None
     if joined is not None and not os.environ.get("RAY_ADDRESS") and joined != recorded_cluster():
-        # Ray 2.60 prefers a lone cluster among this machine's processes: another sweep's own, which ends with it.
+        # Ray 2.60 prefers a single cluster among this machine's processes, such as another sweep's, which ends with it.
         ray.shutdown()
         raise CannotRunError(
             f"`auto` found the Ray at {joined}, but `ray start` last joined {recorded_cluster()}.",
-            f"Say which with --address, for example --address {recorded_cluster()}.",
+            f"Choose one with --address, for example --address {recorded_cluster()}.",
         )
 
 
@@ -225,10 +224,10 @@ def _first_line(error: Exception) -> str:
 
 
 def check_storage(folder: Path) -> None:
-    """Check, from a worker on every node, that it reads and writes the very folder that is seen here.
+    """Check, by a worker on every node, that the node reads and writes the same folder as this process.
 
     Raises:
-        CannotRunError: A node does not, or has another version of tune-jobs; the message names it.
+        CannotRunError: A node does not, or has another version of tune-jobs; the message names the node.
     """
     with open_sweep(folder).probing() as probe:
         tasks = {}
@@ -242,7 +241,7 @@ def check_storage(folder: Path) -> None:
 
 
 def _answer(place: str, node_id: str) -> tuple[str, str]:
-    """On a node: what is read there of the question, and the version there."""
+    """Run on a node: return what the node reads of the question, and its version of tune-jobs."""
     return answer(place, node_id), version("tune-jobs")
 
 
@@ -259,7 +258,7 @@ def _check_answer(name: str, task: Any, folder: Path, is_same: Callable[[str], b
         cause = getattr(error, "cause", None) or error
         if isinstance(cause, ImportError) or "ModuleNotFoundError" in str(error):
             raise CannotRunError(
-                f"Node {name} has no tune-jobs that works: {_last_line(error)}",
+                f"Node {name} has no working tune-jobs: {_last_line(error)}",
                 "Install the same version on every node, or use its image.",
             ) from error
         if isinstance(cause, FileNotFoundError):

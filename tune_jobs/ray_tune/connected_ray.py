@@ -1,4 +1,4 @@
-"""The Ray that this process is connected to: whose it is, and what it has to run on."""
+"""Tell whose the Ray is that this process is connected to, and which resources it has."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import ray
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 
-# What was just given back is told a little later.
+# Ray reports freed resources a little later.
 _FREED_WITHIN_S = 5.0
 _POLL_INTERVAL_S = 0.1
 _DEFAULT_CLIENT_PORT = "10001"
@@ -25,7 +25,7 @@ _num_of_sweeps = 0
 
 @contextlib.contextmanager
 def of_a_sweep() -> Iterator[None]:
-    """In the block the connection is one that a sweep has made for itself, and not the caller's."""
+    """Mark the connection to Ray in the block as made by a sweep for itself, and not by the caller."""
     global _num_of_sweeps  # noqa: PLW0603 (a process has one connection)
     _num_of_sweeps += 1
     try:
@@ -40,26 +40,26 @@ def is_of_a_sweep() -> bool:
 
 
 def address_for_others() -> str:
-    """Where another process of this machine joins the same Ray."""
+    """Return the address by which another process of this machine joins the same Ray."""
     return f"ray://{_client_address()}" if is_client() else str(ray.get_runtime_context().gcs_address)
 
 
 def is_client() -> bool:
-    """Whether it was joined by `ray://`."""
+    """Whether this process joined Ray by `ray://`."""
     return bool(ray.util.client.ray.is_connected())
 
 
 def alive_nodes() -> list[dict[str, Any]]:
-    """Its nodes, as Ray describes them."""
+    """Return the nodes that are alive, as Ray describes them."""
     return [node for node in ray.nodes() if node["Alive"]]
 
 
 def cluster_machine(source: str) -> Machine:
-    """The CPUs, GPUs and memory of the joined cluster's nodes."""
+    """Return the CPUs, GPUs and memory of the joined cluster's nodes."""
     resources = [node["Resources"] for node in alive_nodes()]
     nodes = tuple((float(node.get("CPU", 0)), float(node.get("GPU", 0))) for node in resources)
     num_cpus = sum(cpus for cpus, _ in nodes)
-    # What a node had free when its Ray started, less the object store.
+    # "memory" is what a node had free when its Ray started, minus the object store.
     shares = [node.get("memory", 0.0) / node["CPU"] for node in resources if node.get("CPU")]
     return Machine(
         num_cpus=num_cpus,
@@ -71,7 +71,7 @@ def cluster_machine(source: str) -> Machine:
 
 
 def connected_machine() -> Machine:
-    """What is free of a Ray that the caller had joined or started: its own actors hold the rest, and may for ever."""
+    """Return what is free in a Ray that the caller joined or started; the caller's actors may keep the rest forever."""
     machine = cluster_machine("the Ray that this process is connected to")
     machine = replace(machine, more="connect to one that has more, or free what is in use")
     if is_client():
@@ -90,7 +90,7 @@ def connected_machine() -> Machine:
 
 
 def _free() -> tuple[tuple[float, float], ...]:
-    """CPUs and GPUs that nobody holds, node by node."""
+    """Return the free CPUs and GPUs, node by node."""
     known = ray._private.state.available_resources_per_node()  # noqa: SLF001 (what is public adds all nodes up)
     left = [known.get(node["NodeID"], {}) for node in alive_nodes()]
     return tuple((float(node.get("CPU", 0)), float(node.get("GPU", 0))) for node in left)
@@ -100,10 +100,10 @@ def check_connected_to(address: str | None) -> None:
     """Check that the Ray which this process is connected to is the wanted one.
 
     Args:
-        address: As `cluster.connect`; None and `auto` want no certain one.
+        address: The same as for `cluster.connect`; None and `auto` accept any.
 
     Raises:
-        CannotRunError: It is another one.
+        CannotRunError: The process is connected to another Ray.
     """
     if address is None or address == "auto":
         return
@@ -122,7 +122,7 @@ def _client_address() -> str:
 
 
 def _is_same(wanted: str, connected: str) -> bool:
-    """Whether two `host:port` are one, under whichever of its names the host is called."""
+    """Whether two `host:port` are the same, even if the host is called by different names."""
     (host, _, port), (other_host, _, other_port) = wanted.rpartition(":"), connected.rpartition(":")
     if port != other_port:
         return False
@@ -137,7 +137,7 @@ def _numbers_of(host: str) -> set[str]:
 
 
 def _are_here(numbers: set[str]) -> bool:
-    """Whether one of these addresses is this machine's: only such a one can be bound."""
+    """Whether one of these addresses is this machine's, as only those can be bound."""
     for number in numbers:
         family = socket.AF_INET6 if ":" in number else socket.AF_INET
         with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:

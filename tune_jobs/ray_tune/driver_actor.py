@@ -1,8 +1,8 @@
-"""The driver of a sweep as an actor on the cluster: for clients that join by `ray://`.
+"""Run a sweep's driver as an actor on the cluster, for clients that join by `ray://`.
 
 A Ray client cannot run Ray Tune's loop itself. The actor runs it and writes the records to the shared storage; the
-client asks it for what has changed, and shows the same table. The client holds the sweep's lock, the actor its driver
-lock: when a client is killed, Ray ends the actor only half a minute later, and nobody may resume the sweep before.
+client asks it for changes, and shows the same table. The client holds the sweep's lock and the actor its driver lock:
+when a client is killed, Ray ends the actor only half a minute later, and until then the sweep must not be resumed.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.record_keeper import Listener
 
 _POLL_INTERVAL_S = 0.5
-# A little of a resource that only the head has: nodes come and go, and the sweep would end with the actor's.
+# A little of a resource that only the head node has: other nodes may leave, and the sweep would end with them.
 _ON_THE_HEAD = {"node:__internal_head__": 0.001}
 
 
 class RemoteDriver:
-    """Runs one job; its two methods are called at the same time."""
+    """The actor: it runs one job; `run` and `changes` are called at the same time."""
 
     def __init__(self) -> None:
         self._changed: dict[str, TrialRecord] = {}
@@ -47,14 +47,14 @@ class RemoteDriver:
             self._changed[record.trial_id] = record
 
     def changes(self) -> list[TrialRecord]:
-        """The records that changed since the last call."""
+        """Return the records that changed since the last call."""
         with self._lock:
             changed, self._changed = self._changed, {}
         return list(changed.values())
 
 
 def run_trials_remotely(job: RunJob, listener: Listener) -> None:
-    """As `run_trials.run_trials`, with the loop in an actor on the joined cluster.
+    """Do what `run_trials.run_trials` does, with the loop in an actor on the joined cluster.
 
     Raises:
         CannotRunError: The actor or the connection to the cluster was lost.
@@ -65,7 +65,7 @@ def run_trials_remotely(job: RunJob, listener: Listener) -> None:
         ended = False
         while not ended:
             time.sleep(_POLL_INTERVAL_S)
-            # Asked before the changes are fetched, so that the last ones are not missed.
+            # Asked before the changes are fetched, so that the last changes are not missed.
             ended = bool(ray.wait([running], timeout=0)[0])
             for record in ray.get(driver.changes.remote()):
                 listener(record)
@@ -74,7 +74,7 @@ def run_trials_remotely(job: RunJob, listener: Listener) -> None:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise CannotRunError(
             f"The sweep's driver on the cluster was lost: {reason}",
-            f"What is done is kept; go on with `tune-jobs resume {job.sweep_folder}`, once the cluster is well.",
+            f"What is done is kept; continue with `tune-jobs resume {job.sweep_folder}` once the cluster works again.",
         ) from error
     finally:
         with contextlib.suppress(Exception):

@@ -1,10 +1,10 @@
-"""Early stopping by Ray Tune's schedulers, on evaluation returns at numbers of env steps.
+"""Stop trials early by Ray Tune's schedulers, which compare evaluation returns at numbers of env steps.
 
-A trial reports about once a second so that the table moves, but only reports with a fresh evaluation may be compared:
-the others repeat an old score at a new number of steps.
+A trial reports about once a second so that the live table is current, but only reports with a new evaluation may be
+compared: the others repeat an old score at a new number of steps.
 
-ASHA and median stopping look at one trial at a time: `RayRule` asks them, for packs and for Tune alike. HyperBand
-pauses trials and lets them go on in Tune's own controller: it is Tune's scheduler itself, and packs have none of it.
+ASHA and median stopping look at one trial at a time: `RayRule` asks them, both for packs and for single trials.
+HyperBand pauses and unpauses trials in Tune's controller, so Tune's own scheduler is used, and packs cannot use it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ray.tune.schedulers import (
     MedianStoppingRule,
     TrialScheduler,
 )
+from typing_extensions import override
 
 from tune_jobs.ray_tune.scheduling import (
     WORST_SCORE,
@@ -45,7 +46,7 @@ def is_unscored(score: float) -> bool:
 
 @dataclass(frozen=True)
 class _Named:
-    """All that Ray's rules ask of a trial: what it is called; and whether it runs, of one that waits."""
+    """The attributes of a trial that Ray's rules read: its id and its status."""
 
     trial_id: str
     status: str = Trial.RUNNING
@@ -53,12 +54,12 @@ class _Named:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """All that Ray's rules ask of Tune's controller: median stopping, which trials wait for a place."""
+    """The part of Tune's controller that Ray's rules read: median stopping asks which trials wait for a place."""
 
     others: Others
 
     def get_live_trials(self) -> list[_Named]:
-        """One that waits stands for all of them: Ray's rule counts none."""
+        """Return one waiting trial if any waits, because Ray's rule does not count them."""
         return [_Named("", Trial.PENDING)] if self.others.wait() else []
 
 
@@ -70,13 +71,13 @@ _DECISIONS = {
 
 
 class RayRule:
-    """One of Ray's rules that look at one trial at a time, as a `Scheduler`; no private member of Ray is used.
+    """A `Scheduler` by one of Ray's rules that look at one trial at a time; no private member of Ray is used.
 
-    A trial whose evaluation is not a finite number is ended at its first after the grace period. Losing every
-    comparison is not enough: the first trial to get somewhere is compared with none.
+    A trial whose evaluation is not a finite number is ended at its first evaluation after the grace period. That it
+    loses every comparison is not enough, because the first trial to reach a rung is compared with none.
 
     Args:
-        rule: Ray's, which compares `score` at `num_env_steps`.
+        rule: Ray's rule, which compares `score` at `num_env_steps`.
         grace_env_steps: Env steps before which no trial is ended.
     """
 
@@ -85,11 +86,11 @@ class RayRule:
         self._grace_env_steps = grace_env_steps
 
     def begins(self, trial_id: str) -> None:
-        """See `Scheduler.begins`."""
+        """Tell Ray's rule of a new trial."""
         self._rule.on_trial_add(None, _Named(trial_id))
 
     def reached(self, standing: Standing, others: Others) -> Decision:
-        """See `Scheduler.reached`."""
+        """Decide by Ray's rule, if the trial has a new evaluation."""
         if not standing.evaluated:
             return Decision.GO_ON
         if is_unscored(standing.score) and standing.num_env_steps >= self._grace_env_steps:
@@ -98,98 +99,98 @@ class RayRule:
         return _DECISIONS[told]
 
     def ended(self, standing: Standing) -> None:
-        """See `Scheduler.ended`."""
+        """Tell Ray's rule of a trial's end."""
         self._rule.on_trial_complete(None, _Named(standing.trial_id), _result(standing))
 
 
 def _result(standing: Standing) -> dict[str, Any]:
-    """What a trial reached, as Ray's rules read it."""
+    """Return a trial's standing in the form that Ray's rules read."""
     return {"num_env_steps": standing.num_env_steps, METRIC: standing.score}
 
 
 class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
-    """Lets Ray Tune ask a `Scheduler`; trials begin in their order.
+    """Connects a `Scheduler` to Ray Tune; trials begin in their order.
 
     Args:
-        scheduler: Decides.
+        scheduler: The scheduler that decides.
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
         super().__init__()
         self.scheduler = scheduler
 
-    def on_trial_add(self, tune_controller: TuneController, trial: Trial) -> None:  # noqa: ARG002 (Tune's signature)
-        """See `TrialScheduler`."""
+    @override
+    def on_trial_add(self, tune_controller: TuneController, trial: Trial) -> None:
         self.scheduler.begins(name_of(trial))
 
+    @override
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
-        """See `TrialScheduler`."""
         decision = self.scheduler.reached(standing_of(trial, result), OfTune(tune_controller))
-        # Who copies pauses the copying trial, which `PopulationScheduler` does.
+        # Copying needs the trial to be paused, which `PopulationScheduler` does.
         assert decision in _DECISIONS.values()
         return str(next(theirs for theirs, ours in _DECISIONS.items() if ours is decision))
 
+    @override
     def on_trial_complete(
         self,
-        tune_controller: TuneController,  # noqa: ARG002 (Tune's signature)
+        tune_controller: TuneController,
         trial: Trial,
         result: dict[str, Any],
     ) -> None:
-        """See `TrialScheduler`."""
-        # One that is ended before its first report has reached nothing to be compared with.
+        # A trial that ends before its first report has no standing.
         if METRIC in result:
             self.scheduler.ended(standing_of(trial, result))
 
 
 @dataclass(frozen=True)
 class OfTune:
-    """The trials of Tune's controller; see `Others`."""
+    """The other trials, as Tune's controller knows them; implements `Others`."""
 
     controller: TuneController
 
     def wait(self) -> bool:
-        """See `Others.wait`."""
+        """Whether a trial waits for a place."""
         return any(trial.status in (Trial.PENDING, Trial.PAUSED) for trial in self.controller.get_live_trials())
 
     def ended(self) -> set[str]:
-        """See `Others.ended`."""
+        """Return the ids of the trials that have ended."""
         return {name_of(trial) for trial in self.controller.get_trials() if trial.is_finished()}
 
 
 def name_of(trial: Trial) -> str:
-    """What we call a trial of Tune's."""
+    """Return our id of one of Tune's trials."""
     return str(trial.config["trial_id"])
 
 
 def standing_of(trial: Trial, result: dict[str, Any]) -> Standing:
-    """What a trial has reached by its report."""
+    """Return a trial's standing by its report."""
     return Standing(name_of(trial), result["num_env_steps"], result[METRIC], bool(result.get("evaluated")))
 
 
 class EvaluationHyperBand(HyperBandScheduler):  # type: ignore[misc]
-    """HyperBand (Li et al. 2018), with the bracket that ends most trials first, as there.
+    """HyperBand (Li et al. 2018), which begins with the bracket that ends the most trials, as in the paper.
 
-    Ray begins with the one that ends none, and small sweeps never come to another; there is no setting for it (2.60).
-    So three private members are used: `_create_bracket`, which is asked for the bracket of a position; `_s_max_1`, how
-    many there are; `_get_r0`, a bracket's first milestone, which may not be 0.
+    Ray begins with the bracket that ends none, and small sweeps never reach another; there is no setting for it (2.60).
+    So three private members are used: `_create_bracket`, which makes the bracket at a position; `_s_max_1`, the number
+    of brackets; and `_get_r0`, a bracket's first milestone, which must not be 0.
 
     Args:
         grace_env_steps: Env steps before which no trial is ended.
-        settings: Of Ray's HyperBand.
+        settings: The settings of Ray's HyperBand.
     """
 
     def __init__(self, grace_env_steps: int, **settings: Any) -> None:
         super().__init__(**settings)
         self._grace_env_steps = grace_env_steps
         milestone = vars(self)["_get_r0"]
-        # Rounded down it may be 0, before a trial's first evaluation.
+        # Rounded down, it may be 0, which is before a trial's first evaluation.
         self._get_r0 = lambda num_halvings: max(1, milestone(num_halvings))
 
     def _create_bracket(self, position: int) -> Any:
         return super()._create_bracket(self._s_max_1 - 1 - position)
 
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
-        """See `TrialScheduler`, and `RayRule` for what becomes of trials without a score."""
+        """Decide what a trial does next; one without a finite score is ended, as by `RayRule`."""
         if not result.get("evaluated"):
             return str(TrialScheduler.CONTINUE)
         unscored = is_unscored(result.get(METRIC, WORST_SCORE))
@@ -199,24 +200,24 @@ class EvaluationHyperBand(HyperBandScheduler):  # type: ignore[misc]
 
 
 def grace_env_steps(spec: SchedulerSpec, max_env_steps: int) -> int:
-    """Env steps before which no trial is ended: the given number, or 1/20 of the cap."""
+    """Return the env steps before which no trial is ended: the given number, or 1/20 of the cap."""
     return spec.grace_env_steps if spec.grace_env_steps is not None else max(1, max_env_steps // 20)
 
 
 def waits_for_others(spec: SchedulerSpec) -> bool:
-    """Whether the scheduler pauses trials until others have come as far.
+    """Whether the scheduler pauses trials until others have reached the same number of env steps.
 
-    Tune counts paused trials as running ones: `max_concurrent_trials` would keep the others from ever starting, and the
-    scheduler would compare only those few.
+    Tune counts paused trials as running: with `max_concurrent_trials`, the others would never start, and the scheduler
+    would compare only those few.
     """
     return spec.type in ("hyperband", "pbt")
 
 
 def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
-    """The scheduler of a sweep whose trials do not wait for each other.
+    """Return the scheduler of a sweep whose trials do not wait for each other.
 
     Args:
-        spec: Its settings.
+        spec: The scheduler's settings.
         max_env_steps: The cap of a trial, `stop.num_env_steps`.
     """
     grace = grace_env_steps(spec, max_env_steps)
@@ -231,11 +232,11 @@ def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
         return RayRule(MedianStoppingRule(grace_period=grace, **common), grace)
     if spec.type == "none":
         return EveryoneGoesOn()
-    raise ValueError(f"{spec.type} pauses trials: it is Ray Tune's own.")
+    raise ValueError(f"{spec.type} pauses trials, so Ray Tune's own scheduler has to be used.")
 
 
 def build_tune_scheduler(spec: SchedulerSpec, max_env_steps: int) -> TrialScheduler:
-    """The same for Ray Tune, and HyperBand too; see `build_scheduler`."""
+    """Return the scheduler in the form that Ray Tune takes, also for HyperBand; see `build_scheduler`."""
     if spec.type != "hyperband":
         return TuneScheduler(build_scheduler(spec, max_env_steps))
     grace = grace_env_steps(spec, max_env_steps)
@@ -244,9 +245,9 @@ def build_tune_scheduler(spec: SchedulerSpec, max_env_steps: int) -> TrialSchedu
         time_attr="grace_periods",
         metric=METRIC,
         mode="max",
-        # Its brackets count in units of the grace period: in env steps they would want 50,000 trials for 50,000 steps.
+        # Its brackets count in grace periods: counted in env steps, they would need 50,000 trials for 50,000 steps.
         max_t=max(1, math.ceil(max_env_steps / grace)),
         reduction_factor=spec.reduction_factor,
-        # The last ones end by the stop rules; milestones are rounded down, and would end them before the cap.
+        # The last trials end by the stop rules: milestones are rounded down, and would end them before the cap.
         stop_last_trials=False,
     )

@@ -1,4 +1,4 @@
-"""What Ray and Ray Tune read from the environment; a module of its own, so that setting it imports neither."""
+"""Set the environment variables of Ray and Ray Tune; this module imports neither."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 
 _TRIAL_CLEANUP_S = 5
 _ENVIRONMENT = {
-    # The driver has its own handler, which lets trials save a checkpoint first.
+    # The driver has its own signal handler, which lets trials save a checkpoint first.
     "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_FORCE_TRIAL_CLEANUP_S": str(_TRIAL_CLEANUP_S),
     "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",
-    # Tune's state is never read back: saving it every ten seconds would only cost.
+    # Tune's state is never read back, so saving it every ten seconds would be a waste.
     "TUNE_GLOBAL_CHECKPOINT_S": "3600",
     "RAY_AIR_NEW_OUTPUT": "0",
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
@@ -22,15 +22,15 @@ _ENVIRONMENT = {
 
 
 def prepare_environment() -> None:
-    """Set what Ray Tune reads from the environment; before Ray starts, so that its workers inherit it."""
+    """Set the variables that Ray Tune reads; call it before Ray starts, so that its workers inherit them."""
     os.environ.update(_ENVIRONMENT)
 
 
 def provide_token() -> None:
-    """Let a Ray that is started here have a token where it could keep none; before Ray starts.
+    """Give a Ray that is started here a token if it could not store one; call it before Ray starts.
 
-    Ray 2.60 makes one in `~/.ray` for all that it starts, and fails where the home folder can't be written, or the
-    user has none, as in many containers.
+    Ray 2.60 stores one in `~/.ray`, and fails if the home folder can't be written or does not exist, as in many
+    containers.
     """
     if any(os.environ.get(name) for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
         return
@@ -48,5 +48,5 @@ def provide_token() -> None:
 
 @functools.cache
 def _own_token() -> str:
-    """One for all sweeps of this process: Ray reads a token once."""
+    """Return one token for all sweeps of this process, because Ray reads a token only once."""
     return secrets.token_hex(32)

@@ -1,12 +1,12 @@
-"""Who trains in which pack: hands out trials, ends those that the scheduler ends, and takes up what a dead pack left.
+"""Assign trials to packs, end those that the scheduler ends, and restart the members of a pack that died.
 
-Ray Tune's trials are the packs here. Tune calls its scheduler with a pack's reports before it lets the pack go on, so
-what is decided then acts in the pack's very next step. The sweep's own scheduler (`tune_jobs.ray_tune.scheduling`)
+For Ray Tune, each pack is one trial. Tune calls its scheduler with a pack's reports before it lets the pack continue,
+so a decision takes effect in the pack's next step. The sweep's own scheduler (`tune_jobs.ray_tune.scheduling`)
 compares the members, whichever pack they are in.
 
-A pack whose process died is started again, and its members go on from their latest checkpoints. One of them may be what
-ends the process: a member that was in a pack that died twice goes on alone, and only what it does alone counts against
-its retries.
+A pack whose process died is started again, and its members go on from their latest checkpoints. One of them may be
+the cause: a member that was twice in a pack that died continues alone, and only its failures alone count against its
+retries.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ray.tune.experiment import Trial
 
 _DEATHS_IN_COMPANY = 2
-"""A member that was in so many packs when they died goes on alone."""
+"""How many times a member may be in a pack that dies before it continues alone."""
 
 
 class _Pack:
@@ -41,12 +41,12 @@ class _Pack:
         self.files = files
         self.members: dict[str, None] = {}
         self.ending: set[str] = set()
-        """Members that the scheduler has ended, and the pack lets go before it trains on."""
+        """Members that the scheduler has ended; the pack removes them before it trains on."""
         self.is_up = False
 
     @property
     def staying(self) -> tuple[str, ...]:
-        """Those that it trains on with."""
+        """The members that the pack keeps training."""
         return tuple(trial_id for trial_id in self.members if trial_id not in self.ending)
 
 
@@ -55,12 +55,12 @@ class PackDriver:
 
     Args:
         store: The sweep.
-        spec: Its spec.
-        plan: How many packs, and how many trials in each at once.
-        trial_ids: The trials to run, in the order in which they are handed out.
-        scheduler: Compares them and ends the worse.
+        spec: The sweep's spec.
+        plan: The number of packs, and how many trials each trains at once.
+        trial_ids: The trials to run, in the order in which they are assigned.
+        scheduler: Compares the trials and ends the worse.
         keeper: Keeps their records.
-        choose: Called with a trial that is handed out, to choose its point; None: all points are known.
+        choose: Called with a trial that is being assigned, to choose its point; None: all points are known.
     """
 
     def __init__(
@@ -88,12 +88,12 @@ class PackDriver:
         num_packs = min(plan.num_packs, len(trial_ids))
         self._packs = {f"p{i:02d}": _Pack(store.pack(f"p{i:02d}")) for i in range(num_packs)}
         for index, pack in enumerate(self._packs.values()):
-            # Fewer than there is room for are spread evenly.
+            # If there are fewer trials than room, they are spread evenly.
             self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))
             self._write(pack)
 
     def __getstate__(self) -> dict[str, Any]:
-        # As `RecordKeeper`: Tune's pickle of it is never read back.
+        # As for `RecordKeeper`, Tune's pickle of this object is never read back.
         return {}
 
     @property
@@ -103,23 +103,23 @@ class PackDriver:
 
     @property
     def is_finished(self) -> bool:
-        """Whether there is nothing to do any more."""
-        # As long as somebody waits, no pack is empty, unless the sweep is asked to stop.
+        """Whether there is nothing left to do."""
+        # As long as trials wait, no pack is empty, unless the sweep is asked to stop.
         return not any(pack.members for pack in self._packs.values())
 
     def log_tail(self, pack_id: str) -> str:
-        """The end of what a pack's process printed."""
+        """Return the end of a pack's log."""
         return self._packs[pack_id].files.log_tail()
 
     def started(self, pack_id: str) -> None:
-        """A pack's process runs."""
+        """Note that a pack's process runs."""
         pack = self._packs[pack_id]
         pack.is_up = True
         for trial_id in pack.members:
             self._keeper.started(trial_id)
 
     def take(self, pack_id: str, reports: Sequence[MemberReport], *, node: str, pid: int) -> bool:
-        """Take a pack's reports and decide what it does next; returns whether there is nothing to do for it."""
+        """Take a pack's reports and decide what it does next; return whether it has nothing left to do."""
         pack = self._packs[pack_id]
         for report in reports:
             if report.progress is not None:
@@ -133,7 +133,7 @@ class PackDriver:
         return not pack.members
 
     def died(self, pack_id: str, error: str) -> None:
-        """A pack's process died, or what concerns no single member went wrong; it is started again."""
+        """Handle the death of a pack's process, or an error of no single member; the pack is started again."""
         pack = self._packs[pack_id]
         pack.is_up = False
         in_company = len(pack.members) > 1
@@ -155,14 +155,14 @@ class PackDriver:
         self._write(pack)
 
     def lost(self, pack_id: str) -> None:
-        """A pack's process ended because another one is the pack: no failure of its members; it is started again."""
+        """Handle the end of a process that lost its pack to another one: no member has failed; it is started again."""
         pack = self._packs[pack_id]
         pack.is_up = False
         for trial_id in pack.members:
             self._keeper.lost(trial_id)
 
     def closed(self, pack_id: str) -> None:
-        """Tune has ended a pack: it has nothing to do, or the sweep stops and it did not save in time."""
+        """Handle a pack that Tune has ended: it has nothing to do, or the sweep stops and it did not save in time."""
         pack = self._packs[pack_id]
         pack.is_up = False
         for trial_id in list(pack.members):
@@ -185,7 +185,7 @@ class PackDriver:
         self._leave(pack, trial_id)
 
     def _failed(self, pack: _Pack, report: MemberReport) -> None:
-        """A member failed by itself; unless it is over, the pack has opened it again."""
+        """Handle the failure of a single member; unless it is not retried, the pack has opened it again."""
         trial_id = report.trial_id
         if trial_id in pack.ending:
             self._stopped(pack, trial_id)
@@ -198,7 +198,7 @@ class PackDriver:
             self._keeper.started(trial_id)
 
     def _lost(self, pack: _Pack, trial_id: str) -> None:
-        """A pack has let a member go that another process took up: no failure, and what that one did is on disk."""
+        """Handle a member that another process took over: it has not failed, and that process's results are on disk."""
         if trial_id in pack.ending:
             self._stopped(pack, trial_id)
             return
@@ -207,7 +207,7 @@ class PackDriver:
         self._waiting.append(trial_id)
 
     def _stopped(self, pack: _Pack, trial_id: str) -> None:
-        """A member that was to be ended is gone without a word: its checkpoints are those on disk."""
+        """Handle a member that was to be ended and is gone without a report: its checkpoints are those on disk."""
         checkpoints = candidates(self._store.trial(trial_id))
         self._keeper.change(trial_id, lambda record: transitions.with_checkpoints(record, checkpoints))
         self._keeper.ended(trial_id)
@@ -218,7 +218,7 @@ class PackDriver:
         pack.ending.discard(trial_id)
 
     def _fill(self, pack: _Pack, num_members: int) -> None:
-        """Give a pack further trials; one that is to go on alone only if it is empty, and nobody else with it."""
+        """Assign more trials to a pack; a trial that has to run alone is assigned only to an empty pack."""
         if self._store.stop_requested():
             return
         staying = pack.staying
@@ -248,7 +248,7 @@ class PackDriver:
 
 
 class PackScheduler(FIFOScheduler):  # type: ignore[misc]
-    """Lets Tune ask the driver what a pack does next."""
+    """The Tune scheduler that asks the driver of the packs what a pack does next."""
 
     def __init__(self, driver: PackDriver) -> None:
         super().__init__()
@@ -260,7 +260,7 @@ class PackScheduler(FIFOScheduler):  # type: ignore[misc]
         trial: Trial,
         result: dict[str, Any],
     ) -> str:
-        """Hand the reports on; see `TrialScheduler`."""
+        """Pass the reports to the driver, and return its decision."""
         is_done = self._driver.take(
             str(trial.config["pack_id"]), result["reports"], node=result["node"], pid=result["pid"]
         )

@@ -1,7 +1,7 @@
 """The Ray Tune Trainable of a pack: one process that trains many trials at once, for as long as there are any.
 
-Tune gives it a sweep folder and a pack id. Whom to train it reads from its assignment before every step; what to
-train is in the sweep folder, so a pack that is started again goes on from what its members left there.
+Tune gives it a sweep folder and a pack id. It reads which trials to train from its assignment before every step; the
+trials themselves are in the sweep folder, so a pack that is started again continues from what its members left there.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
     """Runs a pack; `config` holds `sweep_folder`, `pack_id`, `engine`, `env_kind` and `num_env_processes`."""
 
     def setup(self, config: dict[str, Any]) -> None:
-        """Remember the pack; it is built in the first step, so that every error comes from there."""
+        """Remember the pack; it is built in the first step, so that every error is raised there."""
         self._config = config
         self._files = open_sweep(Path(config["sweep_folder"])).pack(config["pack_id"])
         run = owner_of_run(config)
@@ -56,10 +56,10 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         self._node = this_node()
 
     def step(self) -> dict[str, Any]:
-        """Let go who is to end, take in who is new, and train until there is something to decide.
+        """Remove members that shall end, add new ones, and train until there is something to decide.
 
         Raises:
-            Exception: What concerns no single member; it is in the pack's log too.
+            Exception: An error of no single member; it is in the pack's log too.
         """
         try:
             if self._loop is None:
@@ -69,18 +69,18 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         except Exception:
             traceback.print_exc()
             raise
-        # When there is nothing left to do is the driver's decision.
+        # The driver decides when there is nothing left to do.
         return {"done": False, "reports": reports, "node": self._node}
 
     def make_engine(self) -> PackEngine:
-        """The engine of this pack."""
+        """Make the engine of this pack."""
         config = self._config
         return make_pack_engine(
             config["engine"], env_kind=config["env_kind"], num_env_processes=config["num_env_processes"]
         )
 
     def evaluate(self, evaluator: Evaluator, policies: Sequence[Policy]) -> Sequence[Episodes | Exception]:
-        """Greedy episodes of each policy, or why there are none."""
+        """Return the greedy episodes of each policy, or the error that prevented them."""
         from policies.packed.evaluation import evaluate_many
 
         return evaluate_many(evaluator, policies)
@@ -104,10 +104,10 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         )
 
     def _arrange(self, loop: PackLoop) -> None:
-        """Make the members those that are assigned.
+        """Add and remove members so that they are those assigned.
 
         Raises:
-            OwnershipLostError: Another process is this pack by now, and reads the same assignment.
+            OwnershipLostError: Another process runs this pack by now, and reads the same assignment.
         """
         self._owner.check()
         assignment = self._files.read()
@@ -119,7 +119,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
                 loop.add(self._reader.read(trial_id), assignment.num_failures.get(trial_id, 0))
 
     def cleanup(self) -> None:
-        """Free everything; the process may end."""
+        """Free everything, as the process may end."""
         if self._engine is not None:
             self._engine.close()
         if self._evaluator is not None:

@@ -1,8 +1,8 @@
-"""Population based training (Jaderberg et al. 2017): who goes on from whom, and how Ray Tune lets them.
+"""Population based training (Jaderberg et al. 2017), and how it is done with Ray Tune's trials.
 
-Every so many env steps a trial is compared with the others. One of the worst goes on from a copy of the latest
-checkpoint of one of the best, with the better one's searched values mutated. What changed is written into the trial's
-record before anything acts on it, so a sweep that is killed goes on with it.
+At regular numbers of env steps a trial is compared with the others. One of the worst continues from a copy of the
+latest checkpoint of one of the best, with mutated values of the better one. The change is written into the trial's
+record before it takes effect, so that a sweep that is killed continues with it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
+from typing_extensions import override
 
 from analysis.records import ChangeRecord, TrialRecord
 from policies import random_streams
@@ -42,25 +43,25 @@ Change = Callable[[str, Callable[[TrialRecord], TrialRecord]], None]
 
 @dataclass
 class _Compared:
-    """Where a trial stood when it was compared last."""
+    """A trial's standing when it was compared last."""
 
     num_env_steps: int
-    """When that was."""
+    """Env steps of the last comparison."""
     due_from: int
-    """Env steps from which the interval to the next time counts."""
+    """Env steps from which the interval to the next comparison counts."""
     score: float | None
-    """None: it never was."""
+    """The score of the last comparison; None: there was none."""
 
 
 class Population:
-    """The comparing, as a `Scheduler`; the rule is that of Ray Tune's `PopulationBasedTraining`, but for two things.
+    """A `Scheduler` with the rule of Ray Tune's `PopulationBasedTraining`, except for two things.
 
-    A trial is copied from only if it is better, and may be at its very first comparison: in Ray's way, after it was
-    compared a second time, as one of the best.
+    A trial is copied from only if it is better, and already at its first comparison. Ray copies from a trial only after
+    it was compared a second time as one of the best.
 
     Args:
         spec: The sweep.
-        read: The newest record of a trial.
+        read: Returns the newest record of a trial.
     """
 
     def __init__(self, spec: SweepSpec, read: ReadRecord) -> None:
@@ -69,18 +70,18 @@ class Population:
         self._members: dict[str, _Compared] = {}
 
     def begins(self, trial_id: str) -> None:
-        """Take a trial into the population, at the place it has by its record: a resumed one is half-way."""
+        """Add a trial to the population, with the env steps of its record, as a resumed trial has some already."""
         record, interval = self._read(trial_id), self._spec.perturb_every_env_steps
         score = WORST_SCORE if record.evaluation_return is None else record.evaluation_return
         steps = record.num_env_steps
         self._members[trial_id] = _Compared(steps, steps // interval * interval, score if steps else None)
 
     def compared_at(self, trial_id: str) -> int:
-        """Env steps at which a trial was compared last; where it began, if it never was."""
+        """Return the env steps at which a trial was compared last, or at which it began if it never was."""
         return self._members[trial_id].num_env_steps
 
     def reached(self, standing: Standing, others: Others) -> Decision | CopyFrom:
-        """See `Scheduler.reached`."""
+        """Compare a trial with the others when its interval is over, and copy a better one if it is among the worst."""
         member, steps = self._members[standing.trial_id], standing.num_env_steps
         if not standing.evaluated or steps - member.due_from < self._spec.perturb_every_env_steps:
             return Decision.GO_ON
@@ -96,10 +97,10 @@ class Population:
         return CopyFrom(chosen, self._mutated(self._read(chosen).point, rng))
 
     def ended(self, standing: Standing) -> None:
-        """See `Scheduler.ended`: who has ended, failed ones too, the others tell."""
+        """Do nothing: `Others` tells which trials have ended, including those that failed."""
 
     def _quantiles(self, others: Others) -> tuple[list[str], list[str]]:
-        """The worst and the best of those that run and have a score; none of a population of one."""
+        """Return the worst and the best of the running trials that have a score; none in a population of one."""
         ended = others.ended()
         known = {name: member for name, member in self._members.items() if name not in ended and _is_scored(member)}
         ranked = sorted(known, key=lambda name: _score(known[name]))
@@ -107,7 +108,7 @@ class Population:
         return ranked[:size], ranked[len(ranked) - size :]
 
     def _mutated(self, point: dict[str, Any], rng: Any) -> dict[str, Any]:
-        """A mutation whose values go together; the point itself if none is found."""
+        """Return a mutation whose values are valid together, or the point itself if none is found."""
         for _ in range(_ATTEMPTS):
             mutated = mutate(point, self._spec.space, rng, self._spec.scheduler.resample_probability)
             try:
@@ -128,16 +129,16 @@ def _is_scored(member: _Compared) -> bool:
 
 
 class PopulationScheduler(TuneScheduler):
-    """Does with Ray Tune's trials what a `Population` decides; those that wait and are least far go first.
+    """Applies the decisions of a `Population` to Ray Tune's trials, and lets those with the fewest env steps go first.
 
-    Two private members of Ray are used (2.60). `_schedule_trial_save` has a running trial save, and gives a pointer of
-    Tune's to what it will have saved. `_latest_checkpoint_result` is what a paused trial's next start is given; without
-    it Tune would start the trial from nothing. Ray's own scheduler uses both, and there is no public way to either.
+    Two private members of Ray are used (2.60). `_schedule_trial_save` makes a running trial save, and returns Tune's
+    pointer to the checkpoint. `_latest_checkpoint_result` is passed to a paused trial's next start; without it Tune
+    would start the trial from nothing. Ray's own scheduler uses both, and there is no public way to either.
 
     Args:
         spec: The sweep.
-        store: Its folder.
-        read: The newest record of a trial.
+        store: The sweep's files.
+        read: Returns the newest record of a trial.
         change: Changes a trial's record, on disk too.
     """
 
@@ -149,10 +150,10 @@ class PopulationScheduler(TuneScheduler):
         self._read = read
         self._change = change
         self._saved: dict[str, Any] = {}
-        """Tune's pointer to what a trial saved at its last comparison, or what will be one."""
+        """Tune's pointer to what each trial saved at its last comparison, or a future of it."""
 
+    @override
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
-        """See `TrialScheduler`."""
         others = OfTune(tune_controller)
         decision = self._population.reached(standing_of(trial, result), others)
         if decision is Decision.GO_ON:
@@ -165,24 +166,24 @@ class PopulationScheduler(TuneScheduler):
                 _LOG.warning("%s goes on as it is: %s", name_of(trial), error)
             else:
                 return str(TrialScheduler.NOOP)
-        # Saved by the trial's process before it trains on.
+        # The trial's process saves it before it trains on.
         self._saved[name_of(trial)] = tune_controller._schedule_trial_save(trial, result=result)  # noqa: SLF001
         return str(TrialScheduler.PAUSE if gives_way else TrialScheduler.CONTINUE)
 
+    @override
     def choose_trial_to_run(self, tune_controller: TuneController) -> Trial | None:
-        """See `TrialScheduler`."""
         waiting = [trial for trial in tune_controller.get_trials() if trial.status in (Trial.PENDING, Trial.PAUSED)]
         return min(waiting, key=lambda trial: self._population.compared_at(name_of(trial)), default=None)
 
     def _take_over(self, trial: Trial, decision: CopyFrom, result: dict[str, Any], controller: TuneController) -> None:
-        """Let a trial go on from a copy of a better one's checkpoint.
+        """Let a trial continue from a copy of a better one's checkpoint.
 
         Raises:
-            CheckpointError: The better one has none, or it is damaged.
+            CheckpointError: The better one has no checkpoint, or a damaged one.
         """
         pointer = self._pointer(decision.trial_id)
         record = self._read(name_of(trial))
-        # The record is of the report before this one: Tune asks its scheduler first.
+        # The record is that of the previous report, because Tune asks its scheduler first.
         iteration, num_env_steps = result["progress/num_iterations"], result["num_env_steps"]
         copied = copy_latest_checkpoint(
             self._store.trial(decision.trial_id), self._store.trial(record.trial_id), iteration
@@ -197,13 +198,13 @@ class PopulationScheduler(TuneScheduler):
             time=time.time(),
         )
         hyperparams = point_hyperparams(self._spec, decision.point, record.point_index).model_dump(mode="json")
-        # This makes the copy count; see tune_jobs.store.copies.
+        # This makes the copy take effect; see tune_jobs.store.copies.
         self._change(record.trial_id, lambda known: with_change(known, entry, hyperparams))
         controller.pause_trial(trial, should_checkpoint=False)
         trial.run_metadata.checkpoint_manager._latest_checkpoint_result = pointer  # noqa: SLF001
 
     def _pointer(self, trial_id: str) -> Any:
-        """Tune's pointer to what a trial saved at its last comparison.
+        """Return Tune's pointer to what a trial saved at its last comparison.
 
         Raises:
             CheckpointError: It has not saved anything since.

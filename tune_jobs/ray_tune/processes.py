@@ -1,4 +1,4 @@
-"""The processes of the Ray that a sweep runs on: none is left if it does not start, and a dead one is noticed."""
+"""Watch the processes of Ray: end them if Ray does not start, and notice when one has died."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from policies.errors import CannotRunError
 from tune_jobs.process.interruption import current
 
 _CONNECT_TIMEOUT_S = 5.0
-# A control process that a cluster's operator starts again may take a little. Ray 2.60 ends a process that has not
-# reached it for a minute, whatever that process still wants to save.
+# A cluster's operator may need a while to restart the control process. Ray 2.60 ends a process that has not reached
+# it for a minute, even if that process still has to save.
 _OWN_GRACE_S, _CLUSTER_GRACE_S = 4.0, 15.0
 
-# Who is told so leaves the block at once, unless it waits in a native call that only Ray could end.
+# A block that is told so is left at once, unless it waits in a native call that only Ray could end.
 _STUCK_S = 20.0
 
 _CONTROL, _RAYLET = "control process (GCS)", "process on this node (raylet)"
@@ -33,7 +33,7 @@ _CONTROL, _RAYLET = "control process (GCS)", "process on this node (raylet)"
 
 @contextlib.contextmanager
 def ending_if_it_fails() -> Iterator[None]:
-    """If the block fails, end the processes of Ray that it started: a Ray that is not up yet does not do it."""
+    """If the block fails, end the processes of Ray that it started; a Ray that is not up yet does not end them."""
     before = _children_of_ray()
     try:
         yield
@@ -47,7 +47,7 @@ def ending_if_it_fails() -> Iterator[None]:
 
 
 def _children_of_ray() -> set[int]:
-    """The ids of this process's children that run a program of Ray's."""
+    """Return the ids of this process's children that run one of Ray's programs."""
     programs = str(Path(ray.__file__).parent)
     found = set()
     for listing in Path("/proc/self/task").glob("*/children"):
@@ -60,19 +60,20 @@ def _children_of_ray() -> set[int]:
 
 
 class RayDiedError(BaseException):
-    """A part of Ray is gone; no Exception, or Ray Tune would tidy up first, and wait for Ray in that."""
+    """A part of Ray is gone. It is not an Exception, because Ray Tune would clean up after one, and wait for Ray."""
 
 
 def ray_died(sweep: str, death: RayDiedError) -> CannotRunError:
-    """What is told of it.
+    """Return the error that reports the death of a part of Ray.
 
     Args:
         sweep: The sweep's name.
-        death: What died.
+        death: The part that died.
     """
     return CannotRunError(
-        f"Ray's {death} died, or does not answer any more: no trial can be run on it.",
-        f"Did the machine run out of memory? What is done is kept; go on with `tune-jobs resume {shlex.quote(sweep)}`.",
+        f"Ray's {death} died, or does not answer any more, so no trial can run on it.",
+        "Check whether the machine ran out of memory. What is done is kept; continue with "
+        f"`tune-jobs resume {shlex.quote(sweep)}`.",
     )
 
 
@@ -80,10 +81,10 @@ class RayWatch:
     """Notices in the background that a part of Ray does not answer any more; a context manager.
 
     Args:
-        probes: Whether a part answers, by its name.
-        grace_s: After so many seconds without an answer it is dead.
-        clock: Seconds, monotonic.
-        stuck_s: After so many more the block is stuck.
+        probes: For each part's name, a function that says whether the part answers.
+        grace_s: Seconds without an answer after which a part is dead.
+        clock: A monotonic clock, in seconds.
+        stuck_s: Seconds after that after which the block counts as stuck.
     """
 
     def __init__(
@@ -98,12 +99,12 @@ class RayWatch:
         self._dead: str | None = None
         self._over = threading.Event()
         self.when_stuck: Callable[[RayDiedError], None] | None = None
-        """Called in the background if the block goes on though a part is dead: Ray would end the process soon."""
+        """Called in the background if the block is stuck although a part is dead, as Ray would end the process soon."""
         self._thread = threading.Thread(target=self._run, name="tune-jobs-ray-watch", daemon=True)
 
     @classmethod
     def of_this_process(cls) -> RayWatch:
-        """A watch over the Ray that this process is connected to."""
+        """Return a watch over the Ray that this process is connected to."""
         host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
         control = (host.strip("[]"), int(port))
         probes = {_CONTROL: lambda: _answers(socket.AF_INET6 if ":" in host else socket.AF_INET, control)}
@@ -117,7 +118,7 @@ class RayWatch:
         return cls(probes, _CLUSTER_GRACE_S)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tune pickles who asks it into a file that is never read back here; threads can't be.
+        # Tune pickles the users of this object into a file that is never read back; threads can't be pickled.
         return {}
 
     def __enter__(self) -> Self:
@@ -128,22 +129,22 @@ class RayWatch:
         self._over.set()
 
     def check(self) -> None:
-        """Go on if Ray lives.
+        """Raise an error unless Ray is alive.
 
         Raises:
-            RayDiedError: It does not; the error names what died.
+            RayDiedError: It is not alive; the error names what died.
         """
         if self._dead is not None:
             raise RayDiedError(self._dead)
 
     def check_after(self, failure: BaseException | None) -> None:
-        """Find out whether something failed because a part of Ray died; if one is silent, wait until that is certain.
+        """Find out whether the death of a part of Ray caused a failure; if one is silent, wait until that is certain.
 
         Args:
-            failure: What was raised; what came from a trial itself is none of Ray's.
+            failure: The error that was raised; an error of a trial itself is not caused by Ray.
 
         Raises:
-            RayDiedError: It did.
+            RayDiedError: A part of Ray died.
         """
         if isinstance(failure, RayTaskError):
             return
@@ -154,7 +155,7 @@ class RayWatch:
         self.check()
 
     def look(self) -> None:
-        """Ask each part."""
+        """Ask each part whether it answers."""
         for name, answers in self._probes.items():
             if answers():
                 self._silent_since.pop(name, None)
@@ -162,7 +163,7 @@ class RayWatch:
                 self._dead = name
 
     def _run(self) -> None:
-        # Not more often: a raylet writes a line into its log whenever somebody asks and leaves.
+        # Not more often, because a raylet writes a line into its log for each such connection.
         while self._dead is None and not self._over.wait(self._grace_s / 4):
             self.look()
         if self._dead is not None and not self._over.wait(self._stuck_s) and self.when_stuck is not None:

@@ -1,11 +1,11 @@
-"""A small process beside a driver that started Ray: it ends what Ray leaves behind when the driver is killed.
+"""A small process beside a driver that started Ray; it ends what Ray leaves behind when the driver is killed.
 
-Most of Ray's processes end at once with the driver, by the kernel's doing. The two agents that a raylet starts do not:
-Ray 2.60 lets them tell the control process (GCS) first, which has gone too, and they try for a minute. This process
-reads a pipe that the driver alone holds open, notes meanwhile whom the driver's raylet has started, and when the pipe
-is closed it kills those of them that still run.
+The kernel ends most of Ray's processes together with the driver, but not the two agents that a raylet starts: in Ray
+2.60 they first try for a minute to reach the control process (GCS), which is gone too. This process reads a pipe that
+only the driver holds open. Meanwhile it notes which processes the driver's raylet has started, and when the pipe is
+closed, it kills those that still run.
 
-Run by its path, so that it loads nothing but what it needs.
+It is run by its path, so that it loads nothing else of this package.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from pathlib import Path
 
 _RAYLET = "raylet"
 _NUM_AGENTS = 2
-# Until the agents are there, and after that: trials' processes come and go.
+# The first is used until the agents run, the second afterwards, as trials' processes come and go.
 _EAGER_S, _INTERVAL_S = 0.1, 1.0
 _PATIENCE_S = 10.0
 
 
 @contextlib.contextmanager
 def reaping() -> Iterator[None]:
-    """Have what the block's Ray started ended if this process is killed in the block, and after the block."""
+    """End what the block's Ray started, after the block or if this process is killed in it."""
     if sys.platform != "linux":
         yield
         return
-    # A session of its own: what a terminal or a shell sends to the driver's group must not reach it.
+    # A session of its own, so that signals to the driver's process group do not reach it.
     process = subprocess.Popen(  # noqa: S603 (this very file)
         [sys.executable, "-I", "-S", str(Path(__file__))],
         stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
@@ -55,7 +55,7 @@ def _children(pid: int) -> list[int]:
 
 
 def _started(pid: int) -> str:
-    """When a process started; empty if it has ended."""
+    """Return when a process started; empty if it has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -72,7 +72,7 @@ def _is_raylet(pid: int) -> bool:
 
 
 def _watch(driver: int) -> dict[int, str]:
-    """Whom the driver's raylets have started, and when, once the driver has closed the pipe."""
+    """Wait until the driver has closed the pipe, and return what its raylets have started, and when."""
     known: dict[int, str] = {}
     while True:
         now = {child: _started(child) for pid in _children(driver) if _is_raylet(pid) for child in _children(pid)}
@@ -85,13 +85,13 @@ def _watch(driver: int) -> dict[int, str]:
 
 
 def _call_this_process(name: str) -> None:
-    """For who looks at the processes of this machine and wonders."""
+    """Name this process, for people who look at the processes of this machine."""
     with contextlib.suppress(OSError):
         Path("/proc/self/comm").write_text(name, encoding="ascii")
 
 
 def main() -> None:
-    """Wait for the driver's end, then end what it left."""
+    """Wait for the driver's end, then end what it left behind."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     for pid, started in _watch(os.getppid()).items():

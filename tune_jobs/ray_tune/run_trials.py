@@ -1,4 +1,4 @@
-"""Runs a sweep's trials with Ray Tune, and keeps their records up to date.
+"""Run a sweep's trials with Ray Tune, and keep their records up to date.
 
 Tune decides which trial runs where and when; what a trial is and how far it got is in the sweep folder, written here
 (their records) and by the trials' own processes. Tune's own folder is a cache that every run begins anew.
@@ -41,13 +41,13 @@ from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 
-# How long running trials may take to save a checkpoint once they were asked to stop; then they are ended.
+# How long running trials may take to save a checkpoint after they were asked to stop, before they are ended.
 STOP_GRACE_S = 20.0
 
 
 @dataclass(frozen=True)
 class RunJob:
-    """What to run."""
+    """The trials that a run has to run."""
 
     sweep_folder: Path
     trial_ids: tuple[str, ...]
@@ -55,16 +55,16 @@ class RunJob:
     gpus_per_trial: float
     max_concurrent: int
     packs: PackPlan | None = None
-    """How those of its trials are run that are packed; None: none is."""
+    """How the packed trials are run; None: no trial is packed."""
     run: str | None = None
-    """The token of the run, as `Owner` has it; None: the job takes the sweep up itself."""
+    """The run's token, as in `Owner`; None: the job makes one."""
 
 
 def run_trials(job: RunJob, listener: Listener) -> None:
-    """Run these trials to their end, or until the sweep is asked to stop. Failed trials raise nothing.
+    """Run trials to their end, or until the sweep is asked to stop. Failed trials raise no error.
 
     Args:
-        job: What to run; Ray must be connected.
+        job: The trials to run; this process must be connected to Ray.
         listener: Called with a trial's record whenever it changes, in this thread.
 
     Raises:
@@ -87,13 +87,13 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         try:
             if packed:
                 run.packs(packed)
-            # One after the other: a pack uses all the CPUs it is given all the time.
+            # Packs first, then single trials, because a pack uses all its CPUs all the time.
             if others and not (packed and store.stop_requested()):
                 run.single_trials(others)
         except (RayDiedError, Exception) as error:
             if isinstance(error, RayDiedError):
                 raise ray_died(store.name, error) from error
-            # What Ray raises when a part of it is gone says little of it.
+            # Errors that Ray raises when a part of it is gone do not name the cause.
             try:
                 watch.check_after(error)
             except RayDiedError as death:
@@ -106,13 +106,13 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 
 
 class _Run:
-    """Trials in packs and single ones, which have their records, their scheduler and their points in common."""
+    """A run of packed and single trials, which share their records, their scheduler and the choice of points."""
 
     def __init__(self, job: RunJob, store: Sweep, listener: Listener, owner: Ownership, watch: RayWatch) -> None:
         self._job = job
         self._watch = watch
         self._store = self.store = store
-        # What each process is told: which sweep, for which run, and who is gone when it is to end.
+        # The settings of every process: its sweep, its run, and the driver with which it ends.
         self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
         self._spec = stored_spec(store.read_record())
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
@@ -126,10 +126,10 @@ class _Run:
         return build_tune_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
 
     def packs(self, trial_ids: Sequence[str]) -> None:
-        """Run trials in packs; Tune's trials are the packs."""
+        """Run trials in packs; for Tune, each pack is one trial."""
         plan = self._job.packs
         assert plan is not None
-        # One that waits for others goes with no pack; the single trials after these are compared with them.
+        # A scheduler that makes trials wait is never used with packs; single trials are compared with the packed ones.
         assert isinstance(self._scheduler, TuneScheduler)
         choose = None if self._chooser is None else self._chooser.prepare
         rule = self._scheduler.scheduler
@@ -141,7 +141,7 @@ class _Run:
             param_space={
                 **self._config,
                 "pack_id": tune.grid_search(list(driver.pack_ids)),
-                # Packs of a sweep are all of one engine: its members' records name it.
+                # All packs of a sweep have the same engine, which the members' records name.
                 "engine": self.keeper.record(trial_ids[0]).engine,
                 "env_kind": plan.env_kind,
                 "num_env_processes": plan.num_env_processes,
@@ -149,12 +149,12 @@ class _Run:
             tune_config=tune.TuneConfig(
                 scheduler=PackScheduler(driver), trial_name_creator=_pack_id, trial_dirname_creator=_pack_id
             ),
-            # The driver decides which of a dead pack's trials are tried again, and the run ends when none is left.
+            # The driver decides which of a dead pack's trials are retried, and the run ends when none is left.
             run_config=self._run_config("packs", events, -1, lambda: driver.is_finished),
         ).fit()
 
     def single_trials(self, trial_ids: Sequence[str]) -> None:
-        """Run trials one by one, as many at once as fit."""
+        """Run single trials, as many at once as fit."""
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
         events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch)
@@ -170,7 +170,7 @@ class _Run:
                 search_alg=searcher,
                 num_samples=1 if searcher is None else len(trial_ids),
                 scheduler=self._scheduler,
-                # Without it Tune runs one trial at a time where there is a searcher.
+                # Without this setting Tune runs one trial at a time if there is a searcher.
                 max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
                 reuse_actors=True,
                 trial_name_creator=_trial_id,
@@ -203,7 +203,7 @@ def _pack_id(trial: Trial) -> str:
 
 
 def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
-    """One bundle for the trial's process, one for each env runner; together `cpus_per_trial`."""
+    """Return one bundle for the trial's process and one for each env runner; together they have `cpus_per_trial`."""
     num_runners = spec.resources.num_env_runners
     main = {"CPU": job.cpus_per_trial - num_runners}
     if job.gpus_per_trial:
@@ -212,7 +212,7 @@ def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
 
 
 class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
-    """Ends the run when there is nothing to do, or once the running trials have saved, or took too long to."""
+    """Ends the run when nothing is left to do, or when it is asked to stop and trials have saved or took too long."""
 
     def __init__(self, store: Sweep, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch) -> None:
         self._watch = watch
@@ -225,10 +225,10 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         return False
 
     def stop_all(self) -> bool:
-        """Whether to end the run now; Tune asks all the time.
+        """Whether to end the run now; Tune asks this continually.
 
         Raises:
-            RayDiedError: It can't go on.
+            RayDiedError: A part of Ray is gone.
         """
         self._watch.check()
         if self._is_finished():
@@ -250,7 +250,7 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         self._watch = watch
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """A process took the trial."""
+        """Note that a process has begun the trial."""
         self._keeper.started(_trial_id(trial))
 
     def on_trial_result(
@@ -261,12 +261,12 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         result: dict[str, Any],
         **info: Any,
     ) -> None:
-        """A report, about once a second and after each evaluation."""
+        """Take a trial's report, which comes about once a second and after each evaluation."""
         progress = Progress.model_validate(result["progress"])
         self._keeper.progressed(_trial_id(trial), progress, node=result["node"], pid=result["pid"])
 
     def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
-        """Schedulers pause trials and tell no one; a paused trial has saved its checkpoint and needs no waiting for."""
+        """Note paused trials, which schedulers do not report; they have saved and need not be waited for."""
         for trial in trials:
             trial_id = _trial_id(trial)
             if trial.status == Trial.PAUSED and trial_id in self._keeper.running:
@@ -274,15 +274,15 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         self._keeper.flush()
 
     def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Tune is done with the trial: its own end, the scheduler's decision, or the end of the run."""
+        """Note a trial's end: its own, the scheduler's decision, or the end of the run."""
         self._keeper.ended(_trial_id(trial))
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """A failure that will be retried."""
+        """Note a failure that will be retried."""
         self._failed(trial, retried=True)
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """A failure that will not."""
+        """Note a failure that will not be retried."""
         self._failed(trial, retried=False)
 
     def _failed(self, trial: Trial, *, retried: bool) -> None:
@@ -300,7 +300,7 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
 
 
 class _PackEvents(tune.Callback):  # type: ignore[misc]
-    """Tells the driver of the packs what becomes of their processes."""
+    """Tells the driver of the packs what happens to their processes."""
 
     def __init__(self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
         self._watch = watch
@@ -309,7 +309,7 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
         self._timeout_s = timeout_s
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """The pack's process runs."""
+        """Note that the pack's process runs."""
         self._driver.started(_pack_id(trial))
 
     def on_trial_result(
@@ -320,19 +320,19 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
         result: dict[str, Any],
         **info: Any,
     ) -> None:
-        """Nothing: the scheduler has taken it; Tune need not keep it."""
+        """Drop the report, which the scheduler has taken, so that Tune does not keep it."""
         del result["reports"]
 
     def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
-        """The packs have been told to go on: time for what they need not wait for."""
+        """Do the work that packs need not wait for, now that they continue."""
         self._keeper.flush()
 
     def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """No process for the pack any more: it has nothing to do, or the run ends."""
+        """Note the end of the pack's process: it has nothing to do, or the run ends."""
         self._driver.closed(_pack_id(trial))
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """The pack's process died; Tune starts another one."""
+        """Note that the pack's process died; Tune starts another one."""
         pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), _error_of(trial)
         if _was_lost(error):
             self._driver.lost(pack_id)
@@ -341,7 +341,7 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
         self._driver.died(pack_id, describe_failure(error, tail, timeout_s=self._timeout_s, what="pack"))
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """It died too often."""
+        """Note that the pack's process died too often."""
         self.on_trial_recover(iteration, trials, trial)
         self._driver.closed(_pack_id(trial))
 
@@ -350,9 +350,9 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
 
 
 def _give_up(run: _Run, death: RayDiedError) -> None:
-    """Save, and end this process: its main thread waits for Ray, which would end it in less than a minute.
+    """Save the records and end this process, whose main thread waits for Ray; Ray would end it within a minute.
 
-    In the background, as the main thread can't; that one changes nothing meanwhile.
+    This is done in the background because the main thread is blocked, so it cannot change anything meanwhile.
     """
     from tune_jobs.store.closing import end_process
 
@@ -361,7 +361,7 @@ def _give_up(run: _Run, death: RayDiedError) -> None:
 
 
 def _error_of(trial: Trial) -> BaseException | None:
-    # Trial.get_pickled_error looks where Tune syncs to, and nothing has been synced yet; this is where it writes.
+    # Trial.get_pickled_error looks where Tune syncs to, but nothing has been synced yet; Tune writes the error here.
     path = trial.pickled_error_file
     if not path or not Path(path).is_file():
         return None
@@ -370,18 +370,18 @@ def _error_of(trial: Trial) -> BaseException | None:
 
 
 def _was_lost(error: BaseException | None) -> bool:
-    """Whether a process ended because another one has what it worked on: no failure of a trial."""
+    """Whether a process ended because another one took over its work, which is no failure of a trial."""
     return isinstance(getattr(error, "cause", None), OwnershipLostError)
 
 
 def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float, what: str = "trial") -> str:
-    """What made a trial or a pack fail, in a line, and the end of its log.
+    """Describe why a trial or a pack failed, in one line, followed by the end of its log.
 
     Args:
-        error: What Ray Tune tells.
-        tail: Of the log, as `logs.log_tail` gives it.
+        error: The error that Ray Tune reports.
+        tail: The end of the log, from `logs.log_tail`.
         timeout_s: The sweep's `iteration_timeout_s`.
-        what: Whose process it was.
+        what: What the process ran, a trial or a pack.
     """
     if isinstance(error, RayTaskError):
         cause = error.cause if isinstance(error.cause, BaseException) else error

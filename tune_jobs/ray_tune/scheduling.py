@@ -1,7 +1,7 @@
-"""What becomes of trials, by what they reached: the question that packs and Ray Tune ask, and who answers it.
+"""The protocol of schedulers, which decide by the trials' results which of them continue.
 
-A *scheduler* here knows trials by their names, and of each what it reached. It knows nothing of processes, of Ray
-Tune's trials and of its controller, so that the same one decides for members of packs and for single trials.
+A *scheduler* here knows trials by their ids, and what each has reached. It knows nothing of processes or of Ray Tune's
+trials and controller, so that the same scheduler decides for members of packs and for single trials.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any, Protocol
 from tune_jobs.store.progress import Progress
 
 WORST_SCORE = -1e300
-"""Of an evaluation that is not a finite number: it must lose every comparison, and NaN loses none (`nan < cutoff` is
-False)."""
+"""The score for an evaluation that is not a finite number: it must lose every comparison, but NaN loses none, since
+`nan < cutoff` is False."""
 
 
 @dataclass(frozen=True)
@@ -25,63 +25,63 @@ class Standing:
     trial_id: str
     num_env_steps: int
     score: float
-    """Its newest evaluation return; `WORST_SCORE`: that is not a finite number, or there is none."""
+    """Its newest evaluation return, or `WORST_SCORE` if that is not a finite number or there is none."""
     evaluated: bool
-    """Whether the evaluation is of this very moment: an older score says nothing of so many env steps."""
+    """Whether the evaluation was made at `num_env_steps`; an older score says nothing about this number of steps."""
 
     @classmethod
     def of(cls, trial_id: str, progress: Progress) -> Standing:
-        """Of a trial, by its progress."""
+        """Return a trial's standing by its progress."""
         return cls(trial_id, progress.num_env_steps, score_of(progress), progress.evaluated)
 
 
 def score_of(progress: Progress) -> float:
-    """What a trial is compared by."""
+    """Return the score that a trial is compared by."""
     return WORST_SCORE if progress.evaluation_return is None else progress.evaluation_return
 
 
 class Decision(Enum):
-    """What becomes of a trial that has told what it reached."""
+    """What a trial does after its report."""
 
     GO_ON = "go on"
     STOP = "stop"
     GIVE_WAY = "give way"
-    """It goes on when those had a place that wait for one."""
+    """It pauses, and continues after the trials that wait for a place."""
     SAVE = "save"
-    """It saves and goes on: others may be told to go on from it."""
+    """It saves and continues: other trials may be told to continue from its checkpoint."""
 
 
 @dataclass(frozen=True)
 class CopyFrom:
-    """It goes on from a copy of another's latest checkpoint, with other values."""
+    """The decision that a trial continues from a copy of another's latest checkpoint, with other values."""
 
     trial_id: str
-    """The other."""
+    """The trial to copy from."""
     point: dict[str, Any]
-    """The searched values it goes on with."""
+    """The searched values that the trial continues with."""
 
 
 class Others(Protocol):
-    """What a scheduler may ask of the trials beside the one that tells."""
+    """What a scheduler may ask about the trials other than the one that reports."""
 
     def wait(self) -> bool:
-        """Whether any of them waits for a place that this one could give up."""
+        """Whether any of them waits for a place, which the reporting trial could give up."""
         ...
 
     def ended(self) -> Collection[str]:
-        """Those that have ended by now, however they did."""
+        """Return the trials that have ended by now, for whatever reason."""
         ...
 
 
 class NobodyWaits:
-    """In packs: places there are not given up for others, and no scheduler there asks who has ended."""
+    """The other trials of a member of a pack, where places are not given up and no scheduler asks what has ended."""
 
     def wait(self) -> bool:
-        """See `Others.wait`."""
+        """Return False: no place is given up for another trial."""
         return False
 
     def ended(self) -> Collection[str]:
-        """See `Others.ended`."""
+        """Return nothing, because no scheduler asks this in packs."""
         return ()
 
 
@@ -89,15 +89,15 @@ class Scheduler(Protocol):
     """Compares trials, and decides which of them go on."""
 
     def begins(self, trial_id: str) -> None:
-        """A trial will run: once, before anything else is told of it."""
+        """Note that a trial will run; it is called once per trial, before any other call about it."""
         ...
 
     def reached(self, standing: Standing, others: Others) -> Decision | CopyFrom:
-        """What becomes of a trial that runs, now that it has reached so much."""
+        """Decide what a running trial does next, by what it has reached."""
         ...
 
     def ended(self, standing: Standing) -> None:
-        """A trial ended there, by itself or because it was to stop: once, and nothing is told of it afterwards."""
+        """Note that a trial ended, by itself or because it was stopped; this is the last call for a trial."""
         ...
 
 
@@ -105,11 +105,11 @@ class EveryoneGoesOn:
     """The scheduler of a sweep that compares no trials; see `Scheduler`."""
 
     def begins(self, trial_id: str) -> None:
-        """See `Scheduler.begins`."""
+        """Do nothing, because trials are not compared."""
 
     def reached(self, standing: Standing, others: Others) -> Decision:  # noqa: ARG002 (it compares nothing)
-        """See `Scheduler.reached`."""
+        """Let every trial continue."""
         return Decision.GO_ON
 
     def ended(self, standing: Standing) -> None:
-        """See `Scheduler.ended`."""
+        """Do nothing, because trials are not compared."""

@@ -1,4 +1,4 @@
-"""Points chosen when a trial starts, and a Ray Tune searcher that starts a sweep's trials one by one."""
+"""Choose points when trials start, and a Ray Tune searcher that starts a sweep's trials one by one."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tune_jobs.store.transitions import begun, with_point
 
 
 class PointChooser:
-    """Chooses the points of trials that have none, when they are about to start, and of the other seeds of the point.
+    """Chooses the point of a trial that has none when it is about to start, also for the other seeds of that point.
 
     Args:
         spec: The sweep.
-        records: All records of the sweep, newest.
+        records: Returns the newest records of all trials.
         change: Changes a trial's record, on disk too.
     """
 
@@ -37,13 +37,13 @@ class PointChooser:
         self._change = change
 
     def prepare(self, name: str) -> None:
-        """See to it that a trial has a point; it starts now.
+        """Ensure that a trial, which is about to start, has a point.
 
         Raises:
-            SpecError: No valid point is found.
+            SpecError: No valid point was found.
         """
         self._given.add(name)
-        # A trial that was given to a process runs, though it may not have reported so.
+        # A trial that was given to a process counts as running, though it may not have reported yet.
         records = [
             begun(record, time.time()) if record.status == "pending" and record.trial_id in self._given else record
             for record in self._records()
@@ -56,7 +56,7 @@ class PointChooser:
         spec = self._spec
         known = [record for record in records if record.point_index == point_index and record.has_point]
         if known:
-            # Another seed has it already: the driver was killed before it could write it down for this one.
+            # Another seed has a point already: the driver was killed before it could write it to this trial's record.
             self._write(point_index, records, known[0].point)
             return
         point = propose_point(spec, records, point_index, lambda point: point_hyperparams(spec, point, point_index))
@@ -70,9 +70,9 @@ class PointChooser:
 
 
 class PointSearcher(Searcher):  # type: ignore[misc]
-    """Gives Tune the trials in order, each with a point.
+    """The Tune searcher that returns the trials in order, each with a point.
 
-    Tune asks only when a trial can start (`max_concurrent_trials`), so every choice knows all that has ended.
+    Tune asks only when a trial can start (`max_concurrent_trials`), so every choice knows all trials that have ended.
 
     Args:
         trial_ids: The trials to run.
@@ -85,7 +85,7 @@ class PointSearcher(Searcher):  # type: ignore[misc]
         self._chooser = chooser
 
     def suggest(self, trial_id: str) -> dict[str, Any] | str:  # noqa: ARG002 - Tune's own id
-        """The next trial's config, as `TrialTrainable` takes it."""
+        """Return the next trial's config for `TrialTrainable`."""
         if not self._waiting:
             return str(Searcher.FINISHED)
         name = self._waiting.popleft()
@@ -93,7 +93,7 @@ class PointSearcher(Searcher):  # type: ignore[misc]
         return {"trial_id": name}
 
     def on_trial_complete(self, trial_id: str, result: dict[str, Any] | None = None, error: bool = False) -> None:  # noqa: FBT001, FBT002 - Tune's signature
-        """Nothing: the records say how a trial ended."""
+        """Do nothing, because the records say how a trial ended."""
 
     def save_to_dir(self, checkpoint_dir: str, session_str: str = "default") -> None:
-        """Nothing: Tune's state is a cache."""
+        """Do nothing, because Tune's state is only a cache."""

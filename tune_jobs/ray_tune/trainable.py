@@ -1,7 +1,7 @@
-"""The Ray Tune Trainable: one warm process that runs one trial after another.
+"""The Ray Tune Trainable of single trials: one warm process that runs one trial after another.
 
-Tune gives it a sweep folder and a trial id and nothing else; what to run is read from the sweep folder, so a trial
-that is started again anywhere goes on from what is on disk there.
+Tune gives it only a sweep folder and a trial id; everything else is read from the sweep folder, so a trial that is
+started again on any node continues from what is on disk.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from tune_jobs.training.protocol import TrainingEngine, TrialTask
 from tune_jobs.training.registry import make_engine
 from tune_jobs.training.trial_loop import TrialLoop
 
-# Reporting every iteration of a fast env costs more than the iteration.
+# Reporting every iteration of a fast env would take longer than the iteration.
 REPORT_INTERVAL_S = 1.0
 _POINTER = "pointer.json"
 _LONGEST_WATCH_S = 1e9
-"""Thirty years; the fault handler's clock overflows at 300."""
+"""Thirty years, in seconds; the fault handler's clock overflows at 300 years."""
 
 
 class TrialLog:
-    """Sends everything this process prints, C++ included, to a trial's log, appended."""
+    """Appends everything this process prints, including C++ code, to a trial's log."""
 
     def __init__(self) -> None:
         self._file: IO[bytes] | None = None
@@ -62,7 +62,7 @@ class TrialLog:
         return self._file
 
     def close(self) -> None:
-        """Send them where they went before."""
+        """Send standard output and error where they went before."""
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError, ValueError):
                 stream.flush()
@@ -74,7 +74,7 @@ class TrialLog:
 
 
 class TaskReader:
-    """Reads from a sweep folder what to run; the sweep's own record once.
+    """Reads trials to run from a sweep folder; it reads the sweep's own record only once.
 
     Args:
         sweep_folder: The sweep's folder.
@@ -89,11 +89,11 @@ class TaskReader:
         self.spec = stored_spec(self.sweep)
 
     def read(self, trial_id: str) -> TrialTask:
-        """What to run as a trial.
+        """Return what to run for a trial.
 
         Raises:
             NotFoundError: There is no such trial.
-            CheckpointError: Its record is damaged, or names an engine that there is none of.
+            CheckpointError: Its record is damaged, or names an unknown engine.
         """
         spec, trial = self.spec, self.store.trial(trial_id).read_record()
         return TrialTask(
@@ -120,9 +120,9 @@ class TaskReader:
 
 @contextlib.contextmanager
 def watchdog(timeout_s: float, file: IO[bytes]) -> Iterator[None]:
-    """End this process, with a traceback in the log, if the block hangs: not even a thread could interrupt it.
+    """End this process, with a traceback in the log, if the block hangs, because not even a thread could interrupt it.
 
-    A hung `env.step` has no time-out of its own with RLlib; Tune then starts a new process.
+    RLlib has no time-out for an `env.step` that hangs. Tune then starts a new process.
     """
     faulthandler.dump_traceback_later(min(timeout_s, _LONGEST_WATCH_S), exit=True, file=file)
     try:
@@ -132,15 +132,15 @@ def watchdog(timeout_s: float, file: IO[bytes]) -> Iterator[None]:
 
 
 def this_node() -> str:
-    """The node this process runs on, as records name it."""
+    """Return the node that this process runs on, as records name it."""
     return f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
 
 
 def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
-    """What Tune's schedulers compare a trial by.
+    """Return the numbers by which Tune's schedulers compare a trial.
 
     Args:
-        progress: Where it stands.
+        progress: The trial's progress.
         grace: Env steps of a grace period.
     """
     return {
@@ -152,19 +152,19 @@ def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
 
 
 def owner_of_run(config: Mapping[str, Any]) -> Ownership | None:
-    """The run that a process was started for; None: it was started for none."""
+    """Return the ownership of the run that a process was started for; None if it was started for none."""
     return open_sweep(Path(config["sweep_folder"])).owner(config["run"]) if config.get("run") else None
 
 
 def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> None:
-    """End this process when its driver has gone, however it went, or another process owns what it works for.
+    """End this process when its driver has ended, for whatever reason, or another process owns its work.
 
-    A driver that is killed takes its Ray along, whose processes this one is a child of. In a Ray that stays there, it
-    is seen itself; on another machine Ray ends this process.
+    The Ray of a driver that is killed ends with it, and this process is a child of Ray's processes. If Ray stays, this
+    process watches the driver itself; on another machine Ray ends this process.
 
     Args:
-        config: What the process was started with: `driver` is `this_process` of the driver.
-        owners: Of what it works for.
+        config: The settings that the process was started with; `driver` is the driver's `this_process`.
+        owners: The ownerships of its work.
     """
     driver = str(config.get("driver", ""))
     lost = [lambda owner=owner: not owner.is_current() for owner in owners if owner is not None]
@@ -172,10 +172,10 @@ def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> Non
 
 
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs trials; `config` holds `sweep_folder`, `trial_id`, and of the driver `run` and `driver`."""
+    """Runs trials; `config` holds `sweep_folder` and `trial_id`, and from the driver `run` and `driver`."""
 
     def setup(self, config: dict[str, Any]) -> None:
-        """Remember the trial; it is built in the first step, so that every error comes from there."""
+        """Remember the trial; it is built in the first step, so that every error is raised there."""
         note_signals()
         self._log = TrialLog()
         self._engine: TrainingEngine | None = None
@@ -203,7 +203,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         """Train until the next report.
 
         Raises:
-            Exception: Whatever went wrong; it is in the trial's log too.
+            Exception: Any error of the trial; it is in the trial's log too.
         """
         folder, trial_id = self._trial
         try:
@@ -211,10 +211,10 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
                 self._loop = self._open(folder, trial_id)
             progress = self._watched(self._loop)
         except Exception as error:
-            # Not by print_exc: standard error of Ray's processes fails at what is no text.
+            # print_exc would fail where standard error of Ray's processes cannot encode the text.
             print(fit(traceback.format_exc()), file=sys.stderr, flush=True)
             if self._loop is not None:
-                # Files that are gone under its hands are no failure of a trial that another process has.
+                # If another process has taken the trial over, missing files are no failure of it.
                 self._loop.check_owned()
             if (told := tellable(error)) is not error:
                 raise told from None
@@ -240,7 +240,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         return loop
 
     def _engine_of(self, task: TrialTask) -> TrainingEngine:
-        """The engine of a trial, warm if the trial before it had the same."""
+        """Return the engine of a trial; it is warm if the previous trial had the same engine."""
         if self._engine is None or self._engine_name != task.engine:
             if self._engine is not None:
                 self._engine.close()
@@ -262,7 +262,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         }
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
-        """For Tune's pauses: the checkpoint itself goes to the sweep folder, Tune gets a pointer to it."""
+        """Save when Tune pauses the trial: the checkpoint goes to the sweep folder, and Tune gets a pointer to it."""
         folder, trial_id = self._trial
         if self._loop is not None:
             self._loop.pause()
@@ -270,29 +270,29 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         (Path(checkpoint_dir) / _POINTER).write_text(json.dumps(pointer), encoding="utf-8")
 
     def load_checkpoint(self, checkpoint: str) -> None:
-        """Check that the sweep folder holds what Tune paused, or newer; the next step goes on from it.
+        """Check that the sweep folder has the checkpoint of Tune's pause or a newer one, for the next step.
 
-        A pointer to another trial's checkpoint comes from population based training; what it points to has been
-        copied into this trial's folder.
+        A pointer to another trial's checkpoint comes from population based training; that checkpoint has been copied
+        into this trial's folder.
 
         Raises:
-            CheckpointError: The checkpoint Tune wants is not there.
+            CheckpointError: The checkpoint of the pause is not there.
         """
         pointer = json.loads((Path(checkpoint) / _POINTER).read_text(encoding="utf-8"))
         folder, trial_id = self._trial
         latest = _latest_iteration(folder, trial_id)
-        # Newer where the trial went on after a pause and its process died: Tune goes back to the pause's pointer.
-        # Older where the one it points to was damaged, and the trial has gone on from the one before.
+        # It is newer if the trial continued after a pause and its process died: Tune uses the pause's pointer again.
+        # It is older if that checkpoint was damaged, and the trial has continued from the one before.
         known = max(latest, open_sweep(folder).trial(trial_id).latest_damaged())
         if pointer["trial_id"] == trial_id and known < pointer["iteration"]:
             raise CheckpointError(
-                f"Trial {trial_id} was paused at iteration {pointer['iteration']}, its latest checkpoint is {latest}.",
-                "Resume the sweep: its trials go on from their latest checkpoints.",
+                f"Trial {trial_id} was paused at iteration {pointer['iteration']}; its latest checkpoint is {latest}.",
+                "Resume the sweep: its trials continue from their latest checkpoints.",
             )
         self._loop = None
 
     def cleanup(self) -> None:
-        """Free the trial; the process may end."""
+        """Free the trial, as the process may end."""
         if self._engine is not None:
             self._engine.close()
         for evaluator in self._evaluators.values():
@@ -301,5 +301,5 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
 
 def _latest_iteration(folder: Path, trial_id: str) -> int:
-    """Of a trial's checkpoints on disk, damaged or not; 0: it has none."""
+    """Return the latest iteration of a trial's checkpoints on disk, damaged or not; 0 if it has none."""
     return max(open_sweep(folder).trial(trial_id).checkpoint_iterations(), default=0)

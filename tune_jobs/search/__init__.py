@@ -1,1 +1,1 @@
-"""Where points come from."""
+"""Choose the points of a sweep: grid, random draws, TPE, and mutations."""

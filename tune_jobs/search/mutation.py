@@ -1,7 +1,7 @@
-"""How population based training changes the searched values of a trial that goes on from another's checkpoint.
+"""Mutate points, for trials that continue from another's checkpoint in population based training.
 
-As in Jaderberg et al. 2017, "Population Based Training of Neural Networks": a value is drawn anew from its domain or
-moved a little from the better trial's, each by itself.
+As in Jaderberg et al. 2017, "Population Based Training of Neural Networks", each value is either drawn anew from its
+domain or changed a little from the better trial's value.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from pydantic import BaseModel
 from tune_jobs.spec.domains import Domain, Listed, Range
 
 FACTORS = (0.8, 1.2)
-"""What a number is multiplied with if it isn't drawn anew; Jaderberg et al. use these two."""
+"""The factors for a number that isn't drawn anew; Jaderberg et al. use these two."""
 
 
 def mutate(
     point: Mapping[str, Any], space: Mapping[str, Domain], rng: np.random.Generator, resample_probability: float
 ) -> dict[str, Any]:
-    """A point near another, or with some values drawn anew, within the space.
+    """Return a point near another, possibly with some values drawn anew, within the space.
 
     Args:
-        point: Of the better trial.
+        point: The better trial's point.
         space: Domains by hyperparameter.
         rng: Draws everything.
-        resample_probability: How likely a value is drawn anew, in [0, 1]; else it becomes a neighbouring one.
+        resample_probability: The probability, in [0, 1], that a value is drawn anew and not changed to a neighbour.
     """
     return {
         name: domain.sample(rng) if rng.random() < resample_probability else _neighbour(domain, point[name], rng)
@@ -36,7 +36,7 @@ def mutate(
 
 
 def _neighbour(domain: BaseModel, value: Any, rng: np.random.Generator) -> Any:
-    """The value before or after this one in a list, or 0.8 or 1.2 times it; never outside the domain."""
+    """Return the value before or after this one in a list, or 0.8 or 1.2 times it; never outside the domain."""
     up = bool(rng.integers(2))
     if isinstance(domain, Listed):
         index = domain.index_of(value) + (1 if up else -1)
@@ -48,6 +48,6 @@ def _neighbour(domain: BaseModel, value: Any, rng: np.random.Generator) -> Any:
         return float(min(max(moved, low), high))
     first, last = domain.factors
     q = domain.q or 1.0
-    # At least one step, or a small whole number would stay where it is.
+    # At least one step, because a small whole number would not change otherwise.
     step = max(round(moved / q), round(value / q) + 1) if up else min(round(moved / q), round(value / q) - 1)
     return domain.at_factor(min(max(step, first), last))

@@ -1,4 +1,4 @@
-"""The points of a sweep as far as they are known before it starts, and the largest trials that unknown ones may be."""
+"""Find a sweep's points that are known before it starts, and the largest trials that unknown points may have."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _DECIDE_SIZE = (
     "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers",
     "replay_capacity",
 )  # fmt: skip
-"""Hyperparameters on which a trial's env steps, disk space and memory depend."""
+"""The hyperparameters that a trial's env steps, disk space and memory depend on."""
 
 
 def planned_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
-    """The point of each index; None: the search method chooses it when its trial starts."""
+    """Return the point of each index; None: the search method chooses it when its trial starts."""
     if spec.search.type == "random":
         return list(draw_points(spec.space, spec.num_samples, spec.seed))
     num_random = min(spec.search.num_startup_trials, spec.num_samples)
@@ -30,14 +30,14 @@ def planned_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
 
 
 def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[Hyperparams]:
-    """Values whose trials are at least as large as those of any point of the space; they need not go together.
+    """Return hyperparameters whose trials are at least as large as any point's; they need not be valid together.
 
     Args:
         spec: The sweep.
-        known: Of the points that are known; at least one.
+        known: The hyperparameters of the points that are known; at least one.
 
     Raises:
-        SpecError: There are too many combinations to look at.
+        SpecError: There are too many combinations to check.
     """
     ends = {name: _ends(domain) for name, domain in spec.space.items() if name in _DECIDE_SIZE}
     if "hidden_sizes" in ends:
@@ -46,7 +46,7 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
     if combinations > _MAX_COMBINATIONS:
         raise SpecError(
             f"The listed values of {', '.join(ends)} have {combinations:,} combinations; at most {_MAX_COMBINATIONS:,} "
-            "can be looked at to find the largest trial.",
+            "can be checked to find the largest trial.",
             "List fewer values, or give ranges.",
         )
     return [

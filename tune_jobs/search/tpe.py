@@ -1,13 +1,13 @@
-"""Points proposed by a model of the trials that ended: TPE (Bergstra et al. 2011), as Optuna implements it.
+"""Propose points by a model of the trials that ended: TPE (Bergstra et al. 2011), as Optuna implements it.
 
-The model is built anew from the trial records for every point, so a sweep that is resumed or extended goes on with all
-it knows, and nothing is kept beside the records. What it is told of a point:
+The model is built anew from the trial records for every point, so a sweep that is resumed or extended uses all its
+results, and nothing is stored besides the records. What the model is given for a point:
 
-- ended: the mean over its seeds of the best evaluation return, which is what the selection goes by;
+- ended: the mean over its seeds of the best evaluation return, which the selection compares too;
 - ended early by a scheduler: the same, and how far it got. Such points count as worse than those that ended by
-  themselves, those that got further as better (Optuna's pruned trials);
-- failed, or without one finite evaluation: worse than all others;
-- still running: as a bad one, so that trials that run at the same time are spread out (the constant liar).
+  themselves, and as better the further they got (Optuna's pruned trials);
+- failed, or without a finite evaluation: worse than all others;
+- still running: a bad score, so that trials that run at the same time are spread out (the constant liar).
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ Check = Callable[[dict[str, Any]], object]
 
 
 def check_installed() -> None:
-    """Check that Optuna is there.
+    """Check that Optuna is installed.
 
     Raises:
-        CannotRunError: It isn't; the hint says how to install it.
+        CannotRunError: It isn't installed; the hint says how to install it.
     """
     if importlib.util.find_spec("optuna") is None:
         raise CannotRunError(
@@ -48,16 +48,16 @@ def check_installed() -> None:
 
 
 def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: int, check: Check) -> dict[str, Any]:
-    """Choose the point that is tried next.
+    """Choose the next point to try.
 
-    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, it is the
-    random one of its index.
+    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, the point
+    is the random one of its index.
 
     Args:
         spec: The sweep.
-        records: All its trials.
-        point_index: Of the point that is wanted.
-        check: Raises SpecError for a point whose values don't go together; then another is proposed.
+        records: The records of all its trials.
+        point_index: The index of the point to choose.
+        check: Raises SpecError for a point whose values contradict each other; then another is proposed.
 
     Raises:
         SpecError: None of many proposals is valid.
@@ -70,7 +70,7 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: 
     if sum(trial.state.is_finished() for trial in known) < spec.search.num_startup_trials:
         return draw_point(spec.space, point_index, spec.seed)
     with warnings.catch_warnings():
-        # Of arguments that are new in Optuna 4.
+        # Optuna 4 warns of arguments that are new in it.
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         sampler = optuna.samplers.TPESampler(
             seed=random_streams.tpe_seed(spec.seed, point_index),
@@ -99,7 +99,7 @@ def _first_valid(study: optuna.Study, space: Mapping[str, Domain], check: Check)
             check(point)
         except SpecError as error:
             last_error = error
-            # Without a value it counts as worse than all others.
+            # A trial without a value counts as worse than all others.
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
         else:
             return point
@@ -107,7 +107,7 @@ def _first_valid(study: optuna.Study, space: Mapping[str, Domain], check: Check)
 
 
 def _known_trials(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[optuna.trial.FrozenTrial]:
-    """The points that are chosen, as Optuna's trials."""
+    """Return the points that are chosen, as Optuna's trials."""
     import optuna
 
     points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
@@ -129,7 +129,7 @@ def _known_trials(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[optun
             else:
                 told = {"state": states.PRUNED, "intermediate_values": {level: score}}
         elif all(record.status == "pending" for record in members):
-            continue  # planned, and not begun
+            continue  # planned, but not begun
         point = members[0].point
         params = {name: _to_optuna(domain, point[name]) for name, domain in spec.space.items()}
         known.append(optuna.trial.create_trial(params=params, distributions=distributions, **told))
@@ -137,23 +137,23 @@ def _known_trials(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[optun
 
 
 def _score(members: Sequence[TrialRecord]) -> float | None:
-    """Mean over a point's seeds; None if one of them failed or was never scored."""
+    """Return the mean score over a point's seeds; None if one of them failed or was never evaluated."""
     scores = [scored.score for record in members if (scored := score_trial(record)) is not None]
     return sum(scores) / len(scores) if len(scores) == len(members) else None
 
 
 def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:
-    """How far the first trial of a point that a scheduler ended came, in steps of its rungs; None: it ended none."""
+    """Return the rung that the first trial ended by a scheduler reached; None if the scheduler ended none."""
     steps = [record.num_env_steps for record in members if record.status == "stopped"]
     if not steps:
         return None
-    # Trials end a rung at somewhat different env steps, and must not be told apart by these.
+    # Trials end at a rung with slightly different env steps, which must not make a difference.
     rungs = math.log(max(1.0, min(steps) / spec.grace_env_steps), spec.scheduler.reduction_factor)
     return int(rungs + 1e-9)
 
 
 def _distribution(domain: Any) -> optuna.distributions.BaseDistribution:
-    """A domain in Optuna's terms: lists and multiples of q by index, as Optuna has no log scale with steps."""
+    """Return a domain in Optuna's form: lists and multiples of q by index, as Optuna has no log scale with steps."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     if isinstance(domain, Listed):

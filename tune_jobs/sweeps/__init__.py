@@ -1,1 +1,1 @@
-"""The verbs that command line and Python share: launch, resume, extend, look up, conclude."""
+"""The functions that the command line and the Python API share: launch, resume, extend, look up, conclude."""

@@ -1,4 +1,4 @@
-"""Functions that run a sweep: each the only one of its process, in its main thread."""
+"""Let functions that run a sweep be the only one of their process, in its main thread."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _Arguments = ParamSpec("_Arguments")
 
 
 def run_alone(call: Callable[_Arguments, SweepResult]) -> Callable[_Arguments, SweepResult]:
-    """Make a function that runs a sweep the only one of its process, end in order at a signal, and leave no traces.
+    """Decorate a function that runs a sweep: it is the only one of its process, and ends cleanly at a signal.
 
-    Where this process runs a sweep already, and in other threads than the main one, it is called in a process of its
-    own: the function is public there, at the top of its module, and its arguments are texts, paths and numbers.
+    If this process runs a sweep already, or in a thread other than the main one, the function is called in a process of
+    its own. So it has to be defined at the top of its module, with strings, paths and numbers as arguments.
 
     Raises:
         SweepInterrupted: A signal came; the records are written.
@@ -33,13 +33,13 @@ def run_alone(call: Callable[_Arguments, SweepResult]) -> Callable[_Arguments, S
             from tune_jobs.sweeps.apart import call_apart
 
             return call_apart(f"{call.__module__}:{call.__qualname__}", args, kwargs)
-        # It needs NumPy, which a program that only asks for help does not.
+        # Imported here because it needs NumPy, which a command that only prints help does not.
         from tune_jobs.process.state import given_back
 
         with taking_signals() as interruption:
             with contextlib.ExitStack() as stack:
                 stack.enter_context(given_back())
-                # What comes while the process is put back as it was has nothing left to cut short.
+                # A signal that comes while the process is restored has nothing left to end.
                 stack.callback(interruption.shield)
                 try:
                     result = call(*args, **kwargs)

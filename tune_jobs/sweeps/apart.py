@@ -1,7 +1,7 @@
-"""A sweep that is run in a process of its own, for a thread of this one that waits for it.
+"""Run a sweep in a process of its own, for a thread of this process that waits for it.
 
-Signals, descriptors 1 and 2, environment variables and the connection to Ray are a process's, not a thread's. So a
-thread leaves them alone, and a second sweep beside another one has them for itself.
+Signals, descriptors 1 and 2, environment variables and the connection to Ray belong to a process, not to a thread. So a
+thread must not change them, and a second sweep beside another one gets its own.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tune_jobs.sweeps.own_process import ERROR, LOG, SIGNALS, Request
 
 _LOOK_S = 0.25
 _PATIENCE_S = 10.0
-# `-P`: nothing of the working directory can stand in for these packages. Ctrl-C ends it silently until it is handled.
+# With `-P`, nothing in the working directory can hide these packages. Ctrl-C ends the child silently at first.
 _BEGIN = """\
 import signal
 signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -46,7 +46,7 @@ main({parent}, {descriptor})
 _ROOT = str(Path(__file__).parents[2])
 
 _running: dict[subprocess.Popen[bytes], threading.Event] = {}
-"""The children, and whether the threads that wait for them have what they came for."""
+"""The children, and whether the threads that wait for them have got their answers."""
 _pid = os.getpid()
 
 
@@ -54,16 +54,16 @@ def call_apart(function: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) 
     """Call a function that runs a sweep in a child process, and wait for it.
 
     Args:
-        function: As `module:function`; in the child, too, it may be run in the main thread alone.
-        args: What it takes.
-        kwargs: What it takes.
+        function: Its `module:function`; the child too runs it in its main thread.
+        args: Its positional arguments.
+        kwargs: Its keyword arguments.
 
     Returns:
-        What it returned.
+        Its result.
 
     Raises:
         CannotRunError: The child could not be started, or ended without an answer.
-        BaseException: Whatever the function raised, SweepInterrupted among it.
+        BaseException: The error that the function raised, which may be SweepInterrupted.
     """
     script = getattr(sys.modules.get("__main__"), "__file__", None)
     request = Request(
@@ -80,12 +80,12 @@ def call_apart(function: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) 
     done = _running[process] = threading.Event()
     try:
         try:
-            # One that has ended is found by what does not come back.
+            # That the child has ended is noticed when its answer is read.
             with contextlib.suppress(OSError):
                 connection.send(request)
             kind, answer = _answer(process, connection)
         except KeyboardInterrupt:
-            # Where the main thread waits, from inside of another sweep.
+            # This happens if the main thread waits, from inside of another sweep.
             process.send_signal(ASKED)
             kind, answer = _answer(process, connection)
     finally:
@@ -103,7 +103,7 @@ def call_apart(function: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) 
 
 
 def _started() -> tuple[subprocess.Popen[bytes], Connection[Any, Any]]:
-    # It needs NumPy.
+    # Imported here because it needs NumPy.
     from tune_jobs.process.state import environment
 
     ours, theirs = Pipe()
@@ -112,7 +112,7 @@ def _started() -> tuple[subprocess.Popen[bytes], Connection[Any, Any]]:
     try:
         with standard_streams():
             errors = standard_error()
-            # In this process's group: what a terminal sends to it reaches both.
+            # In this process's group, so that signals of a terminal reach both.
             process = subprocess.Popen(  # noqa: S603 (this very Python)
                 [sys.executable, "-P", "-c", code],
                 stdin=subprocess.DEVNULL, stdout=errors, stderr=errors, env=environment(), pass_fds=[number],
@@ -129,7 +129,7 @@ def _started() -> tuple[subprocess.Popen[bytes], Connection[Any, Any]]:
 
 
 def _answer(process: subprocess.Popen[bytes], connection: Connection[Any, Any]) -> tuple[str, Any]:
-    """What the child answers; meanwhile log what it logs, and ask it to end where this process was interrupted."""
+    """Wait for the child's answer; meanwhile pass on its log records, and ask it to end on an interrupt."""
     num_before, is_asked = num_taken(), False
     while True:
         try:
@@ -143,7 +143,7 @@ def _answer(process: subprocess.Popen[bytes], connection: Connection[Any, Any]) 
         except (EOFError, OSError):
             return ERROR, _lost(process)
         if not is_asked and (num_taken() != num_before or main_thread_was_interrupted()):
-            # Not at once: what a terminal has sent is there by now, and this does not count as a second one.
+            # Not at once: a terminal's signal has reached the child by now, and this one does not count as a second.
             is_asked = True
             process.send_signal(ASKED)
 
@@ -152,10 +152,10 @@ def _answer(process: subprocess.Popen[bytes], connection: Connection[Any, Any]) 
 def _end_in_order() -> None:
     """Ask children that still run when this process ends to end too, and wait for them.
 
-    Their threads are daemons, or forgotten: up to Python 3.12 a Ctrl-C that comes while a thread is joined takes it for
-    one that has ended (an error in the fix of bpo-45274), and it is not waited for.
+    The threads that wait for them may be daemons. And up to Python 3.12, a thread that is being joined when Ctrl-C
+    comes counts as ended (an error in the fix of bpo-45274), so it is not waited for.
     """
-    # A copy of this process, by a fork, has no such children.
+    # A fork of this process has no such children.
     running = dict(_running) if os.getpid() == _pid else {}
     for process in running:
         process.send_signal(ASKED)
@@ -174,7 +174,7 @@ def _lost(process: subprocess.Popen[bytes]) -> BaseException:
         process.wait(_PATIENCE_S)
     code = process.returncode
     if code is not None and -code in SIGNALS:
-        # It handles these once it has begun.
+        # The child handles these signals after it has begun.
         return SweepInterrupted()
     how = "closed its connection" if code is None else f"ended with exit code {code}"
     if code is not None and code < 0:
@@ -182,5 +182,5 @@ def _lost(process: subprocess.Popen[bytes]) -> BaseException:
     return CannotRunError(
         f"The process that ran the sweep {how}.",
         "What is done is kept, and `tune-jobs resume` continues it. "
-        f"Standard error and {DRIVER_LOG} have what it said.",
+        f"Look for the cause on standard error and in {DRIVER_LOG}.",
     )

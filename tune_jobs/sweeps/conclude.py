@@ -1,4 +1,4 @@
-"""What happens to a sweep's trials afterwards: best, evaluate, video, report. None of it starts Ray."""
+"""Conclude a sweep after its trials: best, evaluate, video, report. None of this starts Ray."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
 from tune_jobs.sweeps.storage import expanded, storage_folder
 from tune_jobs.training.registry import engine_of_checkpoint
 
-# The first seed of `evaluate` where no sweep says which: never one of training, evaluation or confirmation.
+# The first seed of `evaluate` if no sweep gives one; it is never one of training, evaluation or confirmation.
 FRESH_SEED = 2**31
 
 
 def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
-    """A sweep by its folder, or by its name in the storage folder.
+    """Find a sweep by its folder, or by its name in the storage folder.
 
     Raises:
-        NotFoundError: There is none.
+        NotFoundError: There is no such sweep.
     """
     as_folder = open_sweep(expanded(sweep))
     if as_folder.exists():
@@ -56,7 +56,7 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
 
 
 def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
-    """Every trial's results, by trial id; none, with a warning, of a trial whose file cannot be read at all."""
+    """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
     found = {}
     for record in store.read_trials():
         try:
@@ -99,7 +99,7 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
 def run_evaluation(
     policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int], timeout_s: float = CALL_TIMEOUT_S
 ) -> EvaluationRecord:
-    """Greedy episodes of a policy, one a seed; `timeout_s` is how long one call of the environment may take."""
+    """Play a policy's greedy episodes, one per seed; `timeout_s` is how long one call of the environment may take."""
     episodes = evaluate_policy(policy, env_id=env_id, env_args=env_args, seeds=seeds, timeout_s=timeout_s)
     return EvaluationRecord(
         policy=policy.description,
@@ -113,20 +113,20 @@ def run_evaluation(
 
 
 def random_policy(env_id: str, env_args: dict[str, Any], timeout_s: float = CALL_TIMEOUT_S) -> RandomPolicy:
-    """What trained policies are held against, in an environment."""
+    """Return a random policy for an environment, to compare trained policies with."""
     env = check_env(env_id, env_args, timeout_s=timeout_s)
     return RandomPolicy(env.observation_space, env.action_space, env_id=env.env_id, env_args=env.env_args)
 
 
 @dataclass(frozen=True)
 class PolicySource:
-    """A policy, where it acts, and where it came from."""
+    """A policy, the environment it acts in, and where it came from."""
 
     policy: Policy
     env_id: str
     env_args: dict[str, Any]
     store: Sweep | None = None
-    """The sweep, where the policy is a sweep's best."""
+    """The sweep, if the policy is a sweep's best."""
     timeout_s: float = CALL_TIMEOUT_S
     """How long one call of the environment may take."""
 
@@ -138,19 +138,20 @@ def find_policy(
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
 ) -> PolicySource:
-    """A policy by any of its names.
+    """Find a policy by any kind of source.
 
     Args:
         source: A sweep (its best; chosen now if it has not been), `SWEEP/TRIAL` (its best checkpoint), a checkpoint
             folder, a policy file, or a baseline: `random` or `constant`.
-        storage: Where sweeps are looked for by name.
-        env_id: Where it acts; needed for a baseline, else the environment it was trained in.
-        action: What `constant` does; None: the action 0.
+        storage: The folder in which sweeps are looked up by name.
+        env_id: The environment it acts in; None: the one it was trained in. A baseline needs one.
+        action: The action of `constant`; None: 0.
 
     Raises:
         NotFoundError: There is no such thing.
         CheckpointError: It is damaged.
-        SpecError: A baseline without an environment or with an action it does not have; an action for another policy.
+        SpecError: A baseline is given no environment, or an action that the environment does not have; or an action is
+            given for another policy.
     """
     text = str(source)
     if text in BASELINES:
@@ -177,7 +178,7 @@ def find_policy(
             policy = load_policy(checkpoint)
             store = None
     if env_id is not None and env_id != policy.env_id:
-        # Its constructor's arguments are the other environment's; what the policy observes is its own.
+        # The constructor's arguments are those of the other environment; the wrappers of observations are the policy's.
         wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS)}
         return PolicySource(policy, env_id, wrappers, timeout_s=timeout_s)
     return PolicySource(policy, policy.env_id, dict(policy.env_args), store, timeout_s)
@@ -203,7 +204,7 @@ def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | Non
 def evaluate(
     source: PolicySource, num_episodes: int, first_seed: int | None
 ) -> tuple[EvaluationRecord, EvaluationRecord]:
-    """Greedy episodes of a policy, and of a random one on the same seeds; see `verbs.evaluate`."""
+    """Play greedy episodes of a policy, and of a random one on the same seeds; see `verbs.evaluate`."""
     first = FRESH_SEED if first_seed is None else first_seed
     seeds = range(first, first + num_episodes)
     env_id, env_args, timeout_s = source.env_id, source.env_args, source.timeout_s
@@ -234,24 +235,24 @@ def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[Sweep, str 
 
 
 def _trusted(store: Sweep) -> Sweep:
-    """The sweep, with the modules allowed that its launcher did: its policies and environment may be from there."""
+    """Return the sweep, and allow the modules that were allowed for it, which its environment may need."""
     allow_modules(store.read_record().allowed_modules)
     return store
 
 
 def best_checkpoint(store: Sweep, trial_id: str) -> CheckpointRecord:
-    """The checkpoint of one trial with the highest evaluation return.
+    """Return the checkpoint of one trial with the highest evaluation return.
 
     Raises:
-        NotFoundError: No such trial, or it has no evaluated checkpoint.
+        NotFoundError: There is no such trial, or it has no evaluated checkpoint.
     """
     trials = {record.trial_id: record for record in read_trials(store)}
     if trial_id not in trials:
         raise NotFoundError(
-            f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)}.",
+            f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)} trials.",
             f"List them with `tune-jobs trials {store.name}`.",
         )
-    # A trial that failed later may still be looked at, though it cannot win.
+    # A trial that failed later may still be evaluated, though it cannot win.
     found = best_of(trials[trial_id].checkpoints)
     if found is None:
         raise NotFoundError(
@@ -262,7 +263,7 @@ def best_checkpoint(store: Sweep, trial_id: str) -> CheckpointRecord:
 
 
 def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Path:
-    """A verified checkpoint folder: a sweep's best, `SWEEP/TRIAL`'s best, or the given folder.
+    """Return a verified checkpoint folder: a sweep's best, `SWEEP/TRIAL`'s best, or the given folder.
 
     Raises:
         NotFoundError: There is no such checkpoint.
@@ -283,18 +284,18 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
 
 
 def find_trained_checkpoint(source: str | Path, storage: str | Path | None = None) -> tuple[Path, Engine]:
-    """A verified checkpoint that can be trained on, and the engine that wrote it.
+    """Return a verified checkpoint from which training can continue, and the engine that wrote it.
 
     Raises:
         NotFoundError: There is no such checkpoint.
-        CheckpointError: It is damaged, or of an engine that RLlib has no part in, as a baseline's.
+        CheckpointError: It is damaged, or its engine is not RLlib's or the packed one.
     """
     folder = find_checkpoint(source, storage)
     saved, engine = read_policy(folder), engine_of_checkpoint(folder)
     if engine.restore is None:
         what = f"baseline {saved.algorithm}" if saved.algorithm in BASELINES else f"engine {engine.name}"
         raise CheckpointError(
-            f"{folder} is of the {what}, which is no RLlib algorithm: there is nothing to restore.",
+            f"{folder} is of the {what}, which is not an RLlib algorithm: there is nothing to restore.",
             "Load its policy with load_policy, or restore a trial of ppo or dqn.",
         )
     return folder, engine
@@ -311,7 +312,7 @@ def make_videos(store: Sweep, seed: int | None = None) -> dict[str, Path]:
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
     before = random_policy(source.env_id, source.env_args, source.timeout_s)
-    # A baseline has not been trained: it is shown as what it is.
+    # A baseline has not been trained, so its caption does not say so.
     trained = not isinstance(source.policy, RandomPolicy | ConstantPolicy)
     first = "before training: random" if trained else before.description
     second = f"after training: {best.checkpoint.trial_id}" if trained else source.policy.description
@@ -333,7 +334,7 @@ def make_videos(store: Sweep, seed: int | None = None) -> dict[str, Path]:
 
 
 def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]:
-    """Film one episode of any policy: MP4 and GIF, named by `output` with the two endings."""
+    """Film one episode of any policy: MP4 and GIF, with the name of `output` and the two suffixes."""
     mp4, gif = output.with_suffix(".mp4"), output.with_suffix(".gif")
     record_video(
         source.policy, env_id=source.env_id, env_args=source.env_args, seeds=seed, mp4=mp4, gif=gif,
@@ -348,7 +349,7 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
 
     Args:
         store: The sweep.
-        why_no_best: Why its winner could not be confirmed just now; None: it was, or nobody tried.
+        why_no_best: Why its winner could not be confirmed just now; None: it was confirmed, or this was not tried.
     """
     from analysis.report import build_report
 
@@ -376,7 +377,7 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
 
 
 def _known_best(store: Sweep) -> BestRecord:
-    """The confirmed winner, confirmed now if it has not been."""
+    """Return the confirmed winner, which is confirmed now if it has not been."""
     try:
         return store.read_best()
     except NotFoundError as error:

@@ -1,4 +1,4 @@
-"""A sweep that is written and not begun: whoever drives it later finds all of it in its folder."""
+"""Write a sweep without beginning it; everything that a later run needs is in its folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tune_jobs.sweeps.storage import choose_store, create_store
 
 @dataclass(frozen=True)
 class CreatedSweep:
-    """A sweep that has been written, and that nobody has begun."""
+    """A sweep that has been written but not begun."""
 
     name: str
     folder: Path
@@ -30,13 +30,13 @@ def write_created(spec: SweepSpec, name: str | None, stem: str, storage: Path, a
 
     Args:
         spec: The sweep.
-        name: As `choose_store`.
-        stem: As `choose_store`.
-        storage: As `choose_store`.
-        address: Ray cluster that it is for, which is not asked; None: this machine, which must be able to run it.
+        name: The same as for `choose_store`.
+        stem: The same as for `choose_store`.
+        storage: The same as for `choose_store`.
+        address: The Ray cluster that it is for, which is not contacted; None: this machine, which must be large enough.
 
     Raises:
-        SpecError: The sweep is wrong, its name is taken, or the address is none. Nothing was written.
+        SpecError: The sweep is wrong, its name is taken, or the address has a wrong form. Nothing was written.
         CannotRunError: It cannot run on this machine, or the storage cannot be written. Nothing was written.
     """
     if address is not None:
@@ -54,13 +54,13 @@ def write_created(spec: SweepSpec, name: str | None, stem: str, storage: Path, a
 
 
 def _smallest_machine(spec: SweepSpec, address: str) -> Machine:
-    """What a trial needs: trials are the same on every machine, and who drives them plans again for his."""
+    """Return a machine of the size of one trial, as the sweep is planned again for the machine that it runs on."""
     return Machine(max(1, spec.cpus_per_trial), spec.resources.num_gpus, source=f"the cluster at {address}")
 
 
 @contextlib.contextmanager
 def removed_if_not_begun(created: CreatedSweep) -> Iterator[None]:
-    """Remove a sweep again if the block fails before anything of it has begun."""
+    """Remove a sweep again if the block fails before any part of it has begun."""
     try:
         yield
     except BaseException:

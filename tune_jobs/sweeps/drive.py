@@ -1,4 +1,4 @@
-"""Driving a sweep whose lock is held: its records at the start, its trials, and what comes after them."""
+"""Drive a sweep whose lock is held: write its records, run its trials, and conclude it."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ _PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
 def write_new(
     store: Sweep, spec: SweepSpec, plan: SweepPlan, address: str | None, state: SweepState = "running"
 ) -> None:
-    """Write the records of a new sweep, which runs at once or is only created."""
+    """Write the records of a new sweep, which is run at once or only created."""
     for trial in plan.trials:
         store.trial(trial.trial_id).write_record(pending_record(trial))
-    # Last: a folder without it is no sweep, so nobody sees half of one.
+    # Written last: a folder without this record is not a sweep, so no reader sees half of one.
     store.write_record(
         SweepRecord(
             name=store.name,
@@ -69,10 +69,10 @@ def _versions() -> dict[str, str]:
 
 
 def _git_commit() -> str | None:
-    """The commit of the working directory's repository, so that a sweep can be traced to a user's own code."""
+    """Return the commit of the working directory's repository, which tells the version of a user's own code."""
     try:
         done = subprocess.run(
-            ["git", "rev-parse", "HEAD"],  # noqa: S607 (git as the user has it)
+            ["git", "rev-parse", "HEAD"],  # noqa: S607 (the user's git)
             capture_output=True, text=True, timeout=5, check=False,
         )  # fmt: skip
     except (OSError, subprocess.SubprocessError):
@@ -81,10 +81,10 @@ def _git_commit() -> str | None:
 
 
 def connected(address: str | None, here: Machine | None) -> AbstractContextManager[Connection]:
-    """Join a cluster or start Ray here; see `cluster.connect`. Imports ray only when it is called.
+    """Join a cluster or start Ray here; see `cluster.connect`. Ray is imported only when this is called.
 
     Raises:
-        SpecError: The address is none.
+        SpecError: The address has a wrong form.
         CannotRunError: Nothing listens there.
     """
     if address is not None:
@@ -95,7 +95,7 @@ def connected(address: str | None, here: Machine | None) -> AbstractContextManag
 
 
 def machine_here() -> Machine:
-    """What a sweep without an address runs on: the Ray that the user has connected this process to, or this machine."""
+    """Return where a sweep without an address runs: the Ray that the user joined in this process, or this machine."""
     if not _is_connected_by_user():
         return local_machine()
     from tune_jobs.ray_tune.connected_ray import connected_machine
@@ -104,7 +104,7 @@ def machine_here() -> Machine:
 
 
 def address_of_users_ray() -> str | None:
-    """Where the Ray is that the user has connected this process to; None: there is none, or it is another sweep's."""
+    """Return the address of the Ray that the user joined in this process; None: there is none, or it is a sweep's."""
     if not _is_connected_by_user():
         return None
     from tune_jobs.ray_tune.connected_ray import address_for_others
@@ -114,7 +114,7 @@ def address_of_users_ray() -> str | None:
 
 def _is_connected_by_user() -> bool:
     ray: Any = sys.modules.get("ray")
-    # A ray that is only being imported has no such function yet.
+    # While another thread imports ray, it has no such function yet.
     if ray is None or not getattr(ray, "is_initialized", bool)():
         return False
     from tune_jobs.ray_tune.connected_ray import is_of_a_sweep
@@ -124,7 +124,7 @@ def _is_connected_by_user() -> bool:
 
 @contextlib.contextmanager
 def settled(store: Sweep) -> Iterator[None]:
-    """However the block ends, leave no sweep behind that says it runs; its lock has to be held."""
+    """Ensure that the sweep's record does not say running after the block; its lock has to be held."""
     is_ours = True
     try:
         yield
@@ -132,7 +132,7 @@ def settled(store: Sweep) -> Iterator[None]:
         is_ours = False
         raise
     finally:
-        # What cannot be read or written here was not before either: that error is told, or nothing was to be changed.
+        # If it cannot be read or written here, this was so before too, and that error is reported.
         with current().shielded(), contextlib.suppress(TuneJobsError):
             if is_ours and store.exists():
                 store.clear_stop_request()
@@ -149,9 +149,9 @@ def run_sweep(
     finish: bool,
     progress: str,
 ) -> SweepResult:
-    """Run the unfinished trials of a sweep whose lock is held, then what comes after.
+    """Run the unfinished trials of a sweep whose lock is held, then conclude it.
 
-    A KeyboardInterrupt ends it with what there is: the records are written, whatever was begun.
+    A KeyboardInterrupt ends it with the results so far: the records are written, whatever was begun.
     """
     try:
         return _run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
@@ -171,12 +171,12 @@ def _run_sweep(
     finish: bool,
     progress: str,
 ) -> SweepResult:
-    # From here on whatever an earlier run left, here or on other machines, can't take up a trial any more.
+    # From here on, processes that an earlier run left, here or on other machines, can't take a trial any more.
     run = store.take()
     todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
     if todo:
         if current().came:
-            # While the records were written, which nothing cuts short.
+            # The signal came while the records were written, which is never cut short.
             raise KeyboardInterrupt
         record = store.read_record()
         started = record.started_at or time.time()
@@ -242,18 +242,18 @@ def _run_trials(
                 else:
                     run_trials(job, monitor.update)
             except CannotRunError:
-                # A signal that went to Ray's processes too, as one to a whole group does, is not Ray's failure.
+                # A signal to the whole process group ends Ray's processes too, which is not a failure of Ray.
                 if not current().came:
                     raise
             finally:
-                # Before Ray is shut down: where a part of it died, that takes long, and may end this process.
+                # Done before Ray is shut down: if a part of Ray died, that takes long, and may end this process.
                 with current().shielded(), run.held():
                     close_run(store, started)
 
 
 @contextlib.contextmanager
 def _noted() -> Iterator[None]:
-    """End the block at a KeyboardInterrupt; it is raised again when everything is saved."""
+    """End the block at a KeyboardInterrupt, which is raised again when everything is saved."""
     try:
         yield
     except KeyboardInterrupt:
@@ -261,14 +261,14 @@ def _noted() -> Iterator[None]:
 
 
 def _close_if_open(store: Sweep) -> None:
-    """As `close_run`, where Ray did not come so far that the run began."""
+    """Close the run if Ray failed before the run began."""
     with current().shielded():
         if store.read_record().state == "running":
             close_run(store)
 
 
 def _finished(store: Sweep, result: SweepResult) -> SweepResult:
-    """Choose, confirm and film the winner, and write the report; what can't be made is noted, not raised."""
+    """Choose, confirm and film the winner, and write the report; what can't be made is noted, and raises no error."""
     made = _Finish(store)
     with _noted():
         made.make_all()
@@ -284,7 +284,7 @@ def _finished(store: Sweep, result: SweepResult) -> SweepResult:
 
 
 class _Finish:
-    """What comes after the trials, as far as it was made."""
+    """Makes what comes after the trials, as far as possible."""
 
     def __init__(self, store: Sweep) -> None:
         self._store = store
@@ -293,17 +293,17 @@ class _Finish:
         self.artifacts: dict[str, Path] = {}
         self.notes: list[str] = []
         self.stopped = False
-        """Whether another process asked to stop before all was made."""
+        """Whether another process asked to stop before everything was made."""
         self.failed = False
         """Whether no winner could be confirmed, or the environment failed where it was filmed."""
 
     @property
     def why_no_best(self) -> str | None:
-        """What kept a winner from being chosen."""
+        """Why no winner could be chosen."""
         return None if self._why is None else str(self._why)
 
     def make_all(self) -> None:
-        """Make everything, or what can be made."""
+        """Make everything that can be made."""
         from tune_jobs.sweeps import conclude as finish
 
         try:
@@ -317,7 +317,7 @@ class _Finish:
         self._attempt("report", lambda: {"report": finish.make_report(self._store, self._why)})
 
     def _attempt(self, what: str, make: Callable[[], dict[str, Path]]) -> None:
-        # Another process may have asked: `stop` ends this too.
+        # Another process may have asked to stop, which ends this too.
         self.stopped = self.stopped or self._store.stop_requested()
         if self.stopped:
             return
@@ -325,5 +325,5 @@ class _Finish:
             self.artifacts.update(make())
         except TuneJobsError as error:
             self.notes.append(f"No {what}: {error}")
-            # Else it could not have gone well: not every environment can be drawn.
+            # Other errors are expected, as not every environment can be drawn.
             self.failed = self.failed or isinstance(error, EnvFailedError)

@@ -1,4 +1,4 @@
-"""What a launch would do: the checks of `verbs.launch` in their order, and nothing that stays."""
+"""Find out what a launch would do: make the checks of `verbs.launch` in their order, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -23,18 +23,9 @@ def planned(
     storage: str | Path | None = None,
     address: str | None = None,
 ) -> tuple[SweepSpec, SweepPlan]:
-    """The sweep and the plan that `verbs.launch` would run.
+    """Return the sweep and the plan that `verbs.launch` would run.
 
-    Args:
-        source: As `verbs.launch`.
-        overrides: As `verbs.launch`.
-        name: As `verbs.launch`.
-        storage: As `verbs.launch`.
-        address: As `verbs.launch`.
-
-    Raises:
-        SpecError: As `verbs.launch`.
-        CannotRunError: As `verbs.launch`.
+    Arguments and errors are those of `verbs.launch`.
     """
     spec = load_source(source, overrides)
     if name is not None:

@@ -1,4 +1,4 @@
-"""What is raised where a sweep is ended by a signal."""
+"""The error that is raised when a signal ends a sweep."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 class SweepInterrupted(KeyboardInterrupt):
     """A launch, drive, resume or extend was ended by Ctrl-C, SIGTERM or SIGHUP; what was done is saved.
 
-    A `KeyboardInterrupt`, so that it ends the script that launched, also a loop over launches with an
+    It is a `KeyboardInterrupt`, so that it ends the script that launched the sweep, even a loop over launches with an
     `except Exception` in it.
 
     Args:
-        result: What there is of the sweep; None: it had not begun, and what was there before is as it was.
+        result: The results of the sweep so far; None: it had not begun, and nothing was changed.
     """
 
     def __init__(self, result: SweepResult | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What a person sees while a sweep runs: one table that is redrawn, or a line now and then without a terminal."""
+"""Show a running sweep: a table that is redrawn on a terminal, or else a line from time to time."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ _shares_terminal = False
 
 
 def share_terminal() -> None:
-    """From now on print lines on a terminal too: another process writes there, and would tear a table."""
+    """Print lines on a terminal too from now on, because another process writes there and would break a table."""
     global _shares_terminal  # noqa: PLW0603 (a process has one standard error)
     _shares_terminal = True
 
 
 def describe_point(record: TrialRecord) -> str:
-    """A trial's sampled values in a line."""
+    """Describe a trial's sampled values in one line."""
     if not record.has_point:
         return "chosen at its start"
     return ", ".join(f"{name} {setting_text(value)}" for name, value in record.point.items()) or "no searched values"
 
 
 def render(monitor: SweepMonitor) -> RenderableType:
-    """The live table of a sweep."""
+    """Return the live table of a sweep."""
     counts = monitor.counts()
     total = len(monitor.records)
     finished = sum(count for status, count in counts.items() if status in FINISHED)
@@ -120,7 +120,7 @@ def _running(monitor: SweepMonitor) -> Table:
 
 
 def summary_line(monitor: SweepMonitor) -> str:
-    """The state of a sweep in a line, for logs."""
+    """Describe the state of a sweep in one line, for logs."""
     counts = ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items()))
     estimate = monitor.estimate()
     best = monitor.best()
@@ -137,7 +137,7 @@ def summary_line(monitor: SweepMonitor) -> str:
 
 
 class _Lines:
-    """Prints a line every so often, and at the end."""
+    """Prints a line at regular intervals and at the end."""
 
     def __init__(self, monitor: SweepMonitor, stream: IO[str]) -> None:
         self._monitor = monitor
@@ -162,7 +162,7 @@ class _Lines:
 
 
 class _Screen:
-    """Lets rich ask for the table as it is at that moment."""
+    """Gives rich the present table each time it redraws."""
 
     def __init__(self, monitor: SweepMonitor) -> None:
         self._monitor = monitor
@@ -176,10 +176,10 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
     """Show a sweep on standard error while the block runs; what libraries print there goes to a file instead.
 
     Args:
-        monitor: What to show.
+        monitor: The monitor of the sweep to show.
         progress: `auto`: a table on a terminal, else lines; `none`: nothing.
         log: File for everything else that this process prints.
-        notes: The plan's, shown first.
+        notes: Notes of the plan, which are shown first.
     """
     with quiet(log) as stream:
         if progress != "none":

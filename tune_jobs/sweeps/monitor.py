@@ -1,4 +1,4 @@
-"""What is known of a running sweep: the numbers behind the live table, without the table."""
+"""Sum up a running sweep: the numbers of the live table, without the table."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _RATE_WINDOW_S = 20.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """How fast a sweep goes, and how long it has to go."""
+    """The speed of a sweep and the time that is left."""
 
     env_steps_per_s: float | None
     time_left_s: float | None
 
 
 class SweepMonitor:
-    """Takes trial records as they change and sums them up.
+    """Takes trial records when they change, and sums them up.
 
     Args:
         name: The sweep's name.
         records: Its trials at the start.
         max_env_steps_per_trial: Cap of each trial.
-        max_concurrent: Trials at once.
-        clock: Seconds, monotonic.
+        max_concurrent: How many trials run at once.
+        clock: A monotonic clock, in seconds.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SweepMonitor:
         self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
         self._history: deque[tuple[float, int]] = deque([(self._start, self._num_env_steps)])
         self._selection: Selection | None = None
-        # All records are looked at for it: with a thousand trials too much to do at every report.
+        # It needs all records; with a thousand trials, that takes too long to do at every report.
         self._selection_is_old = True
 
     @property
@@ -72,7 +72,7 @@ class SweepMonitor:
         self.records[record.trial_id] = record
         now = self._clock()
         if self._num_env_steps == self._history[0][1]:
-            # Nothing has been sampled here yet: starting Ray and the processes is no part of the rate.
+            # Nothing was sampled here before: the time to start Ray and the processes must not count for the rate.
             self._history.clear()
         self._history.append((now, self._num_env_steps))
         while len(self._history) > 2 and self._history[1][0] < now - _RATE_WINDOW_S:
@@ -82,11 +82,11 @@ class SweepMonitor:
             self._selection_is_old = True
 
     def counts(self) -> dict[TrialStatus, int]:
-        """Number of trials by status."""
+        """Return the number of trials by status."""
         return dict(Counter(record.status for record in self.records.values()))
 
     def best(self) -> Selection | None:
-        """The winner so far, by the rule that will choose the winner; None while no trial is usable."""
+        """Return the winner so far, by the rule that will choose the winner; None while no trial is usable."""
         if self._selection_is_old:
             self._selection_is_old = False
             try:
@@ -96,7 +96,7 @@ class SweepMonitor:
         return self._selection
 
     def estimate(self) -> Estimate:
-        """Rate over the last seconds, and the time that is left if the other trials take as long as the ended ones."""
+        """Return the rate over the last seconds, and the time left if other trials take as long as those that ended."""
         now = self._clock()
         first_time, first_steps = self._history[0]
         span = now - first_time

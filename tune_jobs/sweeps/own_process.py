@@ -1,4 +1,4 @@
-"""The process that runs a sweep for another one: what it is asked, and what it answers; see `apart`."""
+"""The process that runs a sweep for another one: its requests and its answers; see `apart`."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ from tune_jobs.sweeps.interrupted import SweepInterrupted
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, ASKED)
 RESULT, ERROR, LOG = "result", "error", "log"
-"""What an answer is."""
+"""The kinds of answers."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """A call of a function, and what the process that asks for it has that this one has to have too."""
+    """A call of a function, and the settings of the asking process that this one has to take over."""
 
     function: str
-    """As `module:function`."""
+    """The function's `module:function`."""
     args: tuple[Any, ...]
     kwargs: Mapping[str, Any]
     path: tuple[str, ...]
-    """Where modules are looked for."""
+    """The import path."""
     script: str
-    """As in `sys.argv`: Ray and the guard let their processes find what lies beside it."""
+    """The script in `sys.argv`: Ray and the guard let their processes import what lies beside it."""
     main_file: str | None
-    """None: it is a notebook, or another program without a script."""
+    """The file of the main module; None: the program has no script, as in a notebook."""
     modules: tuple[str, ...]
-    """Those of the user's own that are allowed."""
+    """The user's own modules that are allowed."""
     ray_address: str | None
-    """Of the Ray that it has joined itself; None: it has not."""
+    """The address of the Ray that the asking process has joined itself; None: it has not joined any."""
 
 
 def main(parent: int, descriptor: int) -> None:
     """Do what the parent asks, and answer.
 
     Args:
-        parent: Its process id.
-        descriptor: Of this end of the pipe to it.
+        parent: The parent's process id.
+        descriptor: Descriptor of this end of the pipe to the parent.
     """
     end_with_parent(parent=parent)
     end_in_order(ASKED)
-    # A thread that waits for signals, as services have one, keeps them from the others and from what these start.
+    # In services, a thread that waits for signals blocks them in other threads and in processes these start.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     os.set_inheritable(descriptor, False)  # noqa: FBT003 (takes no keyword)
     connection = Connection(descriptor)
@@ -64,7 +64,7 @@ def main(parent: int, descriptor: int) -> None:
     logging.getLogger().addHandler(telling)
     try:
         answer = (RESULT, _done(connection.recv()))
-    except BaseException as error:  # noqa: BLE001 (KeyboardInterrupt too: whatever it is, the parent raises it)
+    except BaseException as error:  # noqa: BLE001 (the parent raises it, even a KeyboardInterrupt)
         answer = (ERROR, _portable(error))
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
@@ -74,7 +74,7 @@ def main(parent: int, descriptor: int) -> None:
 
 
 def _done(request: Request) -> Any:
-    # It needs NumPy: the signals are handled before.
+    # Imported only here because it needs NumPy: signals have to be handled before.
     from tune_jobs.sweeps.live_table import share_terminal
 
     share_terminal()
@@ -93,7 +93,7 @@ def _done(request: Request) -> Any:
 
 
 def _portable(error: BaseException) -> BaseException:
-    """The error, or one that says the same where it cannot be sent."""
+    """Return the error, or one with the same message if it cannot be pickled."""
     if isinstance(error, KeyboardInterrupt) and not isinstance(error, SweepInterrupted):
         return SweepInterrupted()
     said = "".join(traceback.format_exception(error))
@@ -102,18 +102,18 @@ def _portable(error: BaseException) -> BaseException:
     error.add_note(f"In the process that ran the sweep:\n{said}")
     try:
         pickle.loads(pickle.dumps(error))  # noqa: S301 (our own)
-    except Exception:  # noqa: BLE001 (of an exception of somebody else's)
+    except Exception:  # noqa: BLE001 (exceptions of other code)
         return RuntimeError(f"{type(error).__name__}: {said_by(error)}\n{said}")
     return error
 
 
 class _Telling(logging.handlers.QueueHandler):
-    """Sends log records to the parent, whose settings decide what becomes of them."""
+    """Sends log records to the parent, whose logging settings apply to them."""
 
     def __init__(self, connection: Connection[Any, Any]) -> None:
-        super().__init__(connection)  # type: ignore[arg-type]  # what it is given is for `enqueue` alone
+        super().__init__(connection)  # type: ignore[arg-type]  # only `enqueue` uses it
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """See `QueueHandler.enqueue`."""
+        """Send a log record to the parent."""
         with contextlib.suppress(OSError):
             self.queue.send((LOG, record))  # type: ignore[attr-defined]

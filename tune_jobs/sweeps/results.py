@@ -1,4 +1,4 @@
-"""What a sweep came to: its trials as records and as a table, and its report."""
+"""The results of a sweep: its trials as records and as a table, and its report."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 @checked
 def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[TrialRecord]:
-    """A sweep's trials, by index.
+    """Return the records of a sweep's trials, by index.
 
     Raises:
-        NotFoundError: No such sweep.
+        NotFoundError: There is no such sweep.
     """
     from tune_jobs.store.candidates import read_trials
     from tune_jobs.sweeps.conclude import find_sweep
@@ -29,10 +29,10 @@ def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[Tria
 
 @checked
 def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.DataFrame:
-    """A sweep's trials as a pandas DataFrame, one row a trial: the table `trials.csv` of its report.
+    """Return a sweep's trials as a pandas DataFrame, one row per trial: the table `trials.csv` of its report.
 
     Raises:
-        NotFoundError: No such sweep.
+        NotFoundError: There is no such sweep.
     """
     from analysis.report_data import goal_of
     from analysis.tables import trials_frame
@@ -43,7 +43,7 @@ def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.Dat
     try:
         best = store.read_best()
     except NotFoundError:
-        # None was chosen yet, or it can't be read: then the env's own threshold counts.
+        # No winner was chosen yet, or it can't be read: then the env's own threshold counts.
         best = None
     return trials_frame(read_trials(store), read_results(store), threshold=goal_of(store.read_record(), best))
 
@@ -51,10 +51,10 @@ def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.Dat
 @allowed_again()
 @checked
 def report(sweep: str | Path, *, storage: str | Path | None = None) -> Path:
-    """Write a sweep's report; returns its index.html.
+    """Write a sweep's report and return the path of its index.html.
 
     Raises:
-        NotFoundError: No such sweep.
+        NotFoundError: There is no such sweep.
     """
     from tune_jobs.sweeps.conclude import find_sweep, make_report
 

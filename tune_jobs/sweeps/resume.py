@@ -1,4 +1,4 @@
-"""A sweep that is there goes on: what it is to run more, and that its trials are still the same."""
+"""Resume or extend a sweep: find what is left to run, and check that its trials are still the same."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def go_on(
     progress: str,
     retry_failed: bool,
 ) -> SweepResult:
-    """Run what is missing of a sweep, and so many more samples of its space.
+    """Run what is missing of a sweep, and `num_samples` more samples of its space.
 
     Raises:
-        SpecError: There is nothing to draw more samples from.
-        CannotRunError: It is being run by another process, or cannot run here.
+        SpecError: The space has nothing to draw more samples from.
+        CannotRunError: Another process runs the sweep, or it cannot run here.
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(store.lock())
-        # Asked of a process that was killed.
+        # The request was for a process that was killed.
         store.clear_stop_request()
         stack.enter_context(settled(store))
         record = store.read_record()
@@ -61,28 +61,28 @@ def go_on(
 
 
 def check_same_trials(store: Sweep, plan: SweepPlan) -> None:
-    """Check that planning again gives the trials that are there.
+    """Check that planning again gives the trials that exist.
 
     Raises:
-        CannotRunError: It does not; a resumed trial would train with other values than it began with.
+        CannotRunError: It gives others; a resumed trial would train with other values than it began with.
     """
     planned = {trial.trial_id: trial for trial in plan.trials}
     for record in store.read_trials():
         trial = planned.get(record.trial_id)
-        # A point that is not planned was chosen by the trials before it, which may be more by now.
+        # A point that a search method chose depends on the trials that had ended then, which may be more by now.
         same = trial is not None and (not trial.has_point or trial.hyperparams == record.first_hyperparams)
         if trial is None or trial.seed != record.seed or not same:
             raise CannotRunError(
                 f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: {SWEEP_RECORD} was "
                 "changed, or was written by a version that draws other points.",
-                f"Restore {SWEEP_RECORD}, or launch a new sweep.",
+                f"Restore {SWEEP_RECORD} from a backup, or launch a new sweep.",
             )
 
 
 def _add_trials(
     store: Sweep, record: SweepRecord, spec: SweepSpec, plan: SweepPlan, address: str | None, *, retry_failed: bool
 ) -> None:
-    """Write the records of what a sweep is to run more; nothing if there is nothing to run."""
+    """Write the records of the trials that are added; nothing if there are none to run."""
     known = {trial.trial_id: trial for trial in store.read_trials()}
     todo = []
     for trial in plan.trials:
@@ -93,8 +93,8 @@ def _add_trials(
             todo.append(tried_again(before))
     if not todo and all(trial.status in FINISHED for trial in known.values()):
         return
-    # First that there are to be more: whoever is killed then leaves a sweep that lacks trials, which a resume adds.
-    # Trials that the sweep's spec does not give would be refused for good.
+    # The sweep's record comes first: if this process is killed then, trials are missing, which a resume adds. Trials
+    # that the sweep's spec does not give would be refused for good.
     changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
     store.write_record(record.model_copy(update={**changes, "state": "running"}))
     for trial_record in todo:

@@ -1,4 +1,4 @@
-"""How sweeps stand, by their files and locks."""
+"""The status of sweeps, read from their files and locks."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from tune_jobs.sweeps.storage import storage_folder
 
 @dataclass(frozen=True)
 class SweepStatus:
-    """A sweep in a few numbers."""
+    """The status of a sweep."""
 
     sweep: SweepRecord
     counts: dict[TrialStatus, int]
     """Number of trials by status."""
     alive: bool
-    """Whether a process runs it now."""
+    """Whether a process runs the sweep now."""
 
 
 @checked
 def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStatus:
-    """How a sweep stands.
+    """Return the status of a sweep.
 
     Raises:
-        NotFoundError: No such sweep.
+        NotFoundError: There is no such sweep.
     """
     from tune_jobs.sweeps.conclude import find_sweep
 
@@ -39,7 +39,7 @@ def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStat
 
 @checked
 def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
-    """How every sweep in a storage folder stands, by name; one that cannot be read is left out with a warning."""
+    """Return the status of every sweep in a storage folder, by name; sweeps that cannot be read give a warning."""
     from tune_jobs.store.candidates import leave_out
 
     found = []
@@ -55,7 +55,7 @@ def _status(store: Sweep) -> SweepStatus:
     record, alive = store.read_record(), store.is_driven()
     counts = Counter(trial.status for trial in store.read_trials())
     if record.state == "running" and not alive:
-        # Its process was killed before it could write so.
+        # Its process was killed before it could write that it ended.
         record = record.model_copy(update={"state": "interrupted"})
         counts["paused"] += counts.pop("running", 0)
     return SweepStatus(record, {name: number for name, number in counts.items() if number}, alive)

@@ -1,4 +1,4 @@
-"""Where sweeps are kept, and which folder a new one gets."""
+"""Find the folder that sweeps are stored in, and the folder of a new sweep."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ DEFAULT_STORAGE = "sweeps"
 
 
 def storage_folder(storage: str | Path | None) -> Path:
-    """The given folder, else $TUNE_JOBS_STORAGE, else ./sweeps; absolute."""
+    """Return the given folder, else $TUNE_JOBS_STORAGE, else ./sweeps, as an absolute path."""
     chosen = storage or os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
     return absolute(expanded(chosen))
 
 
 def expanded(path: str | Path) -> Path:
-    """A path as its user means it, with ~ for a home folder; of a user that there is none of, it is a name like any."""
+    """Replace a ~ at the beginning of a path by a home folder; the ~ of an unknown user is kept as a name."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -29,7 +29,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def choose_store(name: str | None, stem: str, storage: Path) -> Sweep:
-    """The folder of a new sweep, not made yet.
+    """Choose the folder of a new sweep, without making it.
 
     Args:
         name: The name that was asked for; None: `stem`, with a number if it is taken.
@@ -37,12 +37,12 @@ def choose_store(name: str | None, stem: str, storage: Path) -> Sweep:
         storage: Folder for sweeps.
 
     Raises:
-        SpecError: The name that was asked for is taken, or is none that a folder can have.
+        SpecError: The name that was asked for is taken, or is not allowed as a folder's name.
     """
     kept = open_storage(storage)
     if name is not None:
         return kept.new_sweep(check_sweep_name(name))
-    # Only the folder's own creation decides who has a name; this finds one that is likely free.
+    # Only the creation of the folder decides whether a name is free; this finds one that is likely free.
     number = 1
     while True:
         candidate = stem if number == 1 else f"{stem}-{number}"
@@ -59,20 +59,20 @@ def choose_store(name: str | None, stem: str, storage: Path) -> Sweep:
 
 
 def stem_of(source: object) -> str:
-    """What a sweep from this source is called where nobody gives a name."""
+    """Return the default name of a sweep from this source."""
     return Path(source).stem if isinstance(source, str | Path) else "sweep"
 
 
 def create_store(name: str | None, stem: str, storage: Path) -> Sweep:
-    """Make the folder of a new sweep; of several processes at once, each gets one of its own.
+    """Make the folder of a new sweep; several processes at once each get one of their own.
 
     Args:
-        name: As `choose_store`.
-        stem: As `choose_store`.
-        storage: As `choose_store`.
+        name: The same as for `choose_store`.
+        stem: The same as for `choose_store`.
+        storage: The same as for `choose_store`.
 
     Raises:
-        SpecError: As `choose_store`.
+        SpecError: In the same cases as `choose_store`.
         CannotRunError: The storage folder cannot be written.
     """
     while True:
@@ -80,7 +80,7 @@ def create_store(name: str | None, stem: str, storage: Path) -> Sweep:
         try:
             store.create()
         except SpecError:
-            # Taken since it was looked for.
+            # It was taken since it was chosen.
             if name is not None:
                 raise
         else:

@@ -1,6 +1,6 @@
-"""Everything one can do with a sweep; the command line and the Python API are this.
+"""Everything one can do with a sweep: the functions behind both the command line and the Python API.
 
-Words: *create* writes a new sweep, *drive* runs it, *launch* does both, *resume* goes on with an interrupted one,
+Words: *create* writes a new sweep, *drive* runs it, *launch* does both, *resume* continues an interrupted one,
 *extend* adds trials to one, *stop* ends one that another process or thread runs. A sweep is named by its folder, or by
 its name in the storage folder.
 """
@@ -51,18 +51,18 @@ def create(
     address: str | None = None,
     rl_module: type[Any] | str | None = None,
 ) -> CreatedSweep:
-    """Write a new sweep, and start nothing: `drive` runs it, from any thread and process.
+    """Write a new sweep without starting anything; `drive` runs it, from any thread and process.
 
     Args:
-        source: As `launch`.
-        overrides: As `launch`.
-        name: As `launch`.
-        storage: As `launch`.
+        source: The same as for `launch`.
+        overrides: The same as for `launch`.
+        name: The same as for `launch`.
+        storage: The same as for `launch`.
         address: Ray cluster that it is for; it is joined only when the sweep is driven. None: this machine.
-        rl_module: As `launch`.
+        rl_module: The same as for `launch`.
 
     Returns:
-        Its name and folder.
+        The sweep's name and folder.
 
     Raises:
         SpecError: The sweep is wrong, or its name is taken. Nothing was written.
@@ -82,21 +82,21 @@ def drive(
     finish: bool = True,
     progress: Progress = "auto",
 ) -> SweepResult:
-    """Run a sweep that was created, or what is missing of one, to its end; the process is as before then.
+    """Run a sweep that was created, or what is missing of one, to its end; this process is afterwards as before.
 
-    In another thread than the main one, and where this process runs a sweep already, it is run in a child process.
+    In a thread other than the main one, or if this process runs a sweep already, the sweep is run in a child process.
 
     Args:
         sweep: Name or folder.
         storage: Folder for sweeps.
         address: Ray cluster to run on; None: the one that it was created for or ran on last, mostly this machine.
-        finish: As `launch`.
-        progress: As `launch`.
+        finish: The same as for `launch`.
+        progress: The same as for `launch`.
 
     Raises:
-        NotFoundError: No such sweep.
-        CannotRunError: It is being run by another process or thread, cannot run here, or Ray died.
-        SweepInterrupted: As `launch`; what was created is kept.
+        NotFoundError: There is no such sweep.
+        CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
+        SweepInterrupted: In the same cases as `launch`; what was created is kept.
     """
     from tune_jobs.sweeps.conclude import find_sweep
 
@@ -126,24 +126,24 @@ def launch(
         name: Name of the sweep and its folder; None: the spec's, else the source's with a number if it is taken.
         storage: Folder for sweeps; None: $TUNE_JOBS_STORAGE, else ./sweeps.
         address: Ray cluster to run on; None: this machine.
-        finish: Also choose and confirm the best, film it and write the report.
-        progress: `auto`: a table on a terminal, else lines, as in another thread than the main one; or `none`.
+        finish: Whether to choose and confirm the best policy, film it and write the report afterwards.
+        progress: `auto`: a table on a terminal, else lines, also in threads other than the main one; or `none`.
         rl_module: An RLModule class of your own, or its `module:Class`; None: the source's, mostly none.
 
     Returns:
-        The records, and where each result lies. Failed trials are in the records; they raise nothing.
+        The records, and the path of each result. Failed trials are in the records; they raise no error.
 
     Raises:
         SpecError: The sweep is wrong, or its name is taken. Nothing was written.
         CannotRunError: It cannot run here, and nothing was written; or Ray died, and what is done can be resumed.
         SweepInterrupted: Ctrl-C, SIGTERM or SIGHUP ended it, and what is done is saved. It is a KeyboardInterrupt; an
-            end by `stop` raises nothing.
+            end by `stop` raises no error.
     """
     if can_drive():
         return _launch_here(
             source, overrides, name, storage, address, finish=finish, progress=progress, rl_module=rl_module
         )
-    # The source may hold classes, and what is wrong with it is told here.
+    # The source may hold classes, and errors in it are raised here.
     created = create(source, overrides=overrides, name=name, storage=storage, address=address, rl_module=rl_module)
     with removed_if_not_begun(created):
         return drive(created.folder, finish=finish, progress=progress)
@@ -165,7 +165,7 @@ def _launch_here(
     spec = load_source(source, overrides, rl_module)
     names = (name if name is not None else spec.name, stem_of(source), storage_folder(storage))
     choose_store(*names)
-    # Here and not only on the cluster's machine, so that a bad env or point is known before Ray starts.
+    # Planned here and not only on the cluster, so that a bad env or point is found before Ray starts.
     machine = machine_here() if address is None else None
     plan = make_plan(spec, machine) if machine is not None else None
     with contextlib.ExitStack() as stack:
@@ -200,23 +200,23 @@ def resume(
     progress: Progress = "auto",
     retry_failed: bool = False,
 ) -> SweepResult:
-    """Run what is missing of a sweep: trials that had begun go on from their latest checkpoints.
+    """Run what is missing of a sweep: trials that had begun continue from their latest checkpoints.
 
-    Such a trial begins new episodes there, and DQN fills its replay memory anew: its numbers differ from those of a
-    trial that nothing has interrupted.
+    Such a trial begins new episodes, and DQN fills its replay memory anew, so its numbers differ from those of a trial
+    that was never interrupted.
 
     Args:
         sweep: Name or folder.
         storage: Folder for sweeps.
         address: Ray cluster to run on; it need not be the one it began on.
-        finish: As `launch`.
-        progress: As `launch`.
+        finish: The same as for `launch`.
+        progress: The same as for `launch`.
         retry_failed: Run failed trials again too, from their latest checkpoints.
 
     Raises:
-        NotFoundError: No such sweep.
-        CannotRunError: It is being run by another process or thread, cannot run here, or Ray died.
-        SweepInterrupted: As `launch`.
+        NotFoundError: There is no such sweep.
+        CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
+        SweepInterrupted: In the same cases as `launch`.
     """
     from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.resume import go_on
@@ -243,14 +243,14 @@ def extend(
         num_samples: How many random draws to add for each combination of the grids' values.
         storage: Folder for sweeps.
         address: Ray cluster to run on.
-        finish: As `launch`.
-        progress: As `launch`.
+        finish: The same as for `launch`.
+        progress: The same as for `launch`.
 
     Raises:
         SpecError: num_samples is not positive, or the space has nothing random to draw.
-        NotFoundError: No such sweep.
-        CannotRunError: It is being run by another process or thread, cannot run here, or Ray died.
-        SweepInterrupted: As `launch`.
+        NotFoundError: There is no such sweep.
+        CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
+        SweepInterrupted: In the same cases as `launch`.
     """
     from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.resume import go_on
@@ -264,7 +264,7 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
     """Ask the process that runs a sweep to stop; its running trials save a checkpoint first.
 
     Returns:
-        Whether a process runs it.
+        Whether a process runs the sweep.
     """
     from tune_jobs.sweeps.conclude import find_sweep
 
@@ -281,7 +281,7 @@ def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: 
     """Choose a sweep's winner, confirm it on fresh seeds, and copy its policy to best/.
 
     Raises:
-        NotFoundError: No such sweep, or no trial of it can win (the message says why).
+        NotFoundError: There is no such sweep, or none of its trials can win (the message says why).
     """
     from tune_jobs.sweeps.conclude import choose_best, find_sweep
 
@@ -305,10 +305,10 @@ def evaluate(
     Args:
         source: A sweep (its best), `SWEEP/TRIAL`, a checkpoint folder, a policy file, `random` or `constant`.
         storage: Folder for sweeps.
-        num_episodes: How many.
+        num_episodes: How many episodes.
         first_seed: Seeds are this and the next ones; None: seeds that no training or selection uses.
-        env_id: Another environment than the policy's own; needed for a baseline.
-        action: What `constant` does; None: 0.
+        env_id: An environment other than the policy's own; needed for a baseline.
+        action: The action of `constant`; None: 0.
 
     Returns:
         The policy's record, and the random policy's.
@@ -336,14 +336,14 @@ def video(
     """Film a policy.
 
     Args:
-        source: As `evaluate`.
+        source: The same as for `evaluate`.
         storage: Folder for sweeps.
         output: File to write, as .mp4 and as .gif; or a folder, that exists or whose name ends with `/`, for files
             called after policy and environment. None: into a sweep's best/ (with the random policy before, and both
             side by side), else into the current folder.
         seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
-        env_id: Another environment than the policy's own; needed for a baseline.
-        action: What `constant` does; None: 0.
+        env_id: An environment other than the policy's own; needed for a baseline.
+        action: The action of `constant`; None: 0.
 
     Returns:
         The files.
@@ -363,19 +363,19 @@ def video(
 
 
 def _film_path(output: str | Path | None, name: str) -> Path:
-    """The file of a film, which is called so where `output` names no file."""
+    """Return the path of a film; it gets the name `name` if `output` names no file."""
     if output is None:
         return Path(name)
     path = expanded(output)
     if str(output).endswith("/") or path.is_dir():
         return path / name
-    # Of another ending, such as that of `cartpole-v0.5`, nothing is cut.
+    # Another suffix, such as that of `cartpole-v0.5`, is kept.
     return path if path.suffix.lower() in (".mp4", ".gif") else path.with_name(f"{path.name}.mp4")
 
 
 @checked
 def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorithm:
-    """Restore a checkpoint as an RLlib `Algorithm` that can train on.
+    """Restore a checkpoint as an RLlib `Algorithm` that can continue training.
 
     Checkpoints of the rllib engine are pickles: restore only sweeps you trust.
 
@@ -385,7 +385,7 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
 
     Raises:
         NotFoundError: There is no such checkpoint.
-        CheckpointError: It is damaged, of a baseline, or does not restore to the very weights that were saved.
+        CheckpointError: It is damaged, of a baseline, or cannot be restored with exactly the weights that were saved.
     """
     from tune_jobs.sweeps.conclude import find_trained_checkpoint
     from tune_jobs.training.registry import restore_checkpoint

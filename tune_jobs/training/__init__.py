@@ -1,1 +1,1 @@
-"""One trial, or one pack of trials, from start to end, on whichever engine."""
+"""Run one trial, or one pack of trials, from start to end, on any engine."""

@@ -1,7 +1,7 @@
-"""The `baseline` engine: plays episodes with a policy that does not learn; neither ray nor torch.
+"""The `baseline` engine: it plays episodes with a policy that does not learn, without ray and torch.
 
-A trial of it looks like any other, with results, evaluations, checkpoints and a portable policy, so that a sweep of
-random play is reported, filmed and compared as a sweep of PPO is.
+Its trials look like any others, with results, evaluations, checkpoints and a portable policy, so that a sweep of random
+play is reported, filmed and compared in the same way as a sweep of PPO.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ STATE_FILE = "baseline.json"
 
 
 class BaselineEngine:
-    """See `TrainingEngine`."""
+    """The engine of trials that do not learn; implements `TrainingEngine`."""
 
     def __init__(self) -> None:
         self._env: gym.vector.VectorEnv[Any, Any, Any] | None = None
 
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
-        """See `TrainingEngine.build`."""
+        """Make the policy and the environments of a trial, fresh or with the counters of a checkpoint."""
         self.close()
         hyperparams = make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams)
         assert isinstance(hyperparams, RandomHyperparams)
@@ -45,21 +45,21 @@ class BaselineEngine:
         seed = task.seed
         if checkpoint is not None:
             self._iteration, self._num_env_steps = _read_state(checkpoint / STATE_FILE)
-            # Other episodes than those it has played already.
+            # New seeds, so that it does not repeat the episodes it has played already.
             seed, _ = random_streams.seeds_after(task.seed, self._iteration)
-        # The failure penalty is for learning alone: returns are those of the env itself.
+        # The failure penalty is only for learning: returns are sums of the env's own rewards.
         env = make_vector_env(task.env_id, task.env_args, hyperparams.num_envs)
         self._env = CheckedEnvs(env, task.env_id)
         self._policy: Policy = policy_from_portable(self.policy())
         if isinstance(self._policy, Resettable):
             self._policy.reset(seed)
         self._observations, _ = self._env.reset(seed=seed)
-        self._returns: NDArray[np.float64] = np.zeros(hyperparams.num_envs)  # of the running episodes
+        self._returns: NDArray[np.float64] = np.zeros(hyperparams.num_envs)  # returns of the running episodes so far
         self._lengths: NDArray[np.int64] = np.zeros(hyperparams.num_envs, dtype=np.int64)
         self._ended: NDArray[np.bool_] = np.zeros(hyperparams.num_envs, dtype=np.bool_)
 
     def train_iteration(self) -> IterationStats:
-        """See `TrainingEngine.train_iteration`: plays, and trains nothing."""
+        """Play for one iteration; nothing is trained."""
         assert self._env is not None
         goal = self._num_env_steps + self._hyperparams.env_steps_per_iteration
         finished: list[tuple[float, int]] = []
@@ -79,7 +79,7 @@ class BaselineEngine:
         return IterationStats(num_env_steps=self._num_env_steps, episodes=tuple(finished))
 
     def policy(self) -> PortablePolicy:
-        """See `TrainingEngine.policy`."""
+        """Return the policy, which never changes."""
         assert self._env is not None
         task = self._task
         return baseline_policy(
@@ -97,12 +97,12 @@ class BaselineEngine:
         )
 
     def save(self, folder: Path) -> None:
-        """See `TrainingEngine.save`: how far it has played. Restored, it begins new episodes."""
+        """Write the counters into an empty folder; a restored trial begins new episodes."""
         state = {"iteration": self._iteration, "num_env_steps": self._num_env_steps}
         (folder / STATE_FILE).write_text(json.dumps(state) + "\n", encoding="utf-8")
 
     def close(self) -> None:
-        """See `TrainingEngine.close`."""
+        """Close the environments."""
         if self._env is not None:
             self._env.close()
             self._env = None

@@ -1,7 +1,7 @@
-"""The env runner of this engine, under a name in tune_jobs.
+"""The env runner of the rllib engine, under a name in tune_jobs.
 
-An env runner in a process of its own unpickles its class there before anything else: by this name it imports
-tune_jobs first, which settles what `policies` means (see `tune_jobs/process/own_packages.py`).
+A process of an env runner first unpickles its class. With a class in tune_jobs it imports tune_jobs first, which
+decides what `policies` means (see `tune_jobs/process/own_packages.py`).
 """
 
 from __future__ import annotations
@@ -10,4 +10,4 @@ from policies.rllib.env_runner import ArrayEnvRunner
 
 
 class EnvRunner(ArrayEnvRunner):
-    """`ArrayEnvRunner`, found by way of tune_jobs."""
+    """`ArrayEnvRunner`, under a name that imports tune_jobs first."""

@@ -1,7 +1,7 @@
-"""The trials of one pack from start to end, trained and evaluated together.
+"""Run the trials of one pack from start to end, trained and evaluated together.
 
-Each goes by the rules of `tune_jobs.training.trial_loop`.
-A member that fails is tried again by itself, from its latest checkpoint; the others do not notice.
+Each follows the rules of `tune_jobs.training.trial_loop`. A member that fails is retried by itself, from its latest
+checkpoint, without any effect on the others.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ from tune_jobs.training.trial_loop import TrialLoop
 _NUM_WRITERS = 8
 
 EvaluateMany = Callable[[Evaluator, Sequence[Policy]], Sequence[Episodes | Exception]]
-"""`policies.packed.evaluation.evaluate_many`: of each policy its greedy episodes, or why there are none."""
+"""The type of `policies.packed.evaluation.evaluate_many`: it returns each policy's greedy episodes, or its error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MemberReport:
-    """News of one member: how far it is, that it failed, or that another process has it by now."""
+    """A report on one member: its progress, its failure, or that another process has taken it over."""
 
     trial_id: str
     progress: Progress | None = None
     error: str | None = None
-    """What made it fail, and the end of its log."""
+    """Why it failed, and the end of its log."""
     reached: Reached | None = None
-    """How far one that failed was; None: it is not known here."""
+    """How far a member that failed had come; None: it is not known here."""
     retried: bool = False
-    """Whether it goes on from its latest checkpoint: at once, or if it was to leave, when the sweep is resumed."""
+    """Whether it is retried from its latest checkpoint: at once, or when the sweep is resumed if it had to leave."""
     lost: bool = False
-    """Whether another process has taken it up: no failure of it, and nothing of it is known here any more."""
+    """Whether another process has taken it over; it has not failed, and nothing more about it is known here."""
 
 
 class _MemberEngine:
-    """A member of a pack, as the engine of one trial; what is done together is not done here.
+    """A member of a pack, in the form of an engine for one trial; it does only what concerns this member.
 
     Args:
-        pack: Trains it.
-        trial_id: Of the member.
-        lock: Held while the pack's engine is asked to save; checkpoints are written by several threads.
+        pack: The engine that trains the member.
+        trial_id: The member's id.
+        lock: Held while the pack's engine saves, because several threads write checkpoints.
     """
 
     def __init__(self, pack: PackEngine, trial_id: str, lock: threading.Lock) -> None:
@@ -78,7 +78,7 @@ class _MemberEngine:
         raise NotImplementedError("The members of a pack are trained together.")
 
     def policy(self) -> PortablePolicy:
-        # Evaluated and saved it is the same one.
+        # The policy that is evaluated is the one that is saved.
         if self._policy is None:
             self._policy = self._pack.policy(self._trial_id)
         return self._policy
@@ -97,7 +97,7 @@ class _MemberEngine:
 
 
 class _TrialInPack:
-    """A trial of the pack; every try of it has an engine and a loop of its own."""
+    """A trial of the pack; every attempt has an engine and a loop of its own."""
 
     def __init__(self, task: TrialTask, num_failures: int) -> None:
         self.task = task
@@ -110,24 +110,24 @@ class _TrialInPack:
 
     @property
     def trial(self) -> TrialLoop:
-        """Its loop, once it is open."""
+        """The trial's loop, after it was opened."""
         assert self.loop is not None
         return self.loop
 
     def take(self, stats: IterationStats) -> bool:
-        """Take what an iteration gave; whether it is to be evaluated."""
+        """Take the results of an iteration, and return whether the trial has to be evaluated."""
         assert self.engine is not None
         self.engine.trained()
         is_due = self.trial.take(stats)
         is_checkpoint = (self.trial.iteration + 1) % self.task.checkpoints.every_iterations == 0
         if is_checkpoint:
-            # The pack's weights are looked at by this thread; others only write what it has found.
+            # Only this thread reads the pack's weights; other threads only write what it has read.
             self.engine.policy()
         self.may_save = is_due or is_checkpoint
         return is_due
 
     def close(self) -> None:
-        """Free it; what it did is written."""
+        """Free the trial; its results are written."""
         try:
             if self.loop is not None:
                 self.loop.flush()
@@ -139,17 +139,17 @@ class _TrialInPack:
 
 
 class PackLoop:
-    """Runs the trials of one pack; they come and go.
+    """Runs the trials of one pack; they can be added and removed at any time.
 
     Args:
-        engine: Trains them.
+        engine: Trains the trials.
         evaluator: The sweep's environment and evaluation seeds.
-        evaluate: Evaluates several policies with it.
-        stop_requested: Whether all are to save and pause.
-        max_retries: How often a member that fails is tried again.
-        watch: Makes what is entered around everything that may hang, for the seconds it may take.
-        clock: Seconds, monotonic.
-        under: The pack, as long as it is run: its members are taken up under it.
+        evaluate: Evaluates several policies with the evaluator.
+        stop_requested: Returns whether all trials have to save and pause.
+        max_retries: How often a member that fails is retried.
+        watch: Takes a time limit in seconds and returns a context manager, entered around everything that may hang.
+        clock: A monotonic clock, in seconds.
+        under: The ownership of the pack; its members are taken only while it holds.
     """
 
     def __init__(
@@ -175,16 +175,16 @@ class PackLoop:
         self._members: dict[str, _TrialInPack] = {}
         self._reports: list[MemberReport] = []
         self._lock = threading.Lock()
-        # Saving is waiting for the disk, for which one need not wait for the other.
+        # Saving mostly waits for the disk, so several members save at once.
         self._writers = ThreadPoolExecutor(_NUM_WRITERS, "checkpoints")
 
     @property
     def trial_ids(self) -> tuple[str, ...]:
-        """Those that are trained now, in the order in which they came."""
+        """The trials that are trained now, in the order in which they were added."""
         return tuple(self._members)
 
     def add(self, task: TrialTask, num_failures: int = 0) -> None:
-        """Take a trial in; it is built before the next iteration.
+        """Add a trial; it is built before the next iteration.
 
         Args:
             task: The trial.
@@ -193,7 +193,7 @@ class PackLoop:
         self._members[task.trial_id] = _TrialInPack(task, num_failures)
 
     def end(self, trial_id: str) -> None:
-        """Save a member and let it go; it is reported as stopped."""
+        """Save a member and remove it; it is reported as stopped."""
         member = self._members[trial_id]
         if member.loop is None:
             del self._members[trial_id]
@@ -202,20 +202,20 @@ class PackLoop:
             self._attempt(leave, saves=False, leaves=True)
 
     def advance(self, max_s: float, *, until_evaluated: bool) -> list[MemberReport]:
-        """Train until there is something to decide, or for max_s seconds.
+        """Train until there is something to decide, or for `max_s` seconds.
 
         Args:
-            max_s: Seconds, at least one iteration.
+            max_s: Seconds; at least one iteration is made.
             until_evaluated: Whether to return as soon as a member was evaluated.
 
         Returns:
-            Each evaluation, each end and each failure since the last call, and where the other members stand.
+            Reports on each evaluation, end and failure since the last call, and on the progress of the other members.
 
         Raises:
-            Exception: What concerns no single member.
+            Exception: An error that concerns no single member.
         """
         deadline = self._clock() + max_s
-        # When so few are left, others could have had the slots of those that ended.
+        # With so few members left, other trials could use the slots of those that ended.
         few = 3 * len(self._members) // 4
         try:
             while self._members:
@@ -232,7 +232,7 @@ class PackLoop:
         return reports
 
     def _one_iteration(self) -> bool:
-        """Train all once and evaluate those whose turn it is; whether there were any."""
+        """Train all members once and evaluate those that are due; return whether there were any members."""
         while new := [member for member in self._members.values() if member.loop is None]:
             for member in new:
                 self._open(member)
@@ -277,12 +277,12 @@ class PackLoop:
     def _attempt(
         self, acts: Mapping[_TrialInPack, Callable[[], Progress | None]], *, saves: bool, leaves: bool = False
     ) -> None:
-        """Do what concerns single members: what goes wrong with one is its own failure.
+        """Do something for each of some members; an error is a failure of that member only.
 
         Args:
-            acts: What to do for each.
-            saves: Whether that may write checkpoints.
-            leaves: Whether those that go wrong are to leave.
+            acts: The function to call for each member.
+            saves: Whether the functions may write checkpoints.
+            leaves: Whether members that fail have to leave the pack.
         """
         outcomes = self._writers.map(_outcome, acts.values()) if saves else map(_outcome, acts.values())
         for member, outcome in zip(acts, outcomes, strict=True):
@@ -320,9 +320,9 @@ class PackLoop:
             self._failed(member, error)
 
     def _failed(self, member: _TrialInPack, error: Exception, *, leaves: bool = False) -> None:
-        """Report a failure; the member is opened again, if it may be and was not to leave."""
+        """Report a failure; the member is opened again if it may be retried and need not leave."""
         if _is_lost(member, error):
-            _log(member.task, "another process trains this trial by now; this one leaves it")
+            _log(member.task, "another process trains this trial by now, so this process stops training it")
             self._reports.append(MemberReport(member.task.trial_id, lost=True))
             with contextlib.suppress(OwnershipLostError):
                 member.close()
@@ -342,7 +342,7 @@ class PackLoop:
 
 
 def _is_lost(member: _TrialInPack, error: Exception) -> bool:
-    """Whether what went wrong is that another process has the member, or may come from that."""
+    """Whether an error says, or may be caused by, that another process has taken the member over."""
     if isinstance(error, OwnershipLostError):
         return True
     try:
@@ -368,5 +368,5 @@ def _describe(task: TrialTask, error: Exception) -> str:
 
 
 def _log(task: TrialTask, text: str) -> None:
-    """Append to a member's own log; the output of the process goes to the pack's."""
+    """Append to a member's own log; the output of the process goes to the pack's log."""
     open_sweep(task.sweep_folder).trial(task.trial_id).write_log(text)

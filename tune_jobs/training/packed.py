@@ -1,4 +1,4 @@
-"""The `packed` engine: many trials in one process, their networks stacked into one tensor program."""
+"""The `packed` engine: it trains many trials in one process, their networks stacked into one tensor program."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ from tune_jobs.training.protocol import IterationStats, TrialTask
 
 
 class PackedEngine:
-    """See `PackEngine`. Trials that cannot share a stack get stacks of their own, which take turns.
+    """The engine of packs; implements `PackEngine`.
+
+    Trials that cannot share a stack get stacks of their own, which take turns.
 
     Args:
-        env_kind: How environments are stepped; None: what `choose_kind` measures.
-        num_env_processes: Processes for environments, where the kind has them.
-        device: Of the updates; None: a GPU if this process has been given one, else the CPU.
-        num_turns: Stacks that trials of one kind are spread over: one samples on the CPU while another's updates run on
-            the GPU. None: two where there is a GPU, else one.
+        env_kind: How environments are stepped; None: `choose_kind` decides by a measurement.
+        num_env_processes: Processes for environments, if the kind uses any.
+        device: Where updates are computed; None: on a GPU if this process has one, else on the CPU.
+        num_turns: The number of stacks that trials of one kind are spread over: one samples on the CPU while another's
+            updates run on the GPU. None: two with a GPU, else one.
     """
 
     def __init__(
@@ -44,7 +46,7 @@ class PackedEngine:
         device: str | None = None,
         num_turns: int | None = None,
     ) -> None:
-        # Small networks run up to several times slower on more than one thread, and packs share the cores.
+        # Small networks are up to several times slower on more than one thread, and packs share the cores.
         torch.set_num_threads(1)
         self._env_kind, self._num_env_processes, self._device = env_kind, num_env_processes, device
         self._num_turns = num_turns
@@ -52,8 +54,8 @@ class PackedEngine:
         self._tasks: dict[str, tuple[TrialTask, Hashable]] = {}
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
-        """See `PackEngine.add`."""
-        # Validated where the values came from, the sweep file; this turns JSON back into the typed object.
+        """Add a trial, fresh or exactly as a checkpoint folder holds it."""
+        # The values were validated with the sweep file; this turns JSON back into the typed object.
         hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
         device = self._device or ("cuda" if task.num_gpus and torch.cuda.is_available() else "cpu")
         key = self._place(task, hyperparams, device)
@@ -65,7 +67,7 @@ class PackedEngine:
             env_seed = task.seed
             if checkpoint is not None:
                 member = _restored(member, checkpoint)
-                # Other numbers than at the trial's start: its environments begin new episodes.
+                # Other seeds than at the trial's start, because its environments begin new episodes.
                 env_seed = random_streams.member_env_seed_after(task.seed, member.num_iterations)
             member.failure_penalty = task.failure_penalty
             stack.add(member, env_seed)
@@ -77,7 +79,7 @@ class PackedEngine:
         self._tasks[task.trial_id] = (task, key)
 
     def _place(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Hashable:
-        """The key of the stack that a new member goes to: of those of its kind, the one with fewest."""
+        """Return the key of the stack for a new member: the one of its kind with the fewest members."""
         kind = (pack_key(hyperparams), task.env_id, json.dumps(task.env_args), task.failure_penalty)
         num_turns = self._num_turns or (2 if device.startswith("cuda") else 1)
 
@@ -100,7 +102,7 @@ class PackedEngine:
         return make_stack(hyperparams, envs, device)
 
     def train_iteration(self) -> dict[str, IterationStats | Exception]:
-        """See `PackEngine.train_iteration`."""
+        """Train every member for one iteration; the stacks take turns."""
         results: dict[str, IterationStats | Exception] = {}
         for stack in self._stacks.values():
             stack.begin_iteration()
@@ -111,7 +113,7 @@ class PackedEngine:
         return results
 
     def policy(self, trial_id: str) -> PortablePolicy:
-        """See `PackEngine.policy`."""
+        """Return the current greedy policy of a member."""
         task, stack = self._member_of(trial_id)
         member = stack.member(trial_id)
         training = {
@@ -130,12 +132,12 @@ class PackedEngine:
         )
 
     def save(self, trial_id: str, folder: Path) -> None:
-        """See `PackEngine.save`."""
+        """Write a member's state into an empty folder."""
         _, stack = self._member_of(trial_id)
         save_member(stack.member(trial_id), folder / STATE_FOLDER)
 
     def remove(self, trial_id: str) -> None:
-        """See `PackEngine.remove`."""
+        """Forget a member."""
         _, stack = self._member_of(trial_id)
         stack.remove(trial_id)
         _, key = self._tasks.pop(trial_id)
@@ -144,7 +146,7 @@ class PackedEngine:
             del self._stacks[key]
 
     def close(self) -> None:
-        """See `PackEngine.close`."""
+        """Close the environments of all stacks."""
         for stack in self._stacks.values():
             stack.envs.close()
         self._stacks.clear()
@@ -156,17 +158,17 @@ class PackedEngine:
 
 
 def _restored(fresh: AnyMember, checkpoint: Path) -> AnyMember:
-    """The member of a checkpoint, if it is one of the same network."""
+    """Return the member of a checkpoint, if it has the same network as a fresh one."""
     folder = checkpoint / STATE_FOLDER
     if not folder.is_dir():
         raise CheckpointError(
-            f"Checkpoint {checkpoint} has no folder {STATE_FOLDER!r}: it is not of the packed engine.",
+            f"Checkpoint {checkpoint} has no folder {STATE_FOLDER!r}: the packed engine did not write it.",
             "Resume the trial with the engine it began on.",
         )
     member = load_member(folder, fresh.member_id)
     if member.hyperparams != fresh.hyperparams or member.seed != fresh.seed:
         raise CheckpointError(
-            f"Checkpoint {checkpoint} is of other hyperparameters or another seed than trial {fresh.member_id} has.",
+            f"Checkpoint {checkpoint} has other hyperparameters or another seed than trial {fresh.member_id}.",
             f"Restore {TRIAL_RECORD}, or use another checkpoint of the trial.",
         )
     check_shapes(member, fresh.weights)

@@ -1,6 +1,6 @@
-"""What an engine is: the one thing that knows how a trial's iterations are computed.
+"""The protocol of engines, which compute the iterations of trials.
 
-Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is `tune_jobs.training.trial_loop`'s
+Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is in `tune_jobs.training.trial_loop`
 and the same for all engines. There are two kinds: those that train one trial at a time, and those that train a pack
 of them together (`tune_jobs.training.pack_loop`). This module imports no ray, so that both sides can import it.
 """
@@ -18,7 +18,7 @@ from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 
 @dataclass(frozen=True)
 class TrialTask:
-    """Everything a process needs to run one trial, or to go on with it."""
+    """Everything a process needs to begin or continue one trial."""
 
     sweep_folder: Path
     trial_id: str
@@ -27,7 +27,7 @@ class TrialTask:
     hyperparams: dict[str, Any]
     env_id: str
     env_args: dict[str, Any]
-    """With `frame_stack` and `pixels`, if the spec sets them: evaluation and videos need them too."""
+    """The env's arguments, with `frame_stack` and `pixels` if the spec sets them."""
     stop: StopSpec
     evaluation: EvaluationSpec
     checkpoints: CheckpointSpec
@@ -36,42 +36,42 @@ class TrialTask:
     num_gpus: float = 0.0
     iteration_timeout_s: float = 600.0
     failure_penalty: float | None = None
-    """For training only; see `EnvSpec`."""
+    """The failure penalty, for training only; see `EnvSpec`."""
     rl_module: str | None = None
-    """`module:Class` of a user's own RLModule."""
+    """`module:Class` of a user's own RLModule; None: ours."""
     changes: tuple[ChangeRecord, ...] = ()
-    """What population based training changed, oldest first."""
+    """The changes of population based training, oldest first."""
     num_env_steps: int = 0
-    """Env steps the trial has done when it is built; the checkpoint it is built from may count another trial's."""
+    """Env steps of the trial when it is built; its checkpoint may be a copy with the count of another trial."""
     num_iterations: int = 0
-    """The same for iterations."""
+    """Iterations of the trial when it is built."""
     engine: str = ""
-    """Name of the engine that trains it, which its checkpoints' manifests name; empty: they name none."""
+    """The engine's name for the manifests of checkpoints; empty: they name none."""
 
 
 @dataclass(frozen=True)
 class IterationStats:
-    """What one iteration gave."""
+    """The results of one iteration."""
 
     num_env_steps: int
     """Env steps of the trial so far."""
     episodes: tuple[tuple[float, int], ...] = ()
-    """(undiscounted return, env steps) of each whole episode that ended in it."""
+    """The undiscounted return and the env steps of each whole episode that ended."""
     learner: dict[str, float] = field(default_factory=dict)
-    """Losses, entropy, learning rate and the like, of the last update."""
+    """Metrics of the last update, such as losses, entropy and learning rate."""
 
 
 class TrainingEngine(Protocol):
-    """Trains one trial at a time; reused for the next by another `build`."""
+    """Trains one trial at a time; another `build` reuses it for the next trial."""
 
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Make the networks and environments of a trial, fresh or exactly as a checkpoint folder holds them.
 
-        The checkpoint may be of another trial or other hyperparameters (population based training): then the task's
-        hyperparameters act, on the weights, optimizer state and target networks of the checkpoint.
+        The checkpoint may come from another trial or have other hyperparameters (population based training): then the
+        task's hyperparameters are used with the weights, optimizer state and target networks of the checkpoint.
 
         Raises:
-            CheckpointError: The checkpoint cannot be restored. Never starts afresh instead.
+            CheckpointError: The checkpoint cannot be restored. The trial never starts afresh instead.
         """
         ...
 
@@ -80,27 +80,27 @@ class TrainingEngine(Protocol):
         ...
 
     def policy(self) -> PortablePolicy:
-        """The current greedy policy."""
+        """Return the current greedy policy."""
         ...
 
     def save(self, folder: Path) -> None:
-        """Write what `build` needs into an empty folder."""
+        """Write the state that `build` restores into an empty folder."""
         ...
 
     def close(self) -> None:
-        """Free everything; `build` may follow."""
+        """Free everything; `build` may be called again."""
         ...
 
 
 class PackEngine(Protocol):
-    """Trains many trials together, the members of a pack; they come and go."""
+    """Trains many trials together, the members of a pack, which can be added and removed."""
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
-        """Take in a trial, fresh or exactly as a checkpoint folder holds it; the other members do not notice.
+        """Add a trial, fresh or exactly as a checkpoint folder holds it, without any effect on other members.
 
         Raises:
-            CheckpointError: The checkpoint cannot be restored. Never starts afresh instead.
-            Exception: The trial cannot be built; it is no member then.
+            CheckpointError: The checkpoint cannot be restored. The trial never starts afresh instead.
+            Exception: The trial cannot be built; then it is not added.
         """
         ...
 
@@ -108,21 +108,21 @@ class PackEngine(Protocol):
         """Train every member for one iteration.
 
         Returns:
-            By trial id, of every member: what the iteration gave, or why the member failed. One that failed stays until
-            it is removed; the others have been trained.
+            For every member, by trial id, the results of the iteration or the error of the member. A member that failed
+            stays until it is removed; the others have been trained.
         """
         ...
 
     def policy(self, trial_id: str) -> PortablePolicy:
-        """The current greedy policy of a member."""
+        """Return the current greedy policy of a member."""
         ...
 
     def save(self, trial_id: str, folder: Path) -> None:
-        """Write what `add` needs into an empty folder."""
+        """Write the state that `add` restores into an empty folder."""
         ...
 
     def remove(self, trial_id: str) -> None:
-        """Forget a member; the others do not notice."""
+        """Forget a member, without any effect on the others."""
         ...
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
-"""Engines by their names: made, told from a checkpoint, and asked to restore one.
+"""Make engines by their names, find the engine of a checkpoint, and restore checkpoints.
 
-The table is `tune_jobs.spec.engines`. What it names is imported here and not before it is used: the driver of a sweep
-needs neither ray's RLlib nor torch, and a pack's process needs no ray.
+The table is `tune_jobs.spec.engines`. The modules that it names are imported here, only when they are used: the driver
+of a sweep needs neither RLlib nor torch, and a pack's process needs no ray.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 
 def make_engine(name: str) -> TrainingEngine:
-    """An engine that trains one trial at a time."""
+    """Make an engine that trains one trial at a time."""
     return cast("TrainingEngine", _loaded(engine_named(name).constructor)())
 
 
 def make_pack_engine(name: str, *, env_kind: EnvKind, num_env_processes: int) -> PackEngine:
-    """An engine that trains packs.
+    """Make an engine that trains packs.
 
     Args:
-        name: Its name.
-        env_kind: How its environments step; see `PackPlan`.
+        name: The engine's name.
+        env_kind: How its environments are stepped; see `PackPlan`.
         num_env_processes: Processes that step them.
     """
     made = _loaded(engine_named(name).constructor)(env_kind=env_kind, num_env_processes=num_env_processes)
@@ -37,7 +37,7 @@ def make_pack_engine(name: str, *, env_kind: EnvKind, num_env_processes: int) ->
 
 
 def engine_of_checkpoint(checkpoint: Path) -> Engine:
-    """The engine that wrote a checkpoint: its manifest names it, or, in one of before, what the folder holds.
+    """Return the engine that wrote a checkpoint, by its manifest or, for an old one, by the folder's content.
 
     Raises:
         NotFoundError: The folder is missing.
@@ -50,26 +50,26 @@ def engine_of_checkpoint(checkpoint: Path) -> Engine:
         if engine.old_state is not None and (checkpoint / engine.old_state).exists():
             return engine
     raise CheckpointError(
-        f"Checkpoint {checkpoint} holds the state of no engine that this tune-jobs has.",
+        f"Checkpoint {checkpoint} does not hold the state of any engine of this tune-jobs.",
         "Use another checkpoint of the trial.",
     )
 
 
 def restore_checkpoint(checkpoint: Path, engine: Engine) -> Any:
-    """A checkpoint as an RLlib `Algorithm` that trains on from it.
+    """Restore a checkpoint as an RLlib `Algorithm` that can continue training.
 
     Args:
         checkpoint: Its folder; callers check the manifest's hashes first.
-        engine: Its engine, which must be one that restores.
+        engine: Its engine, which must be able to restore.
 
     Raises:
-        CheckpointError: It does not restore to the very weights that were saved.
+        CheckpointError: It cannot be restored with exactly the weights that were saved.
     """
     assert engine.restore is not None
     return _loaded(engine.restore)(checkpoint)
 
 
 def _loaded(path: str) -> Any:
-    """What `module:name` names."""
+    """Import and return what `module:name` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)

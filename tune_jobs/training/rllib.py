@@ -1,4 +1,4 @@
-"""The `rllib` engine: one RLlib Algorithm a trial, rebuilt in the same warm process for the next."""
+"""The `rllib` engine: it makes one RLlib Algorithm for each trial, one after another in the same warm process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tune_jobs.training.protocol import IterationStats, TrialTask
 
 RLLIB_FOLDER = "rllib"
 _LIFETIME_STEPS = ("env_runners", "num_env_steps_sampled_lifetime")
-# RLlib's name -> ours; the others are timers and counters.
+# RLlib's names of metrics and ours; RLlib's other metrics are timers and counters.
 _LEARNER_STATS = {
     "total_loss": "total_loss",
     "policy_loss": "policy_loss",
@@ -40,18 +40,18 @@ _LEARNER_STATS = {
 
 
 def algorithm_from_checkpoint(checkpoint: Path) -> RLlibAlgorithm:
-    """A checkpoint of this engine as an RLlib Algorithm that trains on from it; see `restore_algorithm`."""
+    """Restore a checkpoint of this engine as an RLlib Algorithm that can continue training."""
     return restore_algorithm(checkpoint / RLLIB_FOLDER, read_policy(checkpoint).network)
 
 
 class RLlibEngine:
-    """See `TrainingEngine`."""
+    """The engine that trains trials with RLlib; implements `TrainingEngine`."""
 
     def __init__(self) -> None:
         self._algorithm: RLlibAlgorithm | None = None
         self._task: TrialTask | None = None
         self._hyperparams: TrainedHyperparams | None = None
-        # Env steps and iterations of the trial that the Algorithm does not count; negative if it counts others.
+        # Env steps and iterations of the trial that the Algorithm does not count; negative if it counts another's.
         self._before = (0, 0)
 
     @property
@@ -66,11 +66,11 @@ class RLlibEngine:
         return self._algorithm
 
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
-        """See `TrainingEngine.build`."""
+        """Make the Algorithm of a trial, fresh or exactly as a checkpoint folder holds it."""
         self.close()
-        # Small networks run up to several times slower on more than one thread, and trials share the cores.
+        # Small networks are up to several times slower on more than one thread, and trials share the cores.
         torch.set_num_threads(1)
-        # Validated where the values came from, the sweep file; this turns JSON back into the typed object.
+        # The values were validated with the sweep file; this turns JSON back into the typed object.
         # A baseline has an engine of its own.
         hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
         self._task, self._hyperparams = task, hyperparams
@@ -99,19 +99,19 @@ class RLlibEngine:
             rl_module=task.rl_module,
         )
         config.env_runners(env_runner_cls=EnvRunner)
-        # The learner's weights are drawn from these; a warm process has drawn other numbers before.
+        # The learner's weights are drawn from these generators, which a warm process has used before.
         torch.manual_seed(task.seed)
         return config.build_algo()
 
     def _num_env_steps(self) -> int:
-        """Env steps as the Algorithm counts them: those before a copied checkpoint are another trial's."""
+        """Return the Algorithm's own count of env steps; after a copied checkpoint it includes another trial's."""
         algorithm = self.algorithm
         if isinstance(algorithm, ReplayDQN):
             return algorithm.num_env_steps
         return int(algorithm.metrics.peek(_LIFETIME_STEPS, default=0))
 
     def _continue_streams(self, checkpoint: Path) -> None:
-        """After a restore: other random numbers than at the trial's start, and a replay buffer with something in it.
+        """Use new random numbers after a restore, and fill the replay memory.
 
         RLlib saves no state of the random generators (2.60), and the replay memory is not in checkpoints.
         """
@@ -127,16 +127,16 @@ class RLlibEngine:
         self.algorithm.env_runner_group.foreach_env_runner(reseed)
         if isinstance(self._hyperparams, DQNHyperparams):
             self.algorithm.seed_replay(own)
-            # As much as it had when learning began; with no replay, the next steps fill it.
+            # It gets as many transitions as it had when learning began; without replay, the next steps fill it.
             num_steps = max(self._hyperparams.learning_starts, self._hyperparams.train_batch_size)
             if self._hyperparams.replay != "none" and self.algorithm.num_updates:
                 self.algorithm.refill(num_steps)
 
     def train_iteration(self) -> IterationStats:
-        """See `TrainingEngine.train_iteration`.
+        """Train for one iteration.
 
         Raises:
-            CannotRunError: An env runner died; RLlib would go on with fewer, or with none and without learning.
+            CannotRunError: An env runner died; RLlib would continue with fewer, or with none and without learning.
         """
         result = self.algorithm.train()
         group = self.algorithm.env_runner_group
@@ -145,7 +145,7 @@ class RLlibEngine:
         if group.num_remote_env_runners() and group.num_healthy_remote_workers() < expected:
             raise CannotRunError(
                 f"An env runner died: {group.num_healthy_remote_workers()} of {expected} are left.",
-                "See the trial's log; the trial goes on from its latest checkpoint when it is retried.",
+                "Read the trial's log for the cause; a retry continues the trial from its latest checkpoint.",
             )
         return IterationStats(
             num_env_steps=self._before[0] + self._num_env_steps(),
@@ -154,7 +154,7 @@ class RLlibEngine:
         )
 
     def policy(self) -> PortablePolicy:
-        """See `TrainingEngine.policy`."""
+        """Return the current greedy policy."""
         assert self._task is not None
         assert self._hyperparams is not None
         task = self._task
@@ -169,19 +169,19 @@ class RLlibEngine:
         )
 
     def save(self, folder: Path) -> None:
-        """See `TrainingEngine.save`: RLlib's own checkpoint, in a folder of its own."""
+        """Write RLlib's own checkpoint into a subfolder of an empty folder."""
         self.algorithm.save_to_path(str((folder / RLLIB_FOLDER).absolute()))
 
     def close(self) -> None:
-        """See `TrainingEngine.close`."""
+        """Stop the Algorithm and free it."""
         if self._algorithm is not None:
             self._algorithm.stop()
             self._algorithm = None
 
 
 def _is_of(task: TrialTask, saved: PortablePolicy) -> bool:
-    """Whether a checkpoint is of this very trial, with the hyperparameters it has now."""
-    # Only population based training changes them, or copies checkpoints.
+    """Whether a checkpoint belongs to this trial and has its present hyperparameters."""
+    # Only population based training changes hyperparameters or copies checkpoints.
     own = json.loads(json.dumps({"trial_id": task.trial_id, "hyperparams": task.hyperparams}))
     return not task.changes or {name: saved.training.get(name) for name in own} == own
 

@@ -1,7 +1,7 @@
-"""One trial from start to end, whichever engine trains it: stop rules, evaluation, checkpoints, results.
+"""Run one trial from start to end, on any engine: stop rules, evaluation, checkpoints, results.
 
-A trial's state is on disk alone (its checkpoints and results.jsonl), so a trial that is opened again, after a kill, on
-another node, in another process, goes on from its latest checkpoint.
+A trial's state is only on disk (its checkpoints and results.jsonl), so a trial that is opened again, after a kill, on
+another node or in another process, continues from its latest checkpoint.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ TRAINING_RETURN_EPISODES = 100
 class TrialLoop:
     """Runs one trial, by `advance`; or step by step, for a pack that trains and evaluates several together.
 
-    A step is `before_iteration`, `take` what the iteration gave, and `conclude`, with an evaluation if `take` asked for
-    one; `flush` now and then, and `leave` to end it early.
+    A step calls `before_iteration`, then `take` with the results of the iteration, and then `conclude`, with an
+    evaluation if `take` asked for one; `flush` is called from time to time, and `leave` ends the trial early.
 
     Args:
-        task: What to run.
-        engine: Trains it; reused between trials.
-        evaluator: Runs the greedy episodes on the sweep's evaluation seeds; reused between trials.
-        clock: Seconds, monotonic.
-        under: The run or the pack that the trial is opened by; None: nobody but who opens the trial next can take it.
+        task: The trial to run.
+        engine: Trains the trial; it is reused for other trials.
+        evaluator: Runs the greedy episodes on the sweep's evaluation seeds; it is reused for other trials.
+        clock: A monotonic clock, in seconds.
+        under: The ownership of the run or pack that opens the trial; None: the trial is not opened for any.
     """
 
     def __init__(
@@ -71,38 +71,39 @@ class TrialLoop:
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
         self._notes: list[str] = []
-        # The iteration that is not concluded yet, and the stop rule that holds without its evaluation.
+        # The iteration that is not concluded yet, and the stop rule that applies before its evaluation.
         self._taken = self._last
         self._reason: str | None = None
-        # Whether the engine holds a copy of another trial's weights that has not been trained on yet.
+        # Whether the engine has a copy of another trial's weights with which it has not trained yet.
         self._is_copy = False
         self._started = 0.0
         self._started_at: float | None = None
 
     @property
     def iteration(self) -> int:
-        """Iterations done."""
+        """The number of iterations done."""
         return self._last.iteration
 
     def check_owned(self) -> None:
-        """Raise if another process has taken the trial, which may be why something went wrong here.
+        """Raise an error if another process has taken the trial, which may have caused an error here.
 
         Raises:
-            OwnershipLostError: It has.
+            OwnershipLostError: Another process has taken it.
         """
         if self._store.is_lost():
             raise OwnershipLostError(
-                f"Trial {self.task.trial_id} is trained by another process by now.", "Leave it to that one."
+                f"Another process trains trial {self.task.trial_id} by now.", "Leave the trial to that process."
             )
 
     def open(self) -> None:
         """Take the trial and build it: from its latest checkpoint or a newer copy of another's, else from its seed.
 
-        A checkpoint whose files are not those that were written is set aside, and the one before it is taken.
+        A checkpoint whose files have changed since they were written is set aside, and the one before it is used.
 
         Raises:
-            CheckpointError: The checkpoint is whole but cannot be restored: it is of other hyperparameters, say.
-            OwnershipLostError: Who opens the trial may not any more.
+            CheckpointError: The checkpoint is whole but cannot be restored, for example because it has other
+                hyperparameters.
+            OwnershipLostError: This process may not open the trial any more.
         """
         self._store.take(self._under)
         self._store.remove_leftovers()
@@ -133,9 +134,9 @@ class TrialLoop:
         self._started_at = time.time()
 
     def _take_up_results(self, start: CheckpointRecord | None) -> None:
-        """Go on with the results up to what the trial starts from; what came after it is done again.
+        """Keep the results up to the checkpoint that the trial starts from; later iterations are repeated.
 
-        The training return goes on from the trial's last change: episodes before it were played by other weights.
+        The training return counts episodes since the trial's last change: those before it were played by other weights.
         """
         found, notes = take_up_results(self._store)
         self._notes += notes
@@ -151,7 +152,7 @@ class TrialLoop:
             if record.evaluation_return is not None:
                 self._evaluation_return = record.evaluation_return
             self._last = record
-            # One that is no time would keep `time_s` from ever ending the trial, or end it at once.
+            # With an invalid time, the stop rule `time_s` would never end the trial, or end it at once.
             if 0 <= record.time_s < math.inf:
                 time_s = record.time_s
         self._last = self._last.model_copy(update={"time_s": time_s})
@@ -167,8 +168,8 @@ class TrialLoop:
                 f"{start.num_env_steps}, from which the trial goes on."
             )
         if contradicts or self._last.iteration < iteration:
-            # Its own line could not be read, or says something else: the checkpoint knows what it has learned from.
-            # The curve has a hole there; the counts go on where they were.
+            # The checkpoint's own line could not be read or contradicts it; the checkpoint's numbers are right.
+            # The curve has a gap there; the counts continue.
             self._last = self._last.model_copy(
                 update={
                     "iteration": start.iteration,
@@ -181,10 +182,10 @@ class TrialLoop:
                 self._evaluation_return = start.evaluation_return
 
     def advance(self, max_s: float) -> Progress:
-        """Train until the next evaluation, the end, or for max_s seconds, whichever comes first.
+        """Train until the next evaluation, the end, or for `max_s` seconds, whichever comes first.
 
         Raises:
-            Exception: Whatever the engine or the environment raises.
+            Exception: Any error of the engine or the environment.
         """
         deadline = self._clock() + max_s
         try:
@@ -196,9 +197,9 @@ class TrialLoop:
             self.flush()
 
     def pause(self) -> None:
-        """Save a checkpoint of this very iteration, so that the trial can go on elsewhere."""
+        """Save a checkpoint of this iteration, so that the trial can continue elsewhere."""
         if self._is_copy:
-            return  # nothing was trained since; the copy is on disk, and the last score is of other weights
+            return  # nothing was trained since the copy, which is on disk; the last score belongs to other weights
         if self.iteration and not (self._checkpoints and self._checkpoints[-1].iteration == self.iteration):
             self._checkpoint(self._last.evaluation_return)
 
@@ -215,37 +216,37 @@ class TrialLoop:
         return self.conclude(evaluation)
 
     def before_iteration(self, *, stop: bool) -> Progress | None:
-        """How the trial ended, if no further iteration is to be trained; asked to stop, it saves and pauses."""
-        # A trial that was opened at its end (its process was killed after the last checkpoint) is done already.
+        """Return how the trial ended, or None if it continues; if asked to stop, it saves and pauses."""
+        # A trial whose process was killed after the last checkpoint is at its end already when it is opened.
         reason = self._stop_reason(self._last, self._last.evaluation_return)
         if reason is not None and self._last.evaluation_return is not None:
             return self._progress("completed", evaluated=True, reason=reason)
         return self.leave() if stop else None
 
     def take(self, stats: IterationStats) -> bool:
-        """Take what an iteration gave; returns whether `conclude` needs an evaluation of the policy as it is now."""
+        """Take the results of an iteration, and return whether `conclude` needs an evaluation of the present policy."""
         self._taken = self._record(stats)
         self._is_copy = False
-        # Its iteration is whole when it is concluded.
+        # The iteration's episodes count as whole when the iteration is concluded.
         self._tally.set(replace(_reached(self._taken), num_iterations=self._last.iteration))
         self._reason = self._stop_reason(self._taken, None)
         return self._taken.iteration % self.task.evaluation.every_iterations == 0 or self._reason is not None
 
     def policy(self) -> Policy:
-        """The current policy, as it is evaluated."""
+        """Return the current policy, for its evaluation."""
         return policy_from_portable(self._engine.policy())
 
     def conclude(self, evaluation: Episodes | NonFiniteWeightsError | None) -> Progress:
-        """End the iteration: its record, its checkpoint if there is to be one, and whether the trial goes on.
+        """End the iteration: write its record and a checkpoint if one is due, and decide whether the trial continues.
 
         Args:
-            evaluation: Greedy episodes of the policy, or that it cannot act; None: `take` asked for none.
+            evaluation: Greedy episodes of the policy, or why it cannot act; None: `take` asked for none.
         """
         record, reason = self._taken, self._reason
         if isinstance(evaluation, NonFiniteWeightsError):
-            # Its later iterations would only repeat it, and a retry too: the trial is over.
+            # Later iterations would fail in the same way, and a retry too, so the trial is over.
             text = f"{evaluation} (iteration {self._last.iteration + 1}{_learning_settings(self.task.hyperparams)})"
-            if record.iteration > self._last.iteration:  # else its training raised it
+            if record.iteration > self._last.iteration:  # otherwise the training raised the error
                 self._unwritten.append(record)
             self._last, reached = record, self._tally.reached
             progress = self._progress("failed", evaluated=False, error=text)
@@ -270,12 +271,12 @@ class TrialLoop:
         return self._progress(status, evaluated=evaluation is not None, reason=reason)
 
     def flush(self) -> None:
-        """Write the iterations that were concluded to results.jsonl."""
+        """Write the concluded iterations to results.jsonl."""
         self._store.append_iterations(self._unwritten)
         self._unwritten = []
 
     def leave(self, status: TrialStatus = "paused") -> Progress:
-        """Save and stop here; the trial can go on elsewhere."""
+        """Save and stop here; the trial can continue elsewhere."""
         self.pause()
         return self._progress(status, evaluated=False)
 
@@ -296,7 +297,7 @@ class TrialLoop:
     def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
         stop = self.task.stop
         full_window = len(self._window) == TRAINING_RETURN_EPISODES
-        # Over fewer than 100 episodes a lucky start would count as solved.
+        # With fewer than 100 episodes, a lucky start would count as solved.
         if full_window and _reaches(record.training_return, stop.training_return):
             return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
         if _reaches(evaluation_return, stop.evaluation_return):
@@ -327,7 +328,7 @@ class TrialLoop:
             training_return=self._last.training_return,
             evaluation_return=score,
         )
-        # The results first: a checkpoint whose iterations are not in results.jsonl would leave a hole in the curve.
+        # Results come first: a checkpoint whose iterations are not in results.jsonl would leave a gap in the curve.
         self.flush()
 
         def write(folder: Path) -> None:
@@ -342,7 +343,7 @@ class TrialLoop:
         self._prune()
 
     def _prune(self) -> None:
-        """Keep the newest so many, the latest and the best, which `analysis.selection` tells."""
+        """Delete all checkpoints but the latest, the best by `analysis.selection`, and the newest as the spec says."""
         newest = self._checkpoints[-max(1, self.task.checkpoints.keep) :]
         for record in list(self._checkpoints):
             if record not in newest and record != self._best:
@@ -376,7 +377,7 @@ class TrialLoop:
 
 
 def _learning_settings(hyperparams: dict[str, Any]) -> str:
-    """Of the hyperparameters what bounds the steps of weights."""
+    """Return the hyperparameters that bound the steps of weights, for a message."""
     known = [name for name in ("lr", "lr_final", "grad_clip") if name in hyperparams]
     return "".join(f", {name} {hyperparams[name]}" for name in known)
 
