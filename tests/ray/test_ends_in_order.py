@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import pty
@@ -20,16 +21,16 @@ pytestmark = pytest.mark.ray
 
 PROGRAM = str(Path(sys.executable).with_name("tune-jobs"))
 Start = Callable[..., subprocess.Popen[str]]
-# Trials that would take hours.
+# Trials that would take hours, most of them waiting while the file {slow} is there: once it is known how fast they are.
 SPEC = """
-env: CartPole-v1
+env: {{id: TestTrouble-v0, args: {{pause_s: 0.005, pause_while: "{slow}"}}}}
 algorithm: ppo
-hyperparams: {hidden_sizes: [8]}
+hyperparams: {{hidden_sizes: [8], num_envs: 4, train_batch_size: 128, minibatch_size: 64, num_epochs: 2}}
 num_samples: 2
-stop: {num_env_steps: 500_000_000}
-evaluation: {every_iterations: 2, num_episodes: 2}
-checkpoints: {every_iterations: 2, keep: 1}
-resources: {max_concurrent: 1}
+stop: {{num_env_steps: 500_000_000}}
+evaluation: {{every_iterations: 2, num_episodes: 2}}
+checkpoints: {{every_iterations: 2, keep: 1}}
+resources: {{max_concurrent: 1}}
 """
 
 
@@ -58,23 +59,28 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[str], 
 
 
 @pytest.fixture
-def launch(tmp_path: Path) -> Iterator[Start]:
-    """Launch the sweep `cut` in a process; whatever is left of it is ended."""
-    (tmp_path / "spec.yaml").write_text(SPEC)
+def start(env_plugin: None, tmp_path: Path) -> Iterator[Start]:
+    """Launch the sweep `cut`, or go on with it, in a process, until Ray starts; whatever is left of it is ended."""
+    slow = tmp_path / "slow"
+    (tmp_path / "spec.yaml").write_text(SPEC.format(slow=slow))
     processes = []
 
-    def start(*options: str, **how: Any) -> subprocess.Popen[str]:
+    def start(*command: str, **how: Any) -> subprocess.Popen[str]:
+        slow.unlink(missing_ok=True)
         how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **how}
-        process = subprocess.Popen(
-            [PROGRAM, "launch", "spec.yaml", "--name", "cut", *options], cwd=tmp_path, text=True, **how
-        )
+        process = subprocess.Popen([PROGRAM, *(command or LAUNCH)], cwd=tmp_path, text=True, **how)
         processes.append(process)
+        wait_until(lambda: child(process.pid, "gcs_server"), process)
+        slow.touch()
         return process
 
     yield start
     for process in processes:
         process.kill()
         process.wait()
+
+
+LAUNCH = ("launch", "spec.yaml", "--name", "cut")
 
 
 def state(folder: Path) -> str:
@@ -87,28 +93,17 @@ def half_made(folder: Path) -> set[str]:
     return {path.name for path in folder.rglob(".*") if path.is_file() and "tune" not in path.parts} - kept
 
 
-def has_checkpoint(folder: Path) -> bool:
-    return any(folder.glob("trials/*/checkpoints/0*"))
+def checkpoints(folder: Path) -> set[str]:
+    return {path.name for path in folder.glob("trials/*/checkpoints/0*")}
 
 
-def resumes(folder: Path) -> dict[str, Any]:
-    """Resume it, and stop it as soon as it has got further; how it was left then."""
-    before = {path.name for path in folder.glob("trials/*/checkpoints/0*")}
-    process = subprocess.Popen([PROGRAM, "resume", str(folder), "--no-finish"], stderr=subprocess.PIPE, text=True)
-    try:
-        wait_until(lambda: {path.name for path in folder.glob("trials/*/checkpoints/0*")} - before, process)
-        process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=240)
-    finally:
-        process.kill()
-    assert process.returncode == 130, err
-    return {path.parent.name: json.loads(path.read_text()) for path in folder.glob("trials/*/trial.json")}
+def has_new(folder: Path, before: set[str]) -> bool:
+    return bool(checkpoints(folder) - before)
 
 
-def test_a_signal_while_ray_starts(launch: Start, tmp_path: Path) -> None:
+def test_a_signal_while_ray_starts(start: Start, tmp_path: Path) -> None:
     folder = tmp_path / "sweeps" / "cut"
-    process = launch()
-    wait_until(lambda: child(process.pid, "gcs_server"), process)
+    process = start()
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=240)
     assert process.returncode == 130, out + err
@@ -117,13 +112,13 @@ def test_a_signal_while_ray_starts(launch: Start, tmp_path: Path) -> None:
     assert half_made(folder) == set()
 
 
-def test_a_terminal_that_goes_away(launch: Start, tmp_path: Path) -> None:
+def test_a_terminal_that_goes_away(start: Start, tmp_path: Path) -> None:
     """As a dropped ssh line: the process gets SIGHUP, and whatever it prints from then on is an error."""
     folder = tmp_path / "sweeps" / "cut"
     ours, theirs = pty.openpty()
     # A session of its own, whose terminal this becomes as it is opened.
     name = os.ttyname(theirs)
-    process = launch(
+    process = start(
         stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True, preexec_fn=lambda: os.open(name, os.O_RDWR)
     )
     os.close(theirs)
@@ -132,7 +127,7 @@ def test_a_terminal_that_goes_away(launch: Start, tmp_path: Path) -> None:
     def read_and_look() -> bool:
         with contextlib.suppress(BlockingIOError):
             os.read(ours, 1 << 16)
-        return has_checkpoint(folder)
+        return bool(checkpoints(folder))
 
     wait_until(read_and_look, process)
     os.close(ours)
@@ -143,19 +138,30 @@ def test_a_terminal_that_goes_away(launch: Start, tmp_path: Path) -> None:
     assert trial["checkpoints"][-1]["iteration"] == trial["num_iterations"]
 
 
-@pytest.mark.parametrize(("program", "name"), [("gcs_server", "control process (GCS)"), ("raylet", "raylet")])
-def test_a_part_of_ray_that_dies(launch: Start, tmp_path: Path, program: str, name: str) -> None:
+def test_parts_of_ray_that_die_one_after_the_other(start: Start, tmp_path: Path) -> None:
+    """Each time the sweep is interrupted and nothing has failed, and it goes on from there."""
     folder = tmp_path / "sweeps" / "cut"
-    process = launch("--set", "max_retries=0")
-    wait_until(lambda: has_checkpoint(folder), process)
-    victim = child(process.pid, program)
-    assert victim is not None
-    os.kill(victim, signal.SIGKILL)
-    # Ray's own clients give up after a minute and end the process, with code 1 and nothing saved.
+    command: tuple[str, ...] = (*LAUNCH, "--set", "max_retries=0")
+    for program, name in (("gcs_server", "control process (GCS)"), ("raylet", "raylet")):
+        before = checkpoints(folder)
+        process = start(*command)
+        wait_until(functools.partial(has_new, folder, before), process)
+        victim = child(process.pid, program)
+        assert victim is not None
+        os.kill(victim, signal.SIGKILL)
+        # Ray's own clients give up after a minute and end the process, with code 1 and nothing saved.
+        out, err = process.communicate(timeout=240)
+        assert process.returncode == 5, out + err
+        assert name in err
+        assert "tune-jobs resume cut" in err.strip().splitlines()[-1]
+        assert state(folder) == "interrupted"
+        assert "failed" not in {json.loads(path.read_text())["status"] for path in folder.glob("trials/*/trial.json")}
+        command = ("resume", "cut", "--no-finish")
+    before = checkpoints(folder)
+    process = start(*command)
+    wait_until(functools.partial(has_new, folder, before), process)
+    process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=240)
-    assert process.returncode == 5, out + err
-    assert name in err
-    assert "tune-jobs resume cut" in err.strip().splitlines()[-1]
-    assert state(folder) == "interrupted"
-    assert "failed" not in {json.loads(path.read_text())["status"] for path in folder.glob("trials/*/trial.json")}
-    assert {trial["status"] for trial in resumes(folder).values()} <= {"paused", "pending"}
+    assert process.returncode == 130, out + err
+    statuses = {json.loads(path.read_text())["status"] for path in folder.glob("trials/*/trial.json")}
+    assert statuses <= {"paused", "pending"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -16,16 +17,21 @@ import pytest
 pytestmark = pytest.mark.ray
 
 PROGRAM = str(Path(sys.executable).with_name("tune-jobs"))
-# One trial at once, so that one is done, one runs and one waits when the signal comes.
+NUM_ENV_STEPS = 7_680
+# One trial at once, so that one is done, one runs and one waits when the signal comes; slow, by waiting, while the file
+# {slow} is there.
 SPEC = """
-env: CartPole-v1
+env:
+  id: TestTrouble-v0
+  args: {{pause_s: 0.005, pause_while: "{slow}"}}
 algorithm: ppo
-space: {lr: {loguniform: [1e-4, 1e-2]}}
+hyperparams: {{hidden_sizes: [8], num_envs: 4, train_batch_size: 128, minibatch_size: 64, num_epochs: 2}}
+space: {{lr: {{loguniform: [1e-4, 1e-2]}}}}
 num_samples: 3
-stop: {num_env_steps: 60_000}
-evaluation: {every_iterations: 2, num_episodes: 2}
-checkpoints: {every_iterations: 2, keep: 1}
-resources: {max_concurrent: 1}
+stop: {{num_env_steps: {num_env_steps}}}
+evaluation: {{every_iterations: 2, num_episodes: 2}}
+checkpoints: {{every_iterations: 2, keep: 1}}
+resources: {{max_concurrent: 1}}
 """
 
 
@@ -49,78 +55,107 @@ def wait_until_gone(pid: int, limit_s: float = 600) -> None:
         time.sleep(0.05)
 
 
+class Sweep:
+    """The sweep `cut` in a folder, run by the command there."""
+
+    def __init__(self, cwd: Path) -> None:
+        self.cwd, self.folder = cwd, cwd / "sweeps" / "cut"
+        self.slow = cwd / "slow"
+        (cwd / "spec.yaml").write_text(SPEC.format(slow=self.slow, num_env_steps=NUM_ENV_STEPS))
+
+    def interrupt(self, number: signal.Signals, *command: str) -> tuple[int, str]:
+        """Run it until its first trial is done and its second has new checkpoints, and send a signal; how it ended."""
+        newest = self.newest() if self.folder.exists() else 0
+        process = subprocess.Popen(
+            [PROGRAM, *command, "--no-finish"],
+            cwd=self.cwd,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+        def second_has_checkpoints() -> bool:
+            records = read(self.folder)
+            if len(records) < 3 or records[0]["status"] != "completed":
+                return False
+            self.slow.touch()
+            return self.newest() > newest
+
+        try:
+            wait_until(second_has_checkpoints, process)
+            process.send_signal(number)
+            out, err = process.communicate(timeout=600)
+        finally:
+            process.kill()
+        return process.returncode, out + err
+
+    def newest(self) -> int:
+        """The iteration of the second trial's newest checkpoint on record."""
+        return max((int(checkpoint["iteration"]) for checkpoint in read(self.folder)[1]["checkpoints"]), default=0)
+
+    def first_trial(self) -> dict[Path, int]:
+        """When each file of the trial that is done was written."""
+        files = (self.folder / "trials" / "t0000").rglob("*")
+        return {path: path.stat().st_mtime_ns for path in files if path.is_file()}
+
+    def check_resumes(self) -> None:
+        """It goes on to its end, fast, from where it was."""
+        self.slow.unlink()
+        before, untouched = read(self.folder), self.first_trial()
+        latest = max(int(path.name) for path in (self.folder / "trials/t0001/checkpoints").glob("[0-9]*"))
+        done = subprocess.run(
+            [PROGRAM, "resume", str(self.folder), "--json", "--no-finish"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        after = read(self.folder)
+        assert [record["status"] for record in after] == ["completed"] * 3
+        assert [record["hyperparams"] for record in after] == [record["hyperparams"] for record in before]
+        assert self.first_trial() == untouched
+        results = (self.folder / "trials/t0001/results.jsonl").read_text()
+        lines = [json.loads(line) for line in results.splitlines()]
+        # Every iteration once and in order, though some were done twice or torn.
+        assert [line["iteration"] for line in lines] == list(range(1, len(lines) + 1))
+        assert 0 < latest < len(lines)
+        steps = [line["num_env_steps"] for line in lines]
+        assert steps == sorted(steps)
+        assert steps[-1] >= NUM_ENV_STEPS > steps[-2]
+        # It went on from its checkpoint, or a later one: a killed driver's trial trains on for a moment.
+        log = (self.folder / "trials/t0001/log.txt").read_text()
+        assert int(re.findall(r"built from checkpoint (\d+)", log)[-1]) >= latest
+        seconds = [line["time_s"] for line in lines]
+        assert seconds == sorted(seconds)
+
+
 @pytest.fixture
-def interrupted(tmp_path: Path, request: pytest.FixtureRequest) -> tuple[Path, int, str]:
-    """A sweep that got a signal when its first trial was done and its second had checkpoints; and how it ended."""
-    (tmp_path / "spec.yaml").write_text(SPEC)
-    folder = tmp_path / "sweeps" / "cut"
-    process = subprocess.Popen(
-        [PROGRAM, "launch", "spec.yaml", "--name", "cut", "--no-finish"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-    def second_has_checkpoints() -> bool:
-        records = read(folder)
-        return len(records) == 3 and records[0]["status"] == "completed" and bool(records[1]["checkpoints"])
-
-    try:
-        wait_until(second_has_checkpoints, process)
-        process.send_signal(request.param)
-        out, err = process.communicate(timeout=600)
-    finally:
-        process.kill()
-    return folder, process.returncode, out + err
+def sweep(env_plugin: None, tmp_path: Path) -> Sweep:
+    return Sweep(tmp_path)
 
 
-def check_resumes(folder: Path) -> None:
-    before = read(folder)
-    first_trial = folder / "trials" / "t0000"
-    untouched = {path: path.stat().st_mtime_ns for path in first_trial.rglob("*") if path.is_file()}
-    latest = max(int(path.name) for path in (folder / "trials/t0001/checkpoints").glob("[0-9]*"))
-    done = subprocess.run(
-        [PROGRAM, "resume", str(folder), "--json", "--no-finish"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    after = read(folder)
-    assert [record["status"] for record in after] == ["completed"] * 3
-    assert [record["hyperparams"] for record in after] == [record["hyperparams"] for record in before]
-    assert {path: path.stat().st_mtime_ns for path in untouched} == untouched
-    lines = [json.loads(line) for line in (folder / "trials/t0001/results.jsonl").read_text().splitlines()]
-    # Every iteration once and in order, though some were done twice or torn.
-    assert [line["iteration"] for line in lines] == list(range(1, len(lines) + 1))
-    assert 0 < latest < len(lines)
-    steps = [line["num_env_steps"] for line in lines]
-    assert steps == sorted(steps)
-    assert steps[-1] >= 60_000 > steps[-2]
-    # It went on from its checkpoint: had it begun anew, its log would show a second trial of as many iterations.
-    seconds = [line["time_s"] for line in lines]
-    assert seconds == sorted(seconds)
+def test_signals_save_and_stop_and_the_sweep_goes_on_after_each(sweep: Sweep) -> None:
+    command = ["launch", "spec.yaml", "--name", "cut"]
+    untouched: dict[Path, int] = {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        code, output = sweep.interrupt(number, *command)
+        assert code == 130, output
+        assert output.strip().splitlines()[-1].endswith("tune-jobs resume cut"), output
+        records = read(sweep.folder)
+        assert [record["status"] for record in records] == ["completed", "paused", "pending"]
+        # The paused trial saved the very iteration it was in.
+        assert records[1]["checkpoints"][-1]["iteration"] == records[1]["num_iterations"]
+        assert json.loads((sweep.folder / "sweep.json").read_text())["state"] == "interrupted"
+        untouched = untouched or sweep.first_trial()
+        assert sweep.first_trial() == untouched
+        command = ["resume", "cut"]
+    sweep.check_resumes()
 
 
-@pytest.mark.parametrize("interrupted", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], indirect=True)
-def test_a_signal_saves_and_stops(interrupted: tuple[Path, int, str]) -> None:
-    folder, code, output = interrupted
-    assert code == 130, output
-    assert output.strip().splitlines()[-1].endswith(f"tune-jobs resume {folder.name}"), output
-    records = read(folder)
-    assert [record["status"] for record in records] == ["completed", "paused", "pending"]
-    # The paused trial saved the very iteration it was in.
-    assert records[1]["checkpoints"][-1]["iteration"] == records[1]["num_iterations"]
-    assert json.loads((folder / "sweep.json").read_text())["state"] == "interrupted"
-    check_resumes(folder)
-
-
-@pytest.mark.parametrize("interrupted", [signal.SIGKILL], indirect=True)
-def test_a_kill_loses_no_more_than_the_last_iterations(interrupted: tuple[Path, int, str]) -> None:
-    folder, code, _ = interrupted
+def test_a_kill_loses_no_more_than_the_last_iterations(sweep: Sweep) -> None:
+    code, _ = sweep.interrupt(signal.SIGKILL, "launch", "spec.yaml", "--name", "cut")
     assert code == -signal.SIGKILL
-    pid = read(folder)[1]["pid"]
-    wait_until_gone(pid)
-    status = subprocess.run([PROGRAM, "status", str(folder), "--json"], capture_output=True, text=True, check=True)
+    wait_until_gone(read(sweep.folder)[1]["pid"])
+    command = [PROGRAM, "status", str(sweep.folder), "--json"]
+    status = subprocess.run(command, capture_output=True, text=True, check=True)
     assert json.loads(status.stdout)["sweep"]["state"] == "interrupted"
-    with (folder / "trials/t0001/results.jsonl").open("a") as file:
+    with (sweep.folder / "trials/t0001/results.jsonl").open("a") as file:
         file.write('{"iteration": 99, "num_env')  # a line torn by the kill
-    check_resumes(folder)
+    sweep.check_resumes()
