@@ -145,3 +145,15 @@ class Pack:
 
     def store(self, trial_id: str) -> TrialStore:
         return TrialStore(self.folder, trial_id)
+
+
+def statuses(pack: Pack) -> dict[str, str]:
+    return {report.trial_id: report.progress.status for report in pack.reports if report.progress is not None}
+
+
+def without_times(progress: Progress) -> Progress:
+    return progress.model_copy(update={"started_at": None, "ended_at": None})
+
+
+def results(pack: Pack, trial_id: str) -> list[int]:
+    return [record.iteration for record in pack.store(trial_id).read_iterations()]

@@ -252,9 +252,9 @@ def test_a_penalty_without_failure_is_refused_with_both_names(env_id: str) -> No
 
 def test_only_a_crash_of_the_lander_is_a_failure() -> None:
     pytest.importorskip("Box2D")
-    rule = check_env("LunarLander-v3", None).failure
+    rule = present(check_env("LunarLander-v3", None).failure)
     rewards, terminated = np.array([-100.0, 100.0, -100.0, 1.0]), np.array([True, True, False, False])
-    assert present(rule).failed(rewards, terminated).tolist() == [True, False, False, False]
+    assert rule.failed(rewards, terminated).tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize(

@@ -92,5 +92,5 @@ def test_an_error_can_be_carried_to_another_process_whatever_it_was_raised_for(
 
 
 def test_other_errors_are_carried_as_they_are() -> None:
-    error = caught(lambda: cast("dict[str, int]", {})["a key"])
-    assert tellable(present(error)) is error
+    error = present(caught(lambda: cast("dict[str, int]", {})["a key"]))
+    assert tellable(error) is error

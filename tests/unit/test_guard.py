@@ -6,18 +6,22 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from signal import Signals
+from typing import Any, cast
 
 import pytest
 from policy_factory import make_policy, register_test_envs
 
 from policies.acting.evaluate import evaluate_policy
-from policies.acting.policy import RandomPolicy
+from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError, EnvFailedError
 from policies.guard import guarded
 from policies.guard.guard import EnvGuard, guarding
+from tests.narrowing import present
 
 register_test_envs()
 
@@ -26,12 +30,12 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
-def _own_modules(monkeypatch):
+def _own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["hostile_envs"])
 
 
-def policy_for_hostile():
+def policy_for_hostile() -> RandomPolicy:
     info = guarded.check_env(HOSTILE, {})
     return RandomPolicy(info.observation_space, info.action_space, env_id=info.env_id)
 
@@ -44,7 +48,7 @@ def is_running(pid):
     return state not in "ZX"
 
 
-def until(condition, what, timeout_s=600.0):
+def until(condition, what: str, timeout_s=600.0):
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {what}"
@@ -57,7 +61,7 @@ def until(condition, what, timeout_s=600.0):
 
 @pytest.mark.parametrize("how", ["hang", "hang_without_python"])
 @pytest.mark.parametrize("where", ["constructor", "reset", "step", "close"])
-def test_an_env_that_hangs_is_cut_off_with_its_place(how, where):
+def test_an_env_that_hangs_is_cut_off_with_its_place(how: str, where: str) -> None:
     place = "its constructor" if where == "constructor" else rf"{where}\(\)"
     with pytest.raises(EnvFailedError, match=f"{HOSTILE} hangs in {place}.* nothing came back for 0.7 s") as caught:
         guarded.check_env(HOSTILE, {"how": how, "where": where}, timeout_s=0.7)
@@ -75,19 +79,19 @@ def test_an_env_that_hangs_is_cut_off_with_its_place(how, where):
     ],
 )
 @pytest.mark.parametrize("where", ["constructor", "step"])
-def test_an_env_that_ends_its_process_ends_another_one(how, words, where):
+def test_an_env_that_ends_its_process_ends_another_one(how: str, words: str, where: str) -> None:
     place = "its constructor" if where == "constructor" else r"step\(\)"
     with pytest.raises(EnvFailedError, match=f"{HOSTILE} {words} {place}"):
         guarded.check_env(HOSTILE, {"how": how, "where": where})
     # The next job has a child again.
-    assert guarded.check_env(HOSTILE, {}).action_space.n == 2
+    assert cast("Any", guarded.check_env(HOSTILE, {}).action_space).n == 2
 
 
 @pytest.mark.parametrize(
     ("where", "words"),
     [("constructor", "cannot be made .*: SystemExit: 5"), ("step", "cannot be stepped.*: SystemExit: 5")],
 )
-def test_an_env_that_raises_what_ends_a_process_has_failed(where, words):
+def test_an_env_that_raises_what_ends_a_process_has_failed(where: str, words: str) -> None:
     with pytest.raises(EnvError, match=words):
         guarded.check_env(HOSTILE, {"how": "leave", "where": where})
 
@@ -101,19 +105,19 @@ def test_an_env_that_raises_what_ends_a_process_has_failed(where, words):
     ],
 )
 @pytest.mark.parametrize("where", ["constructor", "step"])
-def test_whatever_an_env_says_can_be_told(how, words, where):
+def test_whatever_an_env_says_can_be_told(how: str, words: str, where: str) -> None:
     with pytest.raises(EnvError, match=words) as caught:
         guarded.check_env(HOSTILE, {"how": how, "where": where})
     assert len(caught.value.message) < 4_000
     caught.value.message.encode()
 
 
-def test_a_segmentation_fault_is_told_with_its_place():
+def test_a_segmentation_fault_is_told_with_its_place() -> None:
     with pytest.raises(EnvFailedError, match=r'hostile_envs.py", line \d+ in segfault'):
         guarded.check_env(HOSTILE, {"how": "segfault"})
 
 
-def test_the_import_of_a_module_is_a_call_too(tmp_path, monkeypatch):
+def test_the_import_of_a_module_is_a_call_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "endless_module.py").write_text("while True: pass\n")
     monkeypatch.syspath_prepend(tmp_path)
     allow_modules(["endless_module"])
@@ -121,7 +125,7 @@ def test_the_import_of_a_module_is_a_call_too(tmp_path, monkeypatch):
         guarded.check_env("endless_module:Env", {}, timeout_s=0.7)
 
 
-def test_what_the_child_finds_wrong_is_raised_as_here():
+def test_what_the_child_finds_wrong_is_raised_as_here() -> None:
     with pytest.raises(EnvError, match="No environment 'Nothing-v0' is registered") as caught:
         guarded.check_env("Nothing-v0", {})
     assert not isinstance(caught.value, EnvFailedError)
@@ -133,13 +137,13 @@ def test_what_the_child_finds_wrong_is_raised_as_here():
     assert guarded.check_env("CartPole-v1", {}).failure == check_env("CartPole-v1", {}).failure
 
 
-def test_an_env_that_only_this_process_registered_is_refused_as_trials_would():
+def test_an_env_that_only_this_process_registered_is_refused_as_trials_would() -> None:
     with pytest.raises(EnvError, match="'TestWalk-v0' is registered with Gymnasium in this process alone") as caught:
         guarded.check_env("TestWalk-v0", {})
     assert "my_envs:TestWalk-v0" in caught.value.hint
 
 
-def test_arguments_that_no_file_holds_are_refused():
+def test_arguments_that_no_file_holds_are_refused() -> None:
     with pytest.raises(EnvError, match="cannot be written to a sweep file"):
         guarded.check_env(HOSTILE, {"how": object()})
 
@@ -155,13 +159,13 @@ def test_arguments_that_no_file_holds_are_refused():
         ("fail", r"raised an error in step\(\) of the episode with seed 3, after 16 steps: ValueError: the motor"),
     ],
 )
-def test_an_env_that_fails_later_fails_in_words(how, words):
+def test_an_env_that_fails_later_fails_in_words(how: str, words: str) -> None:
     args = {"how": how, "at": 17}
     with pytest.raises(EnvFailedError, match=words):
         guarded.evaluate_policy(policy_for_hostile(), env_id=HOSTILE, env_args=args, seeds=[3], timeout_s=0.7)
 
 
-def test_time_counts_by_call_and_not_by_episode():
+def test_time_counts_by_call_and_not_by_episode() -> None:
     args = {"step_s": 0.05, "num_steps": 40}
     done = guarded.evaluate_policy(policy_for_hostile(), env_id=HOSTILE, env_args=args, seeds=[1], timeout_s=1.5)
     # Two seconds in all.
@@ -170,14 +174,14 @@ def test_time_counts_by_call_and_not_by_episode():
 
 @pytest.mark.parametrize("make", [make_policy, RandomPolicy.for_env])
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_episodes_are_those_of_this_process(make, env_id):
+def test_episodes_are_those_of_this_process(make: Callable[..., NetworkPolicy], env_id: str) -> None:
     policy = make(env_id)
     expected = evaluate_policy(policy, env_id=env_id, seeds=range(5, 12), max_episode_steps=60)
     assert guarded.evaluate_policy(policy, env_id=env_id, seeds=range(5, 12), max_episode_steps=60) == expected
 
 
 @pytest.mark.parametrize(("how", "where"), [("hang", "render"), ("exit", "step"), ("fail", "step")])
-def test_a_film_that_breaks_off_leaves_nothing(tmp_path, how, where):
+def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path, how: str, where: str) -> None:
     args = {"how": how, "where": where, "at": 5}
     policy = policy_for_hostile()
     with pytest.raises(EnvFailedError, match=rf" in {where}\(\)"):
@@ -191,7 +195,7 @@ def test_a_film_that_breaks_off_leaves_nothing(tmp_path, how, where):
 # -- the child
 
 
-def test_what_an_env_prints_is_not_on_standard_output(tmp_path):
+def test_what_an_env_prints_is_not_on_standard_output(tmp_path: Path) -> None:
     (tmp_path / "loud_envs.py").write_text(
         "import os\nfrom hostile_envs import Hostile\n"
         "class Loud(Hostile):\n"
@@ -212,38 +216,38 @@ def test_what_an_env_prints_is_not_on_standard_output(tmp_path):
     assert "by the system" in done.stderr
 
 
-def test_a_child_is_used_again_and_ends_with_its_block():
+def test_a_child_is_used_again_and_ends_with_its_block() -> None:
     with EnvGuard() as guard:
         guard.start()
-        pid = guard._child.process.pid
+        pid = present(guard._child).process.pid
         for _ in range(2):
             guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
-        assert guard._child.process.pid == pid
+        assert present(guard._child).process.pid == pid
     assert not is_running(pid)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None])
 @pytest.mark.parametrize("has_worked", [True, False])
-def test_a_child_that_died_while_nobody_asked_is_replaced(number, has_worked):
+def test_a_child_that_died_while_nobody_asked_is_replaced(number: Signals | None, has_worked: bool) -> None:
     """By the system, where memory is scarce; None: an env's own thread ended it."""
     with EnvGuard() as guard:
         guard.start()
         if has_worked or number is None:
             guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
         if number is None:
-            guard._child.connection.send_bytes(b"no JSON")
+            present(guard._child).connection.send_bytes(b"no JSON")
         else:
-            guard._child.process.send_signal(number)
-        guard._child.process.wait()
+            present(guard._child).process.send_signal(number)
+        present(guard._child).process.wait()
         assert guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)["env_id"] == "CartPole-v1"
 
 
-def test_one_block_within_another_shares_its_guard():
+def test_one_block_within_another_shares_its_guard() -> None:
     with guarding() as outer, guarding() as inner:
         assert inner is outer
 
 
-def test_modules_that_are_allowed_no_more_are_seen_no_more(tmp_path, monkeypatch):
+def test_modules_that_are_allowed_no_more_are_seen_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with EnvGuard() as guard:
         guard.run("check_env", HOSTILE, env_args={}, algorithm=None)
         monkeypatch.setattr(env_modules, "_allowed", set())
@@ -251,7 +255,7 @@ def test_modules_that_are_allowed_no_more_are_seen_no_more(tmp_path, monkeypatch
             guard.run("check_env", HOSTILE, env_args={}, algorithm=None)
 
 
-def test_a_child_does_not_outlive_a_killed_parent(tmp_path):
+def test_a_child_does_not_outlive_a_killed_parent(tmp_path: Path) -> None:
     pids = tmp_path / "pids"
     code = (
         "from policies.guard import guarded\n"
@@ -272,7 +276,7 @@ def test_a_child_does_not_outlive_a_killed_parent(tmp_path):
     until(lambda: not is_running(child), "the child has ended")
 
 
-def test_an_interrupted_parent_ends_its_child(tmp_path):
+def test_an_interrupted_parent_ends_its_child(tmp_path: Path) -> None:
     pids = tmp_path / "pids"
     code = (
         "from policies.guard import guarded\n"
@@ -298,13 +302,13 @@ def test_an_interrupted_parent_ends_its_child(tmp_path):
     assert not is_running(child)
 
 
-def test_a_child_is_ended_though_its_closing_is_interrupted(monkeypatch):
+def test_a_child_is_ended_though_its_closing_is_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
     guard = EnvGuard()
     guard.start()
-    process = guard._child.process
+    process = present(guard._child).process
     wait = process.wait
 
-    def interrupt(timeout=None):
+    def interrupt(timeout=None) -> None:
         monkeypatch.setattr(process, "wait", wait)
         raise KeyboardInterrupt
 
@@ -314,11 +318,11 @@ def test_a_child_is_ended_though_its_closing_is_interrupted(monkeypatch):
     assert not is_running(process.pid)
 
 
-def test_a_child_that_cannot_begin_is_told_as_that(monkeypatch):
+def test_a_child_that_cannot_begin_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("policies.guard.guard._BOOTSTRAP", "raise SystemExit(9)")
     with EnvGuard() as guard:
         guard.start()
-        guard._child.process.wait()
+        present(guard._child).process.wait()
         with pytest.raises(EnvFailedError, match="ended with exit code 9") as caught:
             guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
     assert "printed" in caught.value.hint

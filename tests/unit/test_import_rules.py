@@ -12,7 +12,7 @@ PROGRAM = "import json, sys\n{code}\nprint(json.dumps(sorted(sys.modules)))"
 NAMES = {"tune_jobs", "tune_jobs.process", "tune_jobs.process.own_packages"}
 
 
-def modules_after(code):
+def modules_after(code: str) -> set[str]:
     done = subprocess.run([sys.executable, "-c", PROGRAM.format(code=code)], capture_output=True, text=True, check=True)
     return {name.partition(".")[0] for name in set(json.loads(done.stdout.splitlines()[-1])) - NAMES}
 
@@ -41,11 +41,11 @@ def modules_after(code):
         ("import policies.envs.make, policies.hyperparams, policies.errors, policies.files", {"analysis", "tune_jobs"}),
     ],
 )
-def test_importing_imports_no_more_than_it_may(code, absent):
+def test_importing_imports_no_more_than_it_may(code: str, absent: set[str]) -> None:
     assert modules_after(code) & absent == set()
 
 
-def test_the_contracts_of_the_source_hold(pytestconfig):
+def test_the_contracts_of_the_source_hold(pytestconfig: pytest.Config) -> None:
     pytest.importorskip("importlinter")
     done = subprocess.run(
         [sys.executable, "-c", "from importlinter.cli import lint_imports; raise SystemExit(lint_imports())"],

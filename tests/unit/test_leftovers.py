@@ -25,13 +25,13 @@ with ExitStack() as stack:
 """
 
 
-def kill_while_writing(*paths):
+def kill_while_writing(*paths: Path) -> None:
     done = subprocess.run([sys.executable, "-c", KILLED, *map(str, paths)], check=False)
     assert done.returncode < 0
 
 
 @pytest.fixture
-def store(tmp_path):
+def store(tmp_path: Path) -> SweepStore:
     """A sweep with a finished trial and one that is not."""
     store = SweepStore(tmp_path / "mine")
     store.create()
@@ -54,11 +54,11 @@ def store(tmp_path):
     return store
 
 
-def files(folder):
+def files(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_what_killed_processes_left_is_removed(store):
+def test_what_killed_processes_left_is_removed(store: SweepStore) -> None:
     write_atomic(store.folder / "best" / "before.mp4", "film")
     before = files(store.folder)
     kill_while_writing(
@@ -77,7 +77,7 @@ def test_what_killed_processes_left_is_removed(store):
     assert not (store.folder / ".probe").exists()
 
 
-def test_a_file_that_is_being_written_stays(store):
+def test_a_file_that_is_being_written_stays(store: SweepStore) -> None:
     with atomic_path(store.folder / "best" / "after.mp4") as half:
         half.write_text("half")
         store.remove_leftovers()
@@ -85,7 +85,7 @@ def test_a_file_that_is_being_written_stays(store):
     assert (store.folder / "best" / "after.mp4").read_text() == "half"
 
 
-def test_nothing_else_is_taken_for_a_leftover(store):
+def test_nothing_else_is_taken_for_a_leftover(store: SweepStore) -> None:
     names = [".lock", ".stop", ".owner", ".mine.json", ".before.12-abc.mp4", "before.12-0123abcd.mp4"]
     for name in names:
         (store.folder / name).write_text("kept")
@@ -103,7 +103,7 @@ def test_nothing_else_is_taken_for_a_leftover(store):
     assert elsewhere.read_text() == "kept"
 
 
-def test_what_another_machine_writes_is_nobodys_after_a_day(tmp_path):
+def test_what_another_machine_writes_is_nobodys_after_a_day(tmp_path: Path) -> None:
     for name in (f".after.00000000-{os.getpid()}-0123abcd.mp4", ".after.7-0123abcd.mp4"):
         path = tmp_path / name
         path.write_text("half")
@@ -113,7 +113,7 @@ def test_what_another_machine_writes_is_nobodys_after_a_day(tmp_path):
         assert is_abandoned(path)
 
 
-def test_a_process_that_ended_but_was_not_asked_how_is_gone(tmp_path):
+def test_a_process_that_ended_but_was_not_asked_how_is_gone(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path / "a.json")]) as process:
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         (left,) = tmp_path.glob(".a.*")

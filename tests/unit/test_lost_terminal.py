@@ -4,6 +4,7 @@ import os
 import pty
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -22,7 +23,7 @@ Path(sys.argv[1]).with_name("done").touch()
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_a_sweep_goes_on_when_nobody_reads_it(tmp_path, terminal):
+def test_a_sweep_goes_on_when_nobody_reads_it(tmp_path: Path, terminal: bool) -> None:
     ours, theirs = pty.openpty() if terminal else os.pipe()
     command = [sys.executable, "-c", SCRIPT, str(tmp_path / "log")]
     # A session of its own: the terminal is not that of this test, nor does it send a signal.

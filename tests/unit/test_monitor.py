@@ -4,10 +4,19 @@ import pytest
 from fake_engine import FakeClock
 
 from analysis.records import CheckpointRecord, TrialRecord
+from tests.narrowing import present
 from tune_jobs.sweeps.monitor import SweepMonitor
 
 
-def make_trial(index, status="pending", *, steps=0, score=None, time_s=0.0, point_index=None):
+def make_trial(
+    index: int,
+    status: str = "pending",
+    *,
+    steps: int = 0,
+    score: float | None = None,
+    time_s: float = 0.0,
+    point_index: None = None,
+) -> TrialRecord:
     """A trial whose best checkpoint has this score."""
     trial_id = f"t{index:04d}"
     checkpoints = ()
@@ -27,13 +36,15 @@ def make_trial(index, status="pending", *, steps=0, score=None, time_s=0.0, poin
     )
 
 
-def make_monitor(*records, clock=None, cap=1_000, max_concurrent=2):
+def make_monitor(
+    *records: TrialRecord, clock: FakeClock | None = None, cap: int = 1_000, max_concurrent: int = 2
+) -> SweepMonitor:
     return SweepMonitor(
         "mine", records, max_env_steps_per_trial=cap, max_concurrent=max_concurrent, clock=clock or FakeClock()
     )
 
 
-def test_trials_are_counted_by_status():
+def test_trials_are_counted_by_status() -> None:
     monitor = make_monitor(*(make_trial(index) for index in range(4)))
     assert monitor.counts() == {"pending": 4}
     monitor.update(make_trial(0, "running"))
@@ -42,7 +53,7 @@ def test_trials_are_counted_by_status():
     assert monitor.counts() == {"completed": 1, "failed": 1, "pending": 2}
 
 
-def test_env_steps_are_of_all_trials_whatever_their_order():
+def test_env_steps_are_of_all_trials_whatever_their_order() -> None:
     monitor = make_monitor(make_trial(0, "completed", steps=1_000), make_trial(1))
     assert monitor.num_env_steps == 1_000
     monitor.update(make_trial(1, "running", steps=300))
@@ -53,24 +64,24 @@ def test_env_steps_are_of_all_trials_whatever_their_order():
     assert monitor.num_env_steps == 1_200
 
 
-def test_the_best_so_far_is_chosen_by_the_rule_that_will_choose_the_winner():
+def test_the_best_so_far_is_chosen_by_the_rule_that_will_choose_the_winner() -> None:
     monitor = make_monitor(make_trial(0), make_trial(1), make_trial(2))
     assert monitor.best() is None
     monitor.update(make_trial(0, "running", steps=100, score=-5.0))
-    assert (monitor.best().trial.trial_id, monitor.best().score) == ("t0000", -5.0)
+    assert (present(monitor.best()).trial.trial_id, present(monitor.best()).score) == ("t0000", -5.0)
     monitor.update(make_trial(1, "running", steps=100, score=0.0))
-    assert monitor.best().trial.trial_id == "t0001"
+    assert present(monitor.best()).trial.trial_id == "t0001"
     # It gets better while it runs.
     monitor.update(make_trial(0, "running", steps=200, score=-0.5))
-    assert [point.score for point in monitor.best().ranking] == [0.0, -0.5]
+    assert [point.score for point in present(monitor.best()).ranking] == [0.0, -0.5]
     # A failed trial never wins.
     monitor.update(make_trial(1, "failed", steps=100, score=0.0))
-    assert monitor.best().trial.trial_id == "t0000"
+    assert present(monitor.best()).trial.trial_id == "t0000"
     monitor.update(make_trial(0, "failed", steps=200, score=-0.5))
     assert monitor.best() is None
 
 
-def test_the_rate_is_of_the_last_seconds():
+def test_the_rate_is_of_the_last_seconds() -> None:
     clock = FakeClock()
     monitor = make_monitor(make_trial(0), clock=clock, cap=1_000_000)
     assert monitor.estimate().env_steps_per_s is None
@@ -88,7 +99,7 @@ def test_the_rate_is_of_the_last_seconds():
     assert monitor.estimate().env_steps_per_s < 400
 
 
-def test_the_start_of_ray_is_no_part_of_the_rate():
+def test_the_start_of_ray_is_no_part_of_the_rate() -> None:
     clock = FakeClock()
     monitor = make_monitor(make_trial(0), clock=clock, cap=1_000_000)
     for _ in range(6):
@@ -99,7 +110,7 @@ def test_the_start_of_ray_is_no_part_of_the_rate():
     assert monitor.estimate().env_steps_per_s == pytest.approx(500)
 
 
-def test_steps_of_an_earlier_run_are_no_part_of_the_rate():
+def test_steps_of_an_earlier_run_are_no_part_of_the_rate() -> None:
     clock = FakeClock()
     monitor = make_monitor(make_trial(0, "paused", steps=50_000), clock=clock, cap=1_000_000)
     clock.now += 1.0
@@ -108,7 +119,7 @@ def test_steps_of_an_earlier_run_are_no_part_of_the_rate():
     assert monitor.num_env_steps == 50_300
 
 
-def test_time_left_is_what_ended_trials_took():
+def test_time_left_is_what_ended_trials_took() -> None:
     """Two at once; those that ended took 10 s each. 4 s of one are done, four have not begun."""
     clock = FakeClock()
     monitor = make_monitor(*(make_trial(index) for index in range(7)), clock=clock)
@@ -122,14 +133,14 @@ def test_time_left_is_what_ended_trials_took():
     assert monitor.estimate().time_left_s == pytest.approx(4 * 10.0 / 2)
 
 
-def test_the_last_trials_run_side_by_side_only_as_far_as_there_are_any():
+def test_the_last_trials_run_side_by_side_only_as_far_as_there_are_any() -> None:
     monitor = make_monitor(*(make_trial(index) for index in range(2)), max_concurrent=8)
     monitor.update(make_trial(0, "completed", steps=1_000, time_s=10.0))
     monitor.update(make_trial(1, "running", steps=10, time_s=4.0))
     assert monitor.estimate().time_left_s == pytest.approx(6.0)
 
 
-def test_before_a_trial_has_ended_time_left_is_what_the_caps_allow():
+def test_before_a_trial_has_ended_time_left_is_what_the_caps_allow() -> None:
     clock = FakeClock()
     monitor = make_monitor(*(make_trial(index) for index in range(3)), clock=clock)
     assert monitor.estimate().time_left_s is None
@@ -142,20 +153,20 @@ def test_before_a_trial_has_ended_time_left_is_what_the_caps_allow():
     assert monitor.estimate().time_left_s == pytest.approx((800 + 1_000 + 1_000) / rate)
 
 
-def test_trials_that_failed_or_ended_before_tell_nothing_of_the_time():
+def test_trials_that_failed_or_ended_before_tell_nothing_of_the_time() -> None:
     """A trial that was ended early, or in an earlier run on another machine, is not how long a trial takes."""
     monitor = make_monitor(make_trial(0, "completed", steps=1_000, time_s=500.0), make_trial(1), make_trial(2))
     monitor.update(make_trial(1, "failed", steps=10, time_s=1.0))
     assert monitor.estimate().time_left_s is None
 
 
-def test_a_sweep_that_is_done_has_no_time_left():
+def test_a_sweep_that_is_done_has_no_time_left() -> None:
     monitor = make_monitor(make_trial(0))
     monitor.update(make_trial(0, "stopped", steps=10, time_s=1.0))
     assert monitor.estimate().time_left_s == 0.0
 
 
-def test_elapsed_time_is_the_clocks():
+def test_elapsed_time_is_the_clocks() -> None:
     clock = FakeClock()
     monitor = make_monitor(make_trial(0), clock=clock)
     clock.now += 12.5

@@ -6,6 +6,9 @@ import os
 import shutil
 import signal
 import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import odd_files
 import pytest
@@ -25,23 +28,24 @@ from tune_jobs.store.ownership import Owner
 from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.sweeps import resume as resuming
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.drive import settled
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory):
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return odd_files.make_template(tmp_path_factory.mktemp("template") / "mine")
 
 
 @pytest.fixture
-def folder(template, tmp_path):
+def folder(template: Path, tmp_path: Path) -> Path:
     return shutil.copytree(template, tmp_path / "mine")
 
 
 @pytest.fixture(autouse=True)
-def _no_modules_stay_allowed(monkeypatch):
+def _no_modules_stay_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
 
 
@@ -50,8 +54,8 @@ class WaitedError(Exception):
 
 
 @pytest.fixture(autouse=True)
-def _nobody_waits():
-    def end(*_):
+def _nobody_waits() -> Iterator[None]:
+    def end(*_: object) -> None:
         raise WaitedError
 
     before = signal.signal(signal.SIGALRM, end)
@@ -61,7 +65,7 @@ def _nobody_waits():
     signal.signal(signal.SIGALRM, before)
 
 
-def make_socket(path):
+def make_socket(path: Path) -> None:
     # Paths of sockets are short.
     with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as listener:
         listener.bind(path.name)
@@ -70,42 +74,42 @@ def make_socket(path):
 KINDS = {"named pipe": os.mkfifo, "folder": os.mkdir, "socket": make_socket}
 
 
-def take(path):
-    def act(folder):
+def take(path: str) -> Callable[..., Any]:
+    def act(folder: Path) -> None:
         Owner.take(folder / path).check()
 
     return act
 
 
-def lock(folder):
+def lock(folder: Path) -> None:
     store = SweepStore(folder)
     with store.lock(), settled(store):
         pass
 
 
-def keep(folder):
+def keep(folder: Path) -> None:
     keeper = RecordKeeper(SweepStore(folder), ["t0001"], lambda record: None)
     keeper.started("t0001")
     keeper.failed("t0001", "it broke", retried=False)
     keeper.close()
 
 
-def scalars(folder):
+def scalars(folder: Path) -> None:
     writer = ScalarWriter(SweepStore(folder))
     writer.write(SweepStore(folder).trial("t0000").read_record(), evaluated=True)
     writer.flush()
 
 
-def show(folder):
+def show(folder: Path) -> None:
     with quiet(SweepStore(folder).driver_log):
         pass
 
 
-def trial(folder):
+def trial(folder: Path) -> TrialStore:
     return SweepStore(folder).trial("t0001")
 
 
-def go_on(folder):
+def go_on(folder: Path) -> None:
     train(SweepStore(folder), "t0001", 7)
 
 
@@ -145,7 +149,9 @@ USES = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("part", USES)
-def test_what_is_no_file_is_refused_and_nobody_waits_for_it(folder, monkeypatch, part, kind):
+def test_what_is_no_file_is_refused_and_nobody_waits_for_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, part: str, kind: str
+) -> None:
     monkeypatch.setattr(resuming, "run_sweep", lambda *_, **__: None)
     path = folder / part
     if path.is_dir():
@@ -158,7 +164,7 @@ def test_what_is_no_file_is_refused_and_nobody_waits_for_it(folder, monkeypatch,
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_no_file_is_named(tmp_path, kind):
+def test_what_is_no_file_is_named(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "here"
     KINDS[kind](path)
     for use in (read_regular, sha256_file):
@@ -170,12 +176,12 @@ def test_what_is_no_file_is_named(tmp_path, kind):
         pass
 
 
-def test_a_device_gives_no_bytes():
+def test_a_device_gives_no_bytes() -> None:
     with pytest.raises(OSError, match="it is a device, not a file"):
-        read_regular("/dev/zero")
+        read_regular("/dev/zero")  # type: ignore[arg-type]
 
 
-def test_files_are_read_and_appended_to(tmp_path):
+def test_files_are_read_and_appended_to(tmp_path: Path) -> None:
     path = tmp_path / "new" / "log.txt"
     for text in (b"one\n", b"two\n"):
         with open_to_append(path) as file:
@@ -187,13 +193,13 @@ def test_files_are_read_and_appended_to(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["sweep.json", "trials/t0001/trial.json", f"{CHECKPOINT}/manifest.json"])
-def test_a_record_that_is_far_too_large_is_not_read(folder, name):
+def test_a_record_that_is_far_too_large_is_not_read(folder: Path, name: str) -> None:
     os.truncate(folder / name, MAX_RECORD_BYTES + 1)
     with pytest.raises(CheckpointError, match=rf"{name} cannot be read .*it has 67,108,865 bytes, and no more than"):
         USES[name][-1](folder)
 
 
-def test_results_that_are_far_too_large_cost_the_others_nothing(folder, caplog):
+def test_results_that_are_far_too_large_cost_the_others_nothing(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     os.truncate(trial(folder).results_path, 2**31)
     assert len(sweeps.dataframe(folder)) == 2
     assert "results.jsonl cannot be read: it has 2,147,483,648 bytes" in caplog.text
@@ -210,14 +216,14 @@ def test_results_that_are_far_too_large_cost_the_others_nothing(folder, caplog):
         ('{"created_at": -Infinity}', "-Infinity is no JSON"),
     ],
 )
-def test_json_that_readers_take_differently_is_refused(folder, text, why):
+def test_json_that_readers_take_differently_is_refused(folder: Path, text: str, why: str) -> None:
     (folder / "sweep.json").write_text(text)
     with pytest.raises(CheckpointError, match=f"sweep.json cannot be read as sweep: {why}"):
         sweeps.status(folder)
 
 
 @pytest.mark.parametrize("number", [300, 900, 100_000])
-def test_json_that_is_nested_deeply_is_refused_before_anybody_is_stuck_in_it(folder, number):
+def test_json_that_is_nested_deeply_is_refused_before_anybody_is_stuck_in_it(folder: Path, number: int) -> None:
     data = odd_files.put(odd_files.read(folder / "sweep.json"), ("spec", "more"), "here")
     (folder / "sweep.json").write_text(json.dumps(data).replace('"here"', "[" * number + "]" * number))
     for use in (sweeps.status, sweeps.report, sweeps.resume):

@@ -6,7 +6,9 @@ import os
 import shutil
 import sys
 import typing
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import odd_files
 import pytest
@@ -32,10 +34,10 @@ class Watch:
 
     folder = None
 
-    def __init__(self):
-        self.seen = []
+    def __init__(self) -> None:
+        self.seen: list[Any] = []
 
-    def __call__(self, event, arguments):
+    def __call__(self, event: str, arguments: tuple[Callable[[pytest.TempPathFactory], Path], str]) -> None:
         if self.folder is None or not event.startswith(("open", "os.", "shutil.")):
             return
         folder, self.folder = self.folder, None
@@ -49,7 +51,7 @@ class Watch:
             self.folder = folder
 
     @staticmethod
-    def _is_in(folder, path):
+    def _is_in(folder: Path, path: bytes | str | Path) -> bool:
         try:
             return Path(os.path.realpath(os.fsdecode(path))).is_relative_to(folder)
         except (OSError, ValueError):
@@ -60,12 +62,12 @@ WATCH = Watch()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _audit():
+def _audit() -> None:
     sys.addaudithook(WATCH)  # for as long as the process lives; it sleeps while it has no folder
 
 
 @pytest.fixture
-def precious(tmp_path):
+def precious(tmp_path: Path) -> Iterator[Path]:
     """A folder outside the sweep that nobody may even look into."""
     folder = (tmp_path / "precious").resolve()
     folder.mkdir()
@@ -80,7 +82,7 @@ def precious(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def template(tmp_path_factory):
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = odd_files.make_template(tmp_path_factory.mktemp("template") / "mine")
     for name in ("tune", "report/figures", "packs", "trials/t0001/copied/000003", "trials/t0001/tensorboard"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -91,34 +93,34 @@ def template(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def _no_modules_stay_allowed(monkeypatch):
+def _no_modules_stay_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
 
 
 @pytest.fixture
-def folder(template, tmp_path):
+def folder(template: Path, tmp_path: Path) -> Path:
     return shutil.copytree(template, tmp_path / "sweeps" / "mine")
 
 
-def write_films(store):
+def write_films(store: SweepStore) -> None:
     for path in (store.best_folder / "before.mp4", refuse_links_in(store.report_folder) / "index.html"):
         path.write_bytes(b"")
 
 
-def scalars(store):
+def scalars(store: SweepStore) -> None:
     writer = ScalarWriter(store)
     writer.write(store.trial("t0001").read_record(), evaluated=True)
     writer.flush()
 
 
-def resume(store):
+def resume(store: SweepStore) -> None:
     with held(store.folder / ".lock", "", ""):
         Owner.take(store.folder / ".owner")
         store.driver_log.open("ab").close()
         remove_folder(store.tune_folder)
 
 
-def use(folder):
+def use(folder: Path) -> None:
     """What readers and a driver do with a sweep, each for itself."""
     store = SweepStore(folder)
     acts = (
@@ -146,7 +148,7 @@ def use(folder):
             act()
 
 
-def texts_in(template):
+def texts_in(template: Path) -> Iterator[tuple[str, tuple[int | str, ...]]]:
     """Every place of every file that holds a text, or may."""
     for file in odd_files.FILES:
         data = odd_files.read(template / file)
@@ -158,14 +160,14 @@ def texts_in(template):
                 yield file, at
 
 
-def test_nothing_that_is_left_alone_looks_outside(folder, precious):
+def test_nothing_that_is_left_alone_looks_outside(folder: Path, precious: Path) -> None:
     use(folder)
     WATCH.folder = None
     assert (folder / "trials" / "t0001" / "checkpoints" / "000009").is_dir()
     assert not (folder / "tune").exists()
 
 
-def test_the_watch_sees(precious):
+def test_the_watch_sees(precious: Path) -> None:
     """Or the other tests would say nothing."""
     (precious / "thesis.json").read_text()
     list(precious.iterdir())
@@ -173,7 +175,7 @@ def test_the_watch_sees(precious):
     WATCH.seen.clear()
 
 
-def test_the_files_that_are_tried_hold_every_text_of_every_record(template):
+def test_the_files_that_are_tried_hold_every_text_of_every_record(template: Path) -> None:
     """A field that is new is tried too, or this fails."""
     known = {at[-1] for _, at in texts_in(template)} | {at[-2] for _, at in texts_in(template) if at[-1] == 0}
     for name in ("SweepRecord", "TrialRecord", "CheckpointRecord", "ChangeRecord", "BestRecord", "EvaluationRecord"):
@@ -183,7 +185,7 @@ def test_the_files_that_are_tried_hold_every_text_of_every_record(template):
 
 
 @pytest.mark.parametrize("file", odd_files.FILES)
-def test_no_text_in_a_file_leads_outside(template, folder, precious, file):
+def test_no_text_in_a_file_leads_outside(template: Path, folder: Path, precious: Path, file: str) -> None:
     """Of three kinds of paths, each place is given one and the next place the next one."""
     paths = itertools.cycle([str(precious), "../../precious", "../../../../../precious", "x/../../../precious"])
     for other, at in texts_in(template):
@@ -196,13 +198,15 @@ def test_no_text_in_a_file_leads_outside(template, folder, precious, file):
             WATCH.folder = precious
 
 
-def parts_of(template):
+def parts_of(template: Path) -> list[str]:
     """Of the trials those of the winner; the other's are as these."""
     parts = (path.relative_to(template).as_posix() for path in template.rglob("*"))
     return sorted(part for part in parts if not part.startswith("trials/t0000/"))
 
 
-def test_no_part_of_a_sweep_is_followed_if_it_is_a_link(template, folder, precious, tmp_path):
+def test_no_part_of_a_sweep_is_followed_if_it_is_a_link(
+    template: Path, folder: Path, precious: Path, tmp_path: Path
+) -> None:
     followed = {}
     for part in parts_of(template):
         WATCH.folder, path = None, folder / part

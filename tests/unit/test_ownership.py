@@ -2,6 +2,7 @@
 
 import multiprocessing
 import threading
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 import pytest
@@ -12,15 +13,15 @@ from tune_jobs.store.ownership import Owner, OwnershipLostError
 
 
 @pytest.fixture
-def path(tmp_path):
+def path(tmp_path: Path) -> Path:
     return tmp_path / "t0000" / ".owner"
 
 
-def epoch(path):
+def epoch(path: Path) -> int:
     return int(path.read_text().split()[0])
 
 
-def test_who_takes_it_has_a_larger_epoch_and_who_had_it_has_lost_it(path):
+def test_who_takes_it_has_a_larger_epoch_and_who_had_it_has_lost_it(path: Path) -> None:
     first = Owner.take(path)
     with first.held():
         pass
@@ -35,12 +36,12 @@ def test_who_takes_it_has_a_larger_epoch_and_who_had_it_has_lost_it(path):
         pass
 
 
-def open_files(folder):
+def open_files(folder: Path) -> list[Path]:
     links = [link for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
     return [link for link in links if str(link.readlink()).startswith(str(folder))]
 
 
-def test_a_released_owner_has_no_file_open_and_can_still_write(path):
+def test_a_released_owner_has_no_file_open_and_can_still_write(path: Path) -> None:
     owner = Owner.take(path)
     for _ in range(2):
         with owner.held():
@@ -50,7 +51,7 @@ def test_a_released_owner_has_no_file_open_and_can_still_write(path):
     assert owner.is_current()
 
 
-def test_a_token_can_be_passed_on(path):
+def test_a_token_can_be_passed_on(path: Path) -> None:
     token = Owner.take(path).token
     with Owner(path, token).held():
         pass
@@ -58,10 +59,10 @@ def test_a_token_can_be_passed_on(path):
     assert not Owner(path, token).is_current()
 
 
-def test_nobody_takes_it_between_the_check_and_the_write(path):
+def test_nobody_takes_it_between_the_check_and_the_write(path: Path) -> None:
     first, order = Owner.take(path), []
 
-    def take():
+    def take() -> None:
         Owner.take(path)
         order.append("taken")
 
@@ -74,7 +75,7 @@ def test_nobody_takes_it_between_the_check_and_the_write(path):
     assert order == ["written", "taken"]
 
 
-def _count(path, number, barrier):
+def _count(path: Path, number: int, barrier: Barrier) -> None:
     """Take it, and count up in a file beside it until another one has taken it."""
     owner = Owner.take(path)
     barrier.wait()
@@ -92,7 +93,7 @@ def _count(path, number, barrier):
         path.with_name("last").write_text(owner.token.split()[0])
 
 
-def test_processes_that_write_at_once_write_one_after_the_other(path):
+def test_processes_that_write_at_once_write_one_after_the_other(path: Path) -> None:
     path.parent.mkdir()
     path.with_name("counter").write_text("0")
     context = multiprocessing.get_context("spawn")
@@ -109,7 +110,7 @@ def test_processes_that_write_at_once_write_one_after_the_other(path):
     assert path.with_name("counter").read_text() == "50"
 
 
-def test_what_is_taken_under_a_run_can_be_taken_no_more_when_the_run_is_over(tmp_path, path):
+def test_what_is_taken_under_a_run_can_be_taken_no_more_when_the_run_is_over(tmp_path: Path, path: Path) -> None:
     old = Owner.take(tmp_path / ".owner")
     first = Owner.take(path, old)
     Owner.take(tmp_path / ".owner")
@@ -121,7 +122,7 @@ def test_what_is_taken_under_a_run_can_be_taken_no_more_when_the_run_is_over(tmp
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x00\xff", b"no number", b"7"])
-def test_a_file_that_cannot_be_read_is_nobodys_and_can_be_taken(path, junk):
+def test_a_file_that_cannot_be_read_is_nobodys_and_can_be_taken(path: Path, junk: bytes) -> None:
     first = Owner.take(path)
     path.write_bytes(junk)
     assert not first.is_current()
@@ -130,7 +131,7 @@ def test_a_file_that_cannot_be_read_is_nobodys_and_can_be_taken(path, junk):
     assert not first.is_current()
 
 
-def test_a_link_is_not_followed(tmp_path, path):
+def test_a_link_is_not_followed(tmp_path: Path, path: Path) -> None:
     path.parent.mkdir()
     elsewhere = tmp_path / "elsewhere"
     path.symlink_to(elsewhere)
@@ -139,14 +140,14 @@ def test_a_link_is_not_followed(tmp_path, path):
     assert not elsewhere.exists()
 
 
-def test_a_folder_that_is_gone_is_nobodys(path):
+def test_a_folder_that_is_gone_is_nobodys(path: Path) -> None:
     owner = Owner.take(path)
     path.unlink()
     path.parent.rmdir()
     assert not owner.is_current()
 
 
-def test_a_process_that_holds_it_for_ever_is_named(path, monkeypatch):
+def test_a_process_that_holds_it_for_ever_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ownership, "_PATIENCE_S", 0.2)
     first = Owner.take(path)
     with first.held(), pytest.raises(CannotRunError, match="has been locked") as caught:

@@ -18,8 +18,8 @@ def slow_env(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def packs(machine: int | Machine = 2, **fields: Any) -> tuple[int, int]:
-    made = plan(machine, **fields).packs
-    return present(made).num_packs, present(made).slots
+    made = present(plan(machine, **fields).packs)
+    return made.num_packs, made.slots
 
 
 # -- sizes
@@ -55,8 +55,8 @@ def test_trials_at_once_are_those_of_all_packs() -> None:
     assert plan(3).max_concurrent == 10
     assert plan(2, num_samples=1000).max_concurrent == 2 * 63
     assert plan(2, resources={"max_concurrent": 5}).max_concurrent == 4
-    made = plan(8, resources={"num_cpus": 3}).packs
-    assert (present(made).cpus_per_pack, present(made).gpus_per_pack) == (3, 0)
+    made = present(plan(8, resources={"num_cpus": 3}).packs)
+    assert (made.cpus_per_pack, made.gpus_per_pack) == (3, 0)
 
 
 @pytest.mark.parametrize(("cpus", "expected"), [(1, (1, 4)), (2, (2, 2)), (3, (3, 1)), (4, (4, 1)), (16, (16, 1))])
@@ -79,8 +79,8 @@ def test_packs_are_smaller_where_memory_is_short() -> None:
     roomy = plan(Machine(2, memory_bytes=2.1 * 10 * MEMBER), **MEMORY)
     assert (present(roomy.packs).slots, present(roomy.packs).notes) == (5, ())
     tight = plan(Machine(2, memory_bytes=2.1 * 6 * MEMBER), **MEMORY)
-    assert (tight.packs.num_packs, tight.packs.slots) == (2, 3)
-    (note,) = tight.packs.notes
+    assert (present(tight.packs).num_packs, present(tight.packs).slots) == (2, 3)
+    (note,) = present(tight.packs).notes
     # Ten trials of 48 MB; half of what there is.
     assert "Packs are planned smaller: 2 x 5 trials at once may take 481.5 MB of memory" in note
     assert "half of what this machine has available is 302.4 MB. 2 x 3 trials run at once" in note
@@ -95,8 +95,8 @@ def test_fewer_packs_where_memory_is_shorter_still() -> None:
 
 def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own() -> None:
     made = plan(Machine(2, memory_bytes=MEMBER), **MEMORY)
-    assert (made.packs.num_packs, made.packs.slots) == (1, 1)
-    (note,) = made.packs.notes
+    assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 1)
+    (note,) = present(made.packs).notes
     assert "one trial may take 48.2 MB of memory, more than half of what this machine has available, 24.0 MB" in note
     assert "One pack trains one trial at a time" in note
     assert made.engines == {"packed": 10}
@@ -138,10 +138,10 @@ def test_on_a_cluster_the_node_where_packs_get_least_decides() -> None:
 
 
 def test_the_plan_says_how_environments_step() -> None:
-    made = plan().packs
-    assert present(made).env_kind == "vectorised"
-    assert present(made).num_env_processes == 0
-    assert present(made).env_step_us is None or present(made).env_step_us > 0
+    made = present(plan().packs)
+    assert made.env_kind == "vectorised"
+    assert made.num_env_processes == 0
+    assert made.env_step_us is None or made.env_step_us > 0
 
 
 ONE_GPU = {"resources": {"num_gpus": 1}}
@@ -173,15 +173,15 @@ FOUR_ENVS = {"hyperparams": {"num_envs": 4, "train_batch_size": 64, "minibatch_s
 def test_idle_cpus_step_slow_environments(
     slow_env, machine: int | Machine, fields: dict[str, Any], packs: int, processes: int
 ) -> None:
-    made = plan(machine, **fields).packs
-    assert (present(made).env_kind, present(made).num_packs, present(made).num_env_processes) == (
+    made = present(plan(machine, **fields).packs)
+    assert (made.env_kind, made.num_packs, made.num_env_processes) == (
         "processes",
         packs,
         processes,
     )
-    assert present(made).cpus_per_pack == fields.get("resources", {}).get("num_cpus", 1) + processes
+    assert made.cpus_per_pack == fields.get("resources", {}).get("num_cpus", 1) + processes
     idle = "one CPU" if processes == 1 else f"{processes} CPUs"
-    assert (present(made).env_step_us, present(made).why_env_kind) == (
+    assert (made.env_step_us, made.why_env_kind) == (
         5000.0,
         f"a step takes 5.0 ms, and {idle} would be idle",
     )
@@ -198,14 +198,14 @@ def test_idle_cpus_step_slow_environments(
     ],
 )
 def test_no_idle_cpus_no_processes(slow_env, machine: int, fields: dict[str, Any], why: str) -> None:
-    made = plan(machine, **fields).packs
-    assert (present(made).env_kind, present(made).num_env_processes) == ("scalar", 0)
-    assert present(made).why_env_kind.startswith(f"a step takes 5.0 ms, but {why}")
+    made = present(plan(machine, **fields).packs)
+    assert (made.env_kind, made.num_env_processes) == ("scalar", 0)
+    assert made.why_env_kind.startswith(f"a step takes 5.0 ms, but {why}")
 
 
 def test_cpus_that_other_trials_need_are_not_idle(slow_env, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_reasons(monkeypatch, [0.2])
     space: dict[str, Any] = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1, "resources": {"num_gpus": 1}}
-    made = plan(Machine(8, 1), **space).packs
-    assert present(made).num_env_processes == 0
-    assert present(made).why_env_kind.endswith("but other trials need the idle CPUs")
+    made = present(plan(Machine(8, 1), **space).packs)
+    assert made.num_env_processes == 0
+    assert made.why_env_kind.endswith("but other trials need the idle CPUs")

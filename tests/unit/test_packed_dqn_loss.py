@@ -11,7 +11,13 @@ from tests.rounding import close
 M, B = 3, 50
 
 
-def by_autograd(outputs, actions, targets, weights, hyperparams):
+def by_autograd(
+    outputs: torch.Tensor,
+    actions: torch.Tensor,
+    targets: torch.Tensor,
+    weights: torch.Tensor | None,
+    hyperparams: DQNHyperparams,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(gradient, loss of each member) of the loss as it is defined."""
     outputs = outputs.clone().requires_grad_()
     num_actions = outputs.shape[-1] - hyperparams.dueling
@@ -32,7 +38,9 @@ def by_autograd(outputs, actions, targets, weights, hyperparams):
 @pytest.mark.parametrize("td_loss", ["huber", "mse"])
 @pytest.mark.parametrize("dueling", [False, True])
 @pytest.mark.parametrize("num_actions", [2, 4])
-def test_the_gradient_by_hand_is_that_of_the_loss(num_actions, dueling, td_loss, has_weights):
+def test_the_gradient_by_hand_is_that_of_the_loss(
+    num_actions: int, dueling: bool, td_loss: str, has_weights: bool
+) -> None:
     hyperparams = DQNHyperparams(dueling=dueling, td_loss=td_loss)
     rng = torch.Generator().manual_seed(num_actions)
     outputs = 2 * torch.randn(M, B, num_actions + dueling, generator=rng)
@@ -50,7 +58,7 @@ def test_the_gradient_by_hand_is_that_of_the_loss(num_actions, dueling, td_loss,
     close(dqn.mean_loss(found.td_errors, weights, hyperparams), losses)
 
 
-def test_the_best_next_action_is_the_target_networks_or_the_online_ones():
+def test_the_best_next_action_is_the_target_networks_or_the_online_ones() -> None:
     rng = torch.Generator().manual_seed(0)
     target, online = torch.randn(M, B, 4, generator=rng), torch.randn(M, B, 4, generator=rng)
     alone, double = dqn.best_next_values(target, None), dqn.best_next_values(target, online)

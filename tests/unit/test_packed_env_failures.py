@@ -1,9 +1,13 @@
 """Environments of a pack that raise, or whose process dies: their member fails, the others go on."""
 
+from __future__ import annotations
+
 import multiprocessing
 import os
 import signal
 import traceback
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -11,11 +15,17 @@ from odd_envs import EXIT, RAISE, WRONG_SHAPE
 from test_packed_envs import assert_equal_bits, make, own_modules, rows_of, seen_by
 
 from policies.errors import EnvError
+from tests.narrowing import present
+
+if TYPE_CHECKING:
+    from policies.packed.envs.cartpole import CartPoleEnvs
+    from policies.packed.envs.scalar import ScalarEnvs
+    from policies.packed.envs.vector import Step
 
 __all__ = ["make", "own_modules"]
 
 
-def go_on(envs, breaking=None, how=0, place=1):
+def go_on(envs: ScalarEnvs, breaking: str | None = None, how: int = 0, place: int = 1) -> Step:
     actions = np.zeros(len(envs.observations), dtype=np.int64)
     if breaking is not None:
         actions[rows_of(envs, breaking)][place] = how
@@ -24,7 +34,9 @@ def go_on(envs, breaking=None, how=0, place=1):
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
 @pytest.mark.parametrize(("how", "words"), [(RAISE, "the motor broke"), (WRONG_SHAPE, r"shape \(5,\), not \(2,\)")])
-def test_an_env_that_raises_fails_its_member_alone(make, kind, how, words):
+def test_an_env_that_raises_fails_its_member_alone(
+    make: Callable[..., CartPoleEnvs | ScalarEnvs], kind: str, how: int, words: str
+) -> None:
     envs = make("odd_envs:Fragile", kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
     alone = make("odd_envs:Fragile", "scalar", members={"a": 1, "c": 3})
     for index in range(20):
@@ -51,7 +63,7 @@ def test_an_env_that_raises_fails_its_member_alone(make, kind, how, words):
 
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
-def test_a_member_that_cannot_be_reset_is_none(make, kind):
+def test_a_member_that_cannot_be_reset_is_none(make: Callable[..., CartPoleEnvs | ScalarEnvs], kind: str) -> None:
     envs = make("odd_envs:RefusesSeeds", kind, num_envs=2, members={"a": 2}, num_processes=2)
     with pytest.raises(EnvError, match=r"reset\(\): ValueError: 13 brings bad luck"):
         envs.add("b", 12)  # its second sub-environment, in another process than the first
@@ -64,7 +76,9 @@ def test_a_member_that_cannot_be_reset_is_none(make, kind):
     np.testing.assert_array_equal(step.observations[2:], go_on(alone).observations)
 
 
-def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_with_it_again(make):
+def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_with_it_again(
+    make: Callable[..., CartPoleEnvs | ScalarEnvs],
+) -> None:
     envs = make("odd_envs:Fragile", "processes", members={"a": 1, "b": 2}, num_processes=2)
     go_on(envs)
     # Places 0 and 2 of a, and place 1 of b, are in one process.
@@ -88,9 +102,9 @@ def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_
         assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
 
 
-def test_a_process_that_is_killed_fails_its_members(make):
+def test_a_process_that_is_killed_fails_its_members(make: Callable[..., CartPoleEnvs | ScalarEnvs]) -> None:
     envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
-    os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+    os.kill(present(multiprocessing.active_children()[0].pid), signal.SIGKILL)
     go_on(envs)
     assert "was killed by SIGKILL" in str(envs.errors["a"])
     assert isinstance(envs.errors["a"], EnvError)
@@ -99,7 +113,7 @@ def test_a_process_that_is_killed_fails_its_members(make):
     assert go_on(envs).rewards.all()
 
 
-def test_a_process_that_is_dead_when_a_member_comes_fails_both(make):
+def test_a_process_that_is_dead_when_a_member_comes_fails_both(make: Callable[..., CartPoleEnvs | ScalarEnvs]) -> None:
     envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
     process = multiprocessing.active_children()[0]
     process.kill()

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Iterator
-from typing import Any, cast
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
+from numpy.typing import NDArray
 from policy_factory import register_test_envs
 
 from policies.envs import modules as env_modules
@@ -15,6 +16,12 @@ from policies.envs.make import make_env
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError
 from policies.packed.envs.make import make_packed_envs
+
+if TYPE_CHECKING:
+    from policies.packed.envs.cartpole import CartPoleEnvs
+    from policies.packed.envs.scalar import ScalarEnvs
+    from policies.packed.envs.vector import Step
+
 
 register_test_envs()
 
@@ -39,7 +46,9 @@ KINDS = [
 def make() -> Iterator[Any]:
     made = []
 
-    def make_one(env_id: str, kind: str, num_envs: int = N, env_args: Any = None, members=(), **kwargs: Any):
+    def make_one(
+        env_id: str, kind: str, num_envs: int = N, env_args: Any = None, members: dict[str, int] = (), **kwargs: Any
+    ) -> CartPoleEnvs | ScalarEnvs:
         envs = make_packed_envs(env_id, env_args, num_envs, kind=kind, **kwargs)
         made.append(envs)
         for member_id, seed in dict(members).items():
@@ -58,29 +67,29 @@ class Actor:
     def __init__(self, space: Any, seed: int, num_envs: int = N) -> None:
         self.space, self.rng, self.num_envs = space, np.random.default_rng(seed), num_envs
 
-    def __call__(self):
+    def __call__(self) -> NDArray[np.int64]:
         if isinstance(self.space, gym.spaces.Discrete):
             return self.rng.integers(0, self.space.n, self.num_envs)
         size = (self.num_envs, *self.space.shape)
         return self.rng.uniform(self.space.low, self.space.high, size).astype(np.float32)
 
 
-def step_all(envs, actors):
+def step_all(envs: CartPoleEnvs | ScalarEnvs, actors: dict[str, Actor]) -> Step:
     return envs.step(np.concatenate([actors[member_id]() for member_id in envs.member_ids]))
 
 
-def rows_of(envs, member_id, num_envs: int = N):
+def rows_of(envs: CartPoleEnvs | ScalarEnvs, member_id: str, num_envs: int = N) -> slice:
     first = envs.member_ids.index(member_id) * num_envs
     return slice(first, first + num_envs)
 
 
-def seen_by(envs, step, member_id):
+def seen_by(envs: CartPoleEnvs | ScalarEnvs, step: Step, member_id: str) -> dict[str, NDArray[Any]]:
     rows = rows_of(envs, member_id)
     names = ("observations", "final_observations", "rewards", "own_rewards", "terminated", "truncated")
     return {name: getattr(step, name)[rows].copy() for name in names}
 
 
-def assert_equal_bits(one, another) -> None:
+def assert_equal_bits(one: Sequence[dict[str, NDArray[Any]]], another: Sequence[dict[str, NDArray[Any]]]) -> None:
     assert len(one) == len(another)
     for left, right in zip(one, another, strict=True):
         for name, values in left.items():
@@ -91,13 +100,13 @@ def assert_equal_bits(one, another) -> None:
 
 
 @pytest.mark.parametrize("env_args", [{"max_episode_steps": 25}, {"sutton_barto_reward": True}])
-def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make, env_args: Any) -> None:
+def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make: Any, env_args: Any) -> None:
     envs = make("CartPole-v1", "vectorised", env_args=env_args, members={"a": 1, "b": 2})
     scalars = [make_env("CartPole-v1", env_args) for _ in range(2 * N)]
 
-    def restart(row) -> None:
+    def restart(row: int) -> None:
         scalars[row].reset(seed=0)
-        scalars[row].unwrapped.state = envs._rows.states[row].copy()
+        cast("Any", scalars[row].unwrapped).state = envs._rows.states[row].copy()
 
     for row in range(2 * N):
         restart(row)
@@ -118,7 +127,7 @@ def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make, 
     assert (num_ended["truncated"] > 10) is ("max_episode_steps" in env_args)
 
 
-def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make) -> None:
+def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make: Any) -> None:
     envs = make("CartPole-v1", "vectorised", num_envs=50, env_args={"max_episode_steps": 2}, members={"a": 1, "b": 2})
     starts = [envs.observations]
     for _ in range(20):
@@ -132,7 +141,7 @@ def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make) -> Non
     assert np.abs(cast("Any", starts).mean(axis=0)).max() < 0.004
 
 
-def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make) -> None:
+def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make: Any) -> None:
     traces = []
     every = dict.fromkeys(range(60), 1)
     for stretches in ({0: 60}, every, {0: 7, 7: 20, 27: 33}, {0: 100}, {}, {0: 10, 3: 20, 17: 2, 30: 8, 33: 40}):
@@ -177,8 +186,8 @@ def test_a_cartpole_of_somebody_s_own_is_not_vectorised() -> None:
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_a_member_gets_the_same_beside_any_others(make, env_id: str, kind: str) -> None:
-    def trace_alone(member_id, seed: int, actor_seed):
+def test_a_member_gets_the_same_beside_any_others(make: Any, env_id: str, kind: str) -> None:
+    def trace_alone(member_id: str, seed: int, actor_seed: int) -> list[dict[str, NDArray[Any]]]:
         envs = make(env_id, kind, env_args={"max_episode_steps": 15}, members={member_id: seed}, num_processes=2)
         actor = Actor(envs.action_space, actor_seed)
         return [seen_by(envs, envs.step(actor()), member_id) for _ in range(60)]
@@ -206,12 +215,12 @@ def test_a_member_gets_the_same_beside_any_others(make, env_id: str, kind: str) 
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make, env_id: str, kind: str) -> None:
+def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make: Any, env_id: str, kind: str) -> None:
     envs = make(env_id, kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
     actors = {name: Actor(envs.action_space, seed) for seed, name in enumerate("abcd")}
     step_all(envs, actors)
 
-    def observed():
+    def observed() -> dict[str, NDArray[np.float32]]:
         return {member_id: envs.observations[rows_of(envs, member_id)].copy() for member_id in envs.member_ids}
 
     before = observed()
@@ -230,7 +239,7 @@ def test_running_episodes_go_on_when_members_come_go_and_are_arranged(make, env_
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_members_are_named_once_and_all_of_them_are_arranged(make, env_id: str, kind: str) -> None:
+def test_members_are_named_once_and_all_of_them_are_arranged(make: Any, env_id: str, kind: str) -> None:
     envs = make(env_id, kind, members={"a": 1, "b": 2}, num_processes=1)
     with pytest.raises(ValueError, match="a member already"):
         envs.add("a", 3)
@@ -247,7 +256,7 @@ def test_members_are_named_once_and_all_of_them_are_arranged(make, env_id: str, 
 
 
 @pytest.mark.parametrize(("env_id", "kind"), KINDS)
-def test_no_step_spans_a_reset(make, env_id: str, kind: str) -> None:
+def test_no_step_spans_a_reset(make: Any, env_id: str, kind: str) -> None:
     limit = 6
     envs = make(env_id, kind, env_args={"max_episode_steps": limit}, members={"a": 1, "b": 2}, num_processes=2)
     actors = {"a": Actor(envs.action_space, 0), "b": Actor(envs.action_space, 1)}
@@ -272,7 +281,7 @@ def test_no_step_spans_a_reset(make, env_id: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["vectorised", "scalar"])
-def test_truncated_is_not_terminated(make, kind: str) -> None:
+def test_truncated_is_not_terminated(make: Any, kind: str) -> None:
     envs = make("CartPole-v1", kind, env_args={"max_episode_steps": 12}, num_envs=2, members={"a": 1})
     balanced, pushed = [], []
     for index in range(12):
@@ -285,7 +294,7 @@ def test_truncated_is_not_terminated(make, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["vectorised", "scalar"])
-def test_the_failure_penalty_is_for_the_learner_alone(make, kind: str) -> None:
+def test_the_failure_penalty_is_for_the_learner_alone(make: Any, kind: str) -> None:
     envs = make("CartPole-v1", kind, env_args={"max_episode_steps": 12}, members={"a": 1}, failure_penalty=-7.5)
     num_failed = num_truncated = 0
     for index in range(40):
@@ -318,7 +327,7 @@ def test_a_penalty_without_a_failure_is_refused() -> None:
     ],
 )
 def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(
-    make, kind: str, env_id: str, env_args: Any
+    make: Any, kind: str, env_id: str, env_args: Any
 ) -> None:
     envs = make(env_id, kind, env_args=env_args, members={"a": 2**32 - 2}, num_processes=2)
     scalars = [make_env(env_id, env_args) for _ in range(N)]
@@ -341,7 +350,7 @@ def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(
     assert num_ended
 
 
-def test_images_stay_bytes(make) -> None:
+def test_images_stay_bytes(make: Any) -> None:
     envs = make("CartPole-v1", "scalar", env_args={"pixels": True}, num_envs=1, members={"a": 1})
     assert envs.observations.dtype == np.uint8
     step = envs.step(np.array([1]))
@@ -349,7 +358,7 @@ def test_images_stay_bytes(make) -> None:
     assert step.observations.max() > 0
 
 
-def test_an_env_may_write_into_its_action(make) -> None:
+def test_an_env_may_write_into_its_action(make: Any) -> None:
     class Greedy(gym.Env[Any, Any]):
         observation_space = gym.spaces.Box(-1, 1, (1,))
         action_space = gym.spaces.Box(-1, 1, (2,))

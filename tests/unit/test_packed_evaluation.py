@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
 import policies.packed.evaluation
-from policies.acting.evaluate import Evaluator
+from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.activations import ACTIVATIONS
 from policies.envs import modules as env_modules
@@ -22,13 +25,20 @@ register_test_envs()
 
 
 @pytest.fixture(autouse=True)
-def own_modules(monkeypatch):
+def own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     """The modules of these tests are allowed, and are not any more when they are over."""
     monkeypatch.setattr(env_modules, "_allowed", set())
     allow_modules(["odd_envs", "policy_factory"])
 
 
-def assert_as_alone(policies, *, env_id="CartPole-v1", env_args=None, seeds=range(12), cap=None):
+def assert_as_alone(
+    policies: Sequence[NetworkPolicy | RandomPolicy],
+    *,
+    env_id: str = "CartPole-v1",
+    env_args: dict[str, Any] | None = None,
+    seeds: range | Sequence[int] = range(12),
+    cap: int | None = None,
+) -> list[Episodes]:
     with Evaluator(env_id, env_args, seeds, max_episode_steps=cap) as evaluator:
         expected = [evaluator.run(policy) for policy in policies]
         assert evaluate_many(evaluator, policies) == expected
@@ -36,12 +46,12 @@ def assert_as_alone(policies, *, env_id="CartPole-v1", env_args=None, seeds=rang
     return expected
 
 
-def with_network(policy, **changes):
+def with_network(policy: NetworkPolicy, **changes: Any) -> NetworkPolicy:
     network = dataclasses.replace(policy.portable.network, **changes)
     return NetworkPolicy(dataclasses.replace(policy.portable, network=network))
 
 
-def deep(skill, activation="relu", hidden=(8, 8)):
+def deep(skill: str, activation: str = "relu", hidden: tuple[int, ...] = (8, 8)) -> NetworkPolicy:
     """A balancing policy with hidden layers, so that episodes are of all lengths; its numbers are random besides."""
     linear = balancing_policy("CartPole-v1", skill).portable
     weight = linear.network.layers[0].weight
@@ -62,7 +72,9 @@ def deep(skill, activation="relu", hidden=(8, 8)):
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
 @pytest.mark.parametrize("counts", [(20, 20, 20), (1, 1, 1), (7, 1, 40), (3, 0, 5)])
-def test_networks_give_the_outputs_that_they_give_alone_to_the_last_bit(activation, counts):
+def test_networks_give_the_outputs_that_they_give_alone_to_the_last_bit(
+    activation: str, counts: tuple[int, int, int]
+) -> None:
     some = [make_policy("CartPole-v1", activation=activation, seed=seed, hidden=(64, 50)) for seed in range(4)]
     normal = Normalization(np.ones(4, np.float32), np.full(4, 0.7, np.float32), 2.0)
     some[1:3] = [with_network(policy, normalization=normal, scale=0.9) for policy in some[1:3]]
@@ -75,14 +87,14 @@ def test_networks_give_the_outputs_that_they_give_alone_to_the_last_bit(activati
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
-def test_policies_have_the_episodes_that_they_have_alone(activation):
+def test_policies_have_the_episodes_that_they_have_alone(activation: str) -> None:
     random = [make_policy("CartPole-v1", activation=activation, seed=seed, hidden=(19, 33)) for seed in range(6)]
     skilled = [deep(skill, activation, hidden=(19, 33)) for skill in ("good", "fair", "poor")]
     results = assert_as_alone([*random, *skilled])
     assert len({length for result in results for length in result.lengths}) > 20
 
 
-def test_policies_of_many_shapes_and_kinds_side_by_side():
+def test_policies_of_many_shapes_and_kinds_side_by_side() -> None:
     mean, std = np.array([0.1, -0.2, 0.01, 0.3], np.float32), np.array([1.3, 0.7, 0.1, 1.1], np.float32)
     normal = Normalization(mean, std, 1.5)
     policies = [
@@ -106,9 +118,9 @@ def test_policies_of_many_shapes_and_kinds_side_by_side():
     assert_as_alone(policies[:1])
 
 
-def test_a_class_of_somebody_s_own_acts_as_it_does():
+def test_a_class_of_somebody_s_own_acts_as_it_does() -> None:
     class Contrary(NetworkPolicy):
-        def act(self, observations):
+        def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
             return 1 - super().act(observations)
 
     policies = [Contrary(deep("good").portable), deep("good")]
@@ -125,21 +137,21 @@ def test_a_class_of_somebody_s_own_acts_as_it_does():
         ({"sutton_barto_reward": True}, 90),
     ],
 )
-def test_caps_limits_and_other_rewards(env_args, cap):
+def test_caps_limits_and_other_rewards(env_args: dict[str, Any], cap: int | None) -> None:
     policies = [deep(skill) for skill in ("good", "fair", "poor")]
     results = assert_as_alone(policies, env_args=env_args, cap=cap)
     assert max(results[0].lengths) == (cap if cap is not None and cap != 60 else 40)
     assert min(results[2].lengths) < 40
 
 
-def test_more_episodes_than_are_played_at_once(monkeypatch):
+def test_more_episodes_than_are_played_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policies.packed.evaluation, "_MAX_ROWS", 25)
     some = [deep(skill, hidden=hidden) for hidden in ((8, 8), (9,)) for skill in ("good", "wobbly", "poor")]
     assert_as_alone(some, cap=120)
     assert_as_alone(some[:3], seeds=range(40), cap=50)
 
 
-def test_weights_that_are_not_finite_come_back_as_the_error():
+def test_weights_that_are_not_finite_come_back_as_the_error() -> None:
     broken = [make_portable("CartPole-v1", seed=seed) for seed in (1, 2)]
     broken[0].network.layers[0].weight[0, 0] = np.nan
     broken[1].network.layers[1].bias[0] = np.inf
@@ -152,7 +164,7 @@ def test_weights_that_are_not_finite_come_back_as_the_error():
     assert "layer 1" in str(results[2])
 
 
-def test_a_policy_for_another_env_comes_back_as_the_error():
+def test_a_policy_for_another_env_comes_back_as_the_error() -> None:
     with Evaluator("CartPole-v1", None, range(3)) as evaluator:
         wrong, right = evaluate_many(evaluator, [make_policy("Acrobot-v1"), deep("poor")])
         assert right == evaluator.run(deep("poor"))
@@ -160,19 +172,19 @@ def test_a_policy_for_another_env_comes_back_as_the_error():
         raise wrong
 
 
-def test_other_envs_are_played_one_policy_after_the_other():
+def test_other_envs_are_played_one_policy_after_the_other() -> None:
     policies = [make_policy("Pendulum-v1", seed=seed) for seed in range(3)]
     assert_as_alone(policies, env_id="Pendulum-v1", seeds=range(2), cap=20)
     assert_as_alone([make_policy("TestWalk-v0", seed=1)], env_id="TestWalk-v0", env_args={"end": 1.0}, cap=50)
 
 
-def test_an_env_that_raises_fails_the_policies_it_raises_at():
+def test_an_env_that_raises_fails_the_policies_it_raises_at() -> None:
     with Evaluator("TestWalk-v0", {"fail_at": 3}, [5, 6]) as evaluator:
         results = evaluate_many(evaluator, [make_policy("TestWalk-v0", seed=seed) for seed in (1, 2)])
     assert all(isinstance(result, EnvError) for result in results)
     assert "the motor broke" in str(results[0])
 
 
-def test_no_policies_have_no_episodes():
+def test_no_policies_have_no_episodes() -> None:
     with Evaluator("CartPole-v1", None, [1]) as evaluator:
         assert evaluate_many(evaluator, []) == []

@@ -1,11 +1,16 @@
 """PPO's gradients by hand, episodes over fragments, advantages, and observation statistics of many members."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from packed_members import random_member
 from torch import nn
 
@@ -16,14 +21,17 @@ from policies.packed.ppo.gae import advantages_and_targets, standardise
 from policies.packed.sampling import EpisodeTracker, Observations, one_hot
 from tests.rounding import assert_rounded, close
 
+if TYPE_CHECKING:
+    from policies.packed.ppo.loss import Minibatch
+
 M, B = 4, 200
 
 
-def column(*values):
+def column(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)[:, None]
 
 
-def make_case(num_actions, *, with_kl, seed=0):
+def make_case(num_actions: int, *, with_kl: bool, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Minibatch]:
     """(outputs, values, minibatch) with ratios far from 1 and values far from their targets."""
     rng = torch.Generator().manual_seed(seed)
     outputs = 2 * torch.randn(M, B, num_actions, generator=rng)
@@ -51,7 +59,7 @@ COEFFICIENTS = ppo.Coefficients(
 @pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("with_kl", [False, True])
 @pytest.mark.parametrize("num_actions", [2, 3, 6])
-def test_gradients_by_hand_are_those_of_the_loss(num_actions, with_kl):
+def test_gradients_by_hand_are_those_of_the_loss(num_actions: int, with_kl: bool) -> None:
     outputs, values, batch = make_case(num_actions, with_kl=with_kl)
     ratio = (ppo.log_probabilities(outputs, batch.actions, is_gaussian=False) - batch.logp).exp()
     for limited in (ratio > 1.3, ratio < 0.7):
@@ -72,7 +80,7 @@ def test_gradients_by_hand_are_those_of_the_loss(num_actions, with_kl):
 
 @pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("entropy_coeff", [0.0, 0.01])
-def test_gradients_without_a_value_clip(entropy_coeff):
+def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
     outputs, values, batch = make_case(2, with_kl=False)
     coefficients = ppo.Coefficients(
         **{
@@ -91,7 +99,7 @@ def test_gradients_without_a_value_clip(entropy_coeff):
 
 @pytest.mark.parametrize("is_gaussian", [False, True])
 @pytest.mark.parametrize("name", ["advantages", "value_targets"])
-def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name, is_gaussian):
+def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name: str, is_gaussian: bool) -> None:
     outputs, values, batch = make_case(4, with_kl=False)
     if is_gaussian:
         batch.actions = batch.actions[..., :2]
@@ -103,7 +111,7 @@ def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name, is_ga
 
 
 @pytest.mark.usefixtures("in_double")
-def test_ratios_begin_at_one():
+def test_ratios_begin_at_one() -> None:
     outputs, values, batch = make_case(3, with_kl=True)
     batch.logp = ppo.log_probabilities(outputs, batch.actions, is_gaussian=False)
     batch.old_outputs = outputs
@@ -115,7 +123,7 @@ def test_ratios_begin_at_one():
 # -- advantages
 
 
-def test_no_advantage_flows_back_over_an_end():
+def test_no_advantage_flows_back_over_an_end() -> None:
     """Two sub-environments of other discounts; the first one's episodes end in steps 1 (truncated) and 3."""
     rewards = np.array([[1, 1], [2, 1], [3, 1], [4, 1]], dtype=np.float32)
     values = np.array([[10, 0], [20, 0], [30, 0], [40, 0]], dtype=np.float32)
@@ -136,7 +144,7 @@ def test_no_advantage_flows_back_over_an_end():
     np.testing.assert_array_equal(targets, advantages + values)
 
 
-def test_advantages_are_standardised_member_by_member():
+def test_advantages_are_standardised_member_by_member() -> None:
     rng = np.random.default_rng(0)
     rows = (rng.normal(size=(3, 50)) * [[1.0], [100.0], [1e-6]] + [[5.0], [0.0], [1.0]]).astype(np.float32)
     out = standardise(rows)
@@ -157,10 +165,12 @@ def test_advantages_are_standardised_member_by_member():
 class Loops:
     """What the tracker does, step by step."""
 
-    def __init__(self, member_ids, num_envs):
+    def __init__(self, member_ids: Sequence[str], num_envs: int) -> None:
         self.running = {name: [[0.0, 0] for _ in range(num_envs)] for name in member_ids}
 
-    def follow(self, member_ids, rewards, ended):
+    def follow(
+        self, member_ids: Sequence[str], rewards: NDArray[np.float32], ended: NDArray[np.bool_]
+    ) -> list[list[tuple[float, int]]]:
         found = {name: [] for name in member_ids}
         for step in range(len(rewards)):
             row = 0
@@ -175,7 +185,7 @@ class Loops:
         return [found[name] for name in member_ids]
 
 
-def test_episodes_go_on_over_fragments_and_changes_of_the_pack():
+def test_episodes_go_on_over_fragments_and_changes_of_the_pack() -> None:
     rng = np.random.default_rng(0)
     num_envs, names = 3, ["a", "b", "c"]
     tracker, loops = EpisodeTracker(), Loops([*names, "d"], num_envs)
@@ -203,14 +213,14 @@ def test_episodes_go_on_over_fragments_and_changes_of_the_pack():
 
 
 class Statistics(ObservationStatistics, nn.Module):
-    def __init__(self, size):
+    def __init__(self, size: int) -> None:
         super().__init__()
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.model_config = {"normalize_observations": True}
         self.add_statistics()
 
 
-def test_observations_are_normalised_as_rlmodules_do_it():
+def test_observations_are_normalised_as_rlmodules_do_it() -> None:
     rng = np.random.default_rng(0)
     num_envs, size = 2, 3
     members = [random_member(f"m{index}", normalize_observations=True) for index in range(3)]
@@ -243,7 +253,7 @@ def test_observations_are_normalised_as_rlmodules_do_it():
                     np.testing.assert_allclose(value, known, rtol=1e-6)
 
 
-def test_observations_as_they_are():
+def test_observations_as_they_are() -> None:
     members = [random_member(f"m{index}") for index in range(2)]
     rows = np.arange(2 * 3 * 4, dtype=np.float32).reshape(6, 4)
     observations = Observations(members, 3, normalizes=False)
@@ -252,5 +262,5 @@ def test_observations_as_they_are():
     assert OBS_MEAN not in members[0].weights
 
 
-def test_one_hot():
+def test_one_hot() -> None:
     np.testing.assert_array_equal(one_hot(np.array([[2, 0]]), 3), [[[0, 0, 1], [1, 0, 0]]])

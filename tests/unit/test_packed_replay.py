@@ -223,7 +223,7 @@ def test_a_slot_that_is_used_again_holds_nothing_of_the_member_before(replay: st
         assert set(theirs) <= set(range(100, 110))
         if replay == "prioritized":
             # The highest priority is that of a new memory again.
-            assert set(drawn.weights[0]) == {1.0}
+            assert set(present(drawn.weights)[0]) == {1.0}
             assert stacked._priorities.totals[slots[0]] == pytest.approx(BATCH)
 
 
@@ -282,7 +282,7 @@ def test_errors_that_are_no_numbers_do_not_spoil_the_trees() -> None:
     stacked.set_priorities(slots, np.arange(4)[None].repeat(2, axis=0), errors)
     assert np.isfinite(stacked._priorities.leaves).all()
     assert np.isfinite(stacked._priorities.totals).all()
-    assert np.isfinite(stacked.draw(slots, np.full((2, BATCH), 0.1)).weights).all()
+    assert np.isfinite(present(stacked.draw(slots, np.full((2, BATCH), 0.1)).weights)).all()
 
 
 @pytest.mark.parametrize(

@@ -3,24 +3,26 @@
 import json
 import math
 import os
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from policies.errors import CannotRunError, EnvError, SpecError
 from tune_jobs.plan import machine as machine_module
 from tune_jobs.plan.machine import Machine, local_machine
-from tune_jobs.plan.sweep_plan import make_plan, trial_id
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan, trial_id
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 
 TWO_CORES = Machine(num_cpus=2)
 
 
-def plan(*overrides, machine=TWO_CORES, source="cartpole-ppo"):
+def plan(*overrides: str, machine: Machine = TWO_CORES, source: str | dict[str, Any] = "cartpole-ppo") -> SweepPlan:
     return make_plan(load_spec(source, overrides), machine)
 
 
-def test_the_tutorials_sweep():
+def test_the_tutorials_sweep() -> None:
     made = plan()
     assert (len(made.trials), made.num_points) == (20, 20)
     assert (made.cpus_per_trial, made.gpus_per_trial, made.max_concurrent) == (1, 0, 20)
@@ -32,7 +34,7 @@ def test_the_tutorials_sweep():
     assert made.notes == ()
 
 
-def test_each_trial_has_all_hyperparameters_its_point_among_them():
+def test_each_trial_has_all_hyperparameters_its_point_among_them() -> None:
     for trial in plan().trials:
         assert trial.hyperparams["num_epochs"] == 6
         assert trial.hyperparams["grad_clip"] is None
@@ -41,7 +43,7 @@ def test_each_trial_has_all_hyperparameters_its_point_among_them():
     json.dumps(plan().to_json())
 
 
-def test_seeds_per_point_repeat_a_point_with_other_seeds():
+def test_seeds_per_point_repeat_a_point_with_other_seeds() -> None:
     made = plan("seeds_per_point=3", "num_samples=2")
     assert (len(made.trials), made.num_points) == (24, 8)
     assert [(trial.point_index, trial.seed_index) for trial in made.trials[:4]] == [
@@ -54,14 +56,14 @@ def test_seeds_per_point_repeat_a_point_with_other_seeds():
     assert len({trial.seed for trial in made.trials}) == 24
 
 
-def test_more_samples_append_trials():
+def test_more_samples_append_trials() -> None:
     assert plan("num_samples=7").trials[:20] == plan().trials
 
 
 @pytest.mark.parametrize(
     "change", ["resources.max_concurrent=1", "stop.num_env_steps=1000", "evaluation.num_episodes=3"]
 )
-def test_trials_do_not_depend_on_anything_else(change):
+def test_trials_do_not_depend_on_anything_else(change: str) -> None:
     assert plan(change, machine=Machine(num_cpus=64)).trials == plan().trials
 
 
@@ -84,7 +86,7 @@ def test_trials_do_not_depend_on_anything_else(change):
         (["resources.num_gpus=1"], Machine(64, 1, nodes=((4, 1), (60, 0))), 1),
     ],
 )
-def test_as_many_trials_at_once_as_fit(overrides, machine, expected):
+def test_as_many_trials_at_once_as_fit(overrides: list[str], machine: Machine, expected: int) -> None:
     assert plan("engine=rllib", *overrides, machine=machine).max_concurrent == expected
 
 
@@ -111,7 +113,9 @@ def test_as_many_trials_at_once_as_fit(overrides, machine, expected):
         ([], Machine(0.5), ["needs 1 CPU;", "has 0.5"]),
     ],
 )
-def test_what_would_wait_for_ever_is_refused_with_the_numbers(overrides, machine, parts):
+def test_what_would_wait_for_ever_is_refused_with_the_numbers(
+    overrides: list[str], machine: Machine, parts: list[str]
+) -> None:
     with pytest.raises(CannotRunError) as caught:
         plan(*overrides, machine=machine)
     assert caught.value.exit_code == 5
@@ -119,7 +123,7 @@ def test_what_would_wait_for_ever_is_refused_with_the_numbers(overrides, machine
         assert part in str(caught.value)
 
 
-def test_values_that_contradict_each_other_are_told_with_their_point():
+def test_values_that_contradict_each_other_are_told_with_their_point() -> None:
     with pytest.raises(SpecError) as caught:
         plan("hyperparams.minibatch_size=", "space.minibatch_size={grid: [256, 2048]}")
     assert caught.value.exit_code == 2
@@ -128,7 +132,7 @@ def test_values_that_contradict_each_other_are_told_with_their_point():
     assert "t0001" in caught.value.message
 
 
-def test_sub_environments_have_to_fit_into_a_trials_seeds():
+def test_sub_environments_have_to_fit_into_a_trials_seeds() -> None:
     machine = Machine(64)
     assert plan("hyperparams.num_envs=512", "resources.num_env_runners=2", machine=machine).max_concurrent == 20
     with pytest.raises(SpecError, match=f"1536 sub-environments.*{SEEDS_PER_TRIAL}"):
@@ -144,23 +148,23 @@ def test_sub_environments_have_to_fit_into_a_trials_seeds():
         (["env=FrozenLake-v1"], "Box"),
     ],
 )
-def test_environments_that_cannot_be_used(overrides, part):
+def test_environments_that_cannot_be_used(overrides: list[str], part: str) -> None:
     with pytest.raises(EnvError, match=part):
         plan(*overrides)
 
 
-def test_dqn_needs_discrete_actions():
+def test_dqn_needs_discrete_actions() -> None:
     with pytest.raises(EnvError, match="Pendulum-v1"):
         plan(source={"env": "Pendulum-v1", "algorithm": "dqn"})
     assert len(plan(source={"env": "Pendulum-v1", "algorithm": "ppo"}).trials) == 1
 
 
-def test_far_too_many_trials_are_refused_before_they_are_drawn():
+def test_far_too_many_trials_are_refused_before_they_are_drawn() -> None:
     with pytest.raises(SpecError, match="4,000,000 trials"):
         plan("num_samples=1000000")
 
 
-def test_env_steps_are_bounded_by_the_cap_and_one_iteration_a_trial():
+def test_env_steps_are_bounded_by_the_cap_and_one_iteration_a_trial() -> None:
     # 1,024 steps an iteration, 8 at a time, of which the last 8 may be one too many.
     assert plan("num_samples=1").max_env_steps == 4 * (99_999 + 1_032)
     assert plan("num_samples=1", "stop.num_iterations=2").max_env_steps == 4 * 2 * 1_032
@@ -171,7 +175,7 @@ def test_env_steps_are_bounded_by_the_cap_and_one_iteration_a_trial():
     assert plan(source=dqn | {"hyperparams": values}).max_env_steps == 4_999 + 999 + 255 + 8
 
 
-def test_disk_grows_with_networks_checkpoints_and_trials():
+def test_disk_grows_with_networks_checkpoints_and_trials() -> None:
     least = plan("num_samples=1").max_disk_bytes
     assert least < 50e6
     assert plan().max_disk_bytes > least
@@ -182,7 +186,7 @@ def test_disk_grows_with_networks_checkpoints_and_trials():
     assert wide - least > 2 * 4 * 2 * 1e6 * 4 * 3
 
 
-def test_disk_counts_what_convolutions_make_of_an_image():
+def test_disk_counts_what_convolutions_make_of_an_image() -> None:
     """64 channels of nearly every pixel are far more numbers than the image has."""
     source = {
         "env": {"id": "CartPole-v1", "pixels": True},
@@ -195,18 +199,18 @@ def test_disk_counts_what_convolutions_make_of_an_image():
     assert plan(source=source).max_disk_bytes - narrow > 4 * 4 * 16 * (made - 9 * 14 * 4)
 
 
-def test_notes_tell_what_may_not_be_meant():
+def test_notes_tell_what_may_not_be_meant() -> None:
     assert "repeats every point" in plan("space.lr=").notes[0]
     assert "below CartPole-v0's threshold 195" in plan("stop.training_return=100").notes[0]
     assert "only 2 trials can run" in plan("resources.max_concurrent=8", "engine=rllib").notes[0]
     assert plan("space=", "num_samples=1").notes == ()
 
 
-def test_trial_ids_sort_and_stay_distinct():
+def test_trial_ids_sort_and_stay_distinct() -> None:
     assert [trial_id(index) for index in (0, 7, 9_999, 10_000)] == ["t0000", "t0007", "t9999", "t10000"]
 
 
-def test_this_machine_has_no_more_cpus_than_may_be_used():
+def test_this_machine_has_no_more_cpus_than_may_be_used() -> None:
     machine = local_machine()
     assert 1 <= machine.num_cpus <= len(os.sched_getaffinity(0))
     assert machine.num_cpus == math.floor(machine.num_cpus)
@@ -225,7 +229,7 @@ def test_this_machine_has_no_more_cpus_than_may_be_used():
         ({}, None),
     ],
 )
-def test_container_limits_are_read(tmp_path, files, expected):
+def test_container_limits_are_read(tmp_path: Path, files: dict[str, str], expected: float | None) -> None:
     for name, text in files.items():
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -248,7 +252,9 @@ V2 = {"memory.max": "5000\n", "memory.current": "4000\n"}
         ({}, None),
     ],
 )
-def test_a_containers_limit_of_memory_is_read_without_the_files_it_keeps(tmp_path, files, expected):
+def test_a_containers_limit_of_memory_is_read_without_the_files_it_keeps(
+    tmp_path: Path, files: dict[str, str], expected: int | None
+) -> None:
     for name, text in files.items():
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -260,13 +266,13 @@ def test_a_containers_limit_of_memory_is_read_without_the_files_it_keeps(tmp_pat
     ("text", "expected"),
     [("MemTotal: 9 kB\nMemAvailable:    3 kB\n", 3072), ("MemTotal: 9 kB\n", None), ("MemAvailable:\n", None)],
 )
-def test_available_memory_is_read(tmp_path, text, expected):
+def test_available_memory_is_read(tmp_path: Path, text: str, expected: int | None) -> None:
     (tmp_path / "meminfo").write_text(text)
     assert machine_module._available_memory(tmp_path / "meminfo") == expected
     assert machine_module._available_memory(tmp_path / "none") is None
 
 
 @pytest.mark.parametrize(("visible", "expected"), [("", 0), ("-1", 0), ("0", 1), ("0,2", 2)])
-def test_gpus_are_those_that_cuda_would_see(monkeypatch, visible, expected):
+def test_gpus_are_those_that_cuda_would_see(monkeypatch: pytest.MonkeyPatch, visible: str, expected: int) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     assert local_machine().num_gpus == expected

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from policies.envs.modules import allow_modules, allowed_modules
 from tune_jobs.process.state import given_back
 
 
-def state():
+def state() -> dict[str, Any]:
     """What another library could see of it."""
     root, known = logging.getLogger(), logging.getLogger("tune_jobs_test.known")
     return {
@@ -34,7 +35,7 @@ def state():
     }
 
 
-def disturb():
+def disturb() -> None:
     os.environ.update(RAY_X="1", TUNE_X="1", PYTHONBREAKPOINT="none", PYTHONPATH="/nowhere", SDL_VIDEODRIVER="dummy")
     signal.signal(signal.SIGUSR1, lambda *_: None)
     signal.signal(signal.SIGTERM, lambda *_: None)
@@ -54,17 +55,19 @@ def disturb():
 
 
 @pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt])
-def test_everything_is_as_before(monkeypatch, error):
+def test_everything_is_as_before(
+    monkeypatch: pytest.MonkeyPatch, error: type[KeyboardInterrupt] | type[ValueError] | None
+) -> None:
     monkeypatch.setenv("TUNE_MINE", "7")
     # pytest has one of its own.
-    dumps = []
+    dumps: list[Any] = []
     monkeypatch.setattr(faulthandler, "is_enabled", lambda: bool(dumps))
     monkeypatch.setattr(faulthandler, "enable", lambda: dumps.append(1))
     monkeypatch.setattr(faulthandler, "disable", dumps.clear)
     logging.getLogger("tune_jobs_test.known")
     before = state()
 
-    def run():
+    def run() -> None:
         with given_back():
             disturb()
             os.environ["TUNE_MINE"] = "8"
@@ -80,14 +83,14 @@ def test_everything_is_as_before(monkeypatch, error):
     assert state() == before
 
 
-def test_what_a_users_module_sets_as_it_is_imported_stays(monkeypatch):
+def test_what_a_users_module_sets_as_it_is_imported_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     with given_back():
         monkeypatch.setenv("MUJOCO_GL", "egl")
     assert os.environ["MUJOCO_GL"] == "egl"
 
 
-def test_modules_that_the_user_allowed_stay_allowed(monkeypatch):
+def test_modules_that_the_user_allowed_stay_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     from policies.envs import modules as env_modules
 
     monkeypatch.setattr(env_modules, "_allowed", set())
@@ -98,10 +101,10 @@ def test_modules_that_the_user_allowed_stay_allowed(monkeypatch):
     assert allowed_modules() == ("of_the_user",)
 
 
-def test_it_works_in_any_thread():
+def test_it_works_in_any_thread() -> None:
     failures = []
 
-    def run():
+    def run() -> None:
         try:
             with given_back():
                 os.environ["RAY_X"] = "1"

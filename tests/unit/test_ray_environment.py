@@ -1,6 +1,7 @@
 """What Ray finds in the environment, where a home folder is missing or can't be written."""
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -11,17 +12,17 @@ NAMES = ["RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"]
 
 
 @pytest.fixture(autouse=True)
-def no_token(monkeypatch):
+def no_token(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in NAMES:
         # As pytest puts back what was there.
         monkeypatch.setenv(name, "")
 
 
-def token():
+def token() -> str:
     return os.environ["RAY_AUTH_TOKEN"]
 
 
-def test_a_home_that_cannot_be_written_needs_no_file(tmp_path, monkeypatch):
+def test_a_home_that_cannot_be_written_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("HOME", str(tmp_path / "file"))
     provide_token()
@@ -33,23 +34,23 @@ def test_a_home_that_cannot_be_written_needs_no_file(tmp_path, monkeypatch):
     assert token() == first
 
 
-def test_a_user_without_a_home_needs_none(monkeypatch):
-    def home():
+def test_a_user_without_a_home_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def home() -> None:
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr(ray_environment.Path, "home", home)
+    monkeypatch.setattr(ray_environment.Path, "home", home)  # type: ignore[attr-defined]
     provide_token()
     assert token()
 
 
-def test_elsewhere_it_is_rays(tmp_path, monkeypatch):
+def test_elsewhere_it_is_rays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     provide_token()
     assert not token()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_the_user_has_set_holds(tmp_path, monkeypatch, name):
+def test_what_the_user_has_set_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("HOME", str(tmp_path / "file"))
     monkeypatch.setenv(name, "mine")

@@ -1,5 +1,8 @@
 """The records of a run: told at once, on disk at once where it matters, and not more often than the disk allows."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 from fake_engine import FakeClock
 
@@ -12,7 +15,7 @@ from tune_jobs.store.transitions import with_point
 
 
 @pytest.fixture
-def kept(tmp_path):
+def kept(tmp_path: Path) -> tuple[SweepStore, RecordKeeper, FakeClock, list[Any]]:
     """(store, keeper, its clock, everything the listener was told) of 50 trials; the last was done before this run."""
     store, clock, told = SweepStore(tmp_path / "mine"), FakeClock(), []
     store.create()
@@ -23,7 +26,7 @@ def kept(tmp_path):
     return store, RecordKeeper(store, names, told.append, clock), clock, told
 
 
-def progress(iteration=1, *, evaluated=True, status="running", **changes):
+def progress(iteration: int = 1, *, evaluated: bool = True, status: str = "running", **changes: Any) -> Progress:
     values = {
         "num_env_steps": 100 * iteration, "num_episodes": iteration, "time_s": 1.0, "training_return": 5.0,
         "evaluation_return": 7.0, "best_evaluation_return": 7.0, "best_iteration": 1,
@@ -31,11 +34,11 @@ def progress(iteration=1, *, evaluated=True, status="running", **changes):
     return Progress(num_iterations=iteration, evaluated=evaluated, status=status, **values)
 
 
-def on_disk(store, trial_id):
+def on_disk(store: SweepStore, trial_id: str) -> TrialRecord:
     return store.trial(trial_id).read_record()
 
 
-def test_what_a_trial_tells_is_in_its_record(kept):
+def test_what_a_trial_tells_is_in_its_record(kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]]) -> None:
     store, keeper, _, told = kept
     checkpoint = CheckpointRecord(trial_id="t0003", iteration=4, num_env_steps=400)
     keeper.started("t0003")
@@ -50,7 +53,9 @@ def test_what_a_trial_tells_is_in_its_record(kept):
     assert list((store.trial("t0003").folder / "tensorboard").iterdir())
 
 
-def test_running_trials_are_written_as_often_as_there_is_time_for_and_the_others_at_once(kept):
+def test_running_trials_are_written_as_often_as_there_is_time_for_and_the_others_at_once(
+    kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]],
+) -> None:
     store, keeper, clock, _ = kept
     names = [f"t{index:04d}" for index in range(49)]
     for name in names:
@@ -59,7 +64,7 @@ def test_running_trials_are_written_as_often_as_there_is_time_for_and_the_others
     keeper.progressed("t0048", progress(1, status="completed"), node="here", pid=1)
     keeper.flush()
 
-    def written(iteration):
+    def written(iteration: int) -> list[str]:
         return [name for name in names if on_disk(store, name).num_iterations == iteration]
 
     # Twenty a second, and the one that has ended.
@@ -85,7 +90,7 @@ def test_running_trials_are_written_as_often_as_there_is_time_for_and_the_others
     assert written(3) == names[:48]
 
 
-def test_what_a_process_reads_is_on_disk_at_once(kept):
+def test_what_a_process_reads_is_on_disk_at_once(kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]]) -> None:
     store, keeper, _, told = kept
     for index in range(40):
         keeper.change(f"t{index:04d}", lambda record: with_point(record, {"lr": 0.1}, {}))
@@ -96,7 +101,9 @@ def test_what_a_process_reads_is_on_disk_at_once(kept):
 @pytest.mark.parametrize(
     "error", ["\udcff in an env's error", "a terminal's \x1b[2J", "x" * 3_000_000], ids=["text", "control", "long"]
 )
-def test_whatever_made_a_trial_fail_can_be_written(kept, error):
+def test_whatever_made_a_trial_fail_can_be_written(
+    kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]], error: str
+) -> None:
     store, keeper, _, told = kept
     keeper.started("t0001")
     keeper.failed("t0001", error, retried=False)
@@ -105,7 +112,7 @@ def test_whatever_made_a_trial_fail_can_be_written(kept, error):
     assert len(told[-1].error) < 21_000
 
 
-def test_how_trials_end(kept):
+def test_how_trials_end(kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]]) -> None:
     store, keeper, _, _ = kept
     for index in range(5):
         keeper.started(f"t000{index}")
@@ -132,7 +139,7 @@ def test_how_trials_end(kept):
     assert (keeper.record("t0001").error, keeper.record("t0001").num_failures) == (None, 1)
 
 
-def test_who_lost_the_run_writes_no_record(tmp_path):
+def test_who_lost_the_run_writes_no_record(tmp_path: Path) -> None:
     """A driver that was stopped for so long that another one took the sweep up."""
     store = SweepStore(tmp_path / "mine")
     store.create()
@@ -157,7 +164,9 @@ def test_who_lost_the_run_writes_no_record(tmp_path):
     assert not (store.trial("t0000").folder / "tensorboard").exists()
 
 
-def test_a_trial_that_another_process_has_is_paused_and_has_not_failed(kept):
+def test_a_trial_that_another_process_has_is_paused_and_has_not_failed(
+    kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]],
+) -> None:
     store, keeper, _, _ = kept
     keeper.started("t0003")
     keeper.lost("t0003")
@@ -167,7 +176,7 @@ def test_a_trial_that_another_process_has_is_paused_and_has_not_failed(kept):
     assert keeper.running == set()
 
 
-def test_what_was_damaged_stays_in_the_record(kept):
+def test_what_was_damaged_stays_in_the_record(kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]]) -> None:
     store, keeper, _, _ = kept
     keeper.progressed("t0003", progress(1, notes=("a", "b")), node="here", pid=1)
     keeper.progressed("t0003", progress(2, notes=("b", "c"), status="completed"), node="here", pid=1)

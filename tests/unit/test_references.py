@@ -6,7 +6,10 @@ import io
 import keyword
 import re
 import tokenize
+from ast import ClassDef, Module
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -42,7 +45,7 @@ BLOCK = re.compile(r"```.*?```", re.DOTALL)
 ENDINGS = {"py", "yaml", "json", "jsonl", "log", "txt", "csv", "safetensors", "html", "mp4", "gif", "damaged"}
 
 
-def strings_and_names():
+def strings_and_names() -> tuple[set[str], list[tuple[str, str]]]:
     """All texts of the code that a reader sees, by place; and every word that the code itself consists of."""
     names, texts = set(dir(builtins)) | set(keyword.kwlist), []
     for path in [*CODE, *TESTS]:
@@ -74,7 +77,7 @@ def strings_and_names():
     return names, texts
 
 
-def names_in(node):
+def names_in(node: Any) -> set[str]:
     match node:
         case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=name):
             return {name or ""}
@@ -95,9 +98,9 @@ SECTIONS = {
 NAMES, TEXTS = strings_and_names()
 
 
-def defined():
+def defined() -> dict[str, set[str]]:
     """What each module and each class has: {"policies.files": {...}, "SweepStore": {...}}."""
-    found = {}
+    found: dict[str, Any] = {}
     for path in CODE:
         dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         inside = members(ast.parse(path.read_text()))
@@ -110,7 +113,7 @@ def defined():
     return found
 
 
-def members(tree):
+def members(tree: ClassDef | Module) -> set[str]:
     inside = set()
     for node in ast.walk(tree):
         match node:
@@ -126,13 +129,13 @@ def members(tree):
     return inside
 
 
-def quoted(text):
+def quoted(text: str) -> Iterator[str]:
     """What stands between backticks, outside of blocks of code."""
     for match in re.finditer(r"``?([^`\n]+)``?", BLOCK.sub("", text)):
         yield match.group(1)
 
 
-def test_every_word_in_backticks_is_one_of_the_code():
+def test_every_word_in_backticks_is_one_of_the_code() -> None:
     missing = {
         f"{place}: `{reference}`"
         for place, text in TEXTS
@@ -144,9 +147,9 @@ def test_every_word_in_backticks_is_one_of_the_code():
     assert missing == set()
 
 
-def test_every_dotted_name_of_ours_leads_somewhere():
+def test_every_dotted_name_of_ours_leads_somewhere() -> None:
     known = defined()
-    by_stem = {}
+    by_stem: dict[str, Any] = {}
     for name, inside in known.items():
         if "." in name:
             by_stem.setdefault(name.rpartition(".")[2], set()).update(inside)
@@ -168,7 +171,7 @@ def test_every_dotted_name_of_ours_leads_somewhere():
     assert missing == set()
 
 
-def test_every_file_that_is_named_is_there():
+def test_every_file_that_is_named_is_there() -> None:
     pattern = re.compile(r"(?<![\w/.<>-])((?:docs|tests|policies|analysis|tune_jobs|docker)/[\w./-]*\w)")
     missing = {
         f"{place}: {name}"
@@ -179,7 +182,7 @@ def test_every_file_that_is_named_is_there():
     assert missing == set()
 
 
-def test_every_command_with_its_options_exists():
+def test_every_command_with_its_options_exists() -> None:
     pattern = re.compile(r"(^ *(?:\$ )?|[`\"' ]|bin/)tune-jobs ([a-z]+)\b([^`\n\"]*)", re.MULTILINE)
     wrong = set()
     for place, text in [*TEXTS, *((str(path.name), path.read_text()) for path in CODE)]:
@@ -196,7 +199,7 @@ def test_every_command_with_its_options_exists():
     assert wrong == set()
 
 
-def test_every_key_of_a_sweep_file_that_is_named_is_one():
+def test_every_key_of_a_sweep_file_that_is_named_is_one() -> None:
     known = {name: set(fields) for name, fields in SECTIONS.items() if name != "env"}
     known["hyperparams"] = known["space"] = {
         name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields
@@ -212,7 +215,7 @@ def test_every_key_of_a_sweep_file_that_is_named_is_one():
     assert wrong == set()
 
 
-def described():
+def described() -> list[str]:
     """The descriptions of the JSON Schema and the helps of the command line."""
     stack, found = [json_schema()], []
     while stack:
@@ -227,7 +230,7 @@ def described():
 
 
 @pytest.mark.parametrize("text", sorted(set(described())))
-def test_the_schema_and_the_helps_name_fields_and_options_that_there_are(text):
+def test_the_schema_and_the_helps_name_fields_and_options_that_there_are(text: str) -> None:
     fields = {name for model in [SweepSpec, *HYPERPARAMS_BY_ALGORITHM.values()] for name in model.model_fields}
     fields |= {name for inner in SECTIONS.values() for name in inner}
     words = set(re.findall(r"\b[a-z]+(?:_[a-z]+)+\b", text))

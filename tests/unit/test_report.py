@@ -6,17 +6,18 @@ import math
 import re
 import shutil
 import subprocess
-from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from synthetic_sweep import make_points, make_sweep
+from report_page import Page
+from synthetic_sweep import Synthetic, make_points, make_sweep
 
 from analysis.records import CheckpointRecord
 from analysis.report import build_report
-from analysis.report_data import goal_of, shown_path, winner_card
+from analysis.report_data import goal_of, winner_card
 from analysis.wording import (
     NONE,
     difference_text,
@@ -26,48 +27,19 @@ from analysis.wording import (
     return_text,
     seed_range,
     setting_text,
+    shown_path,
 )
+from policies.hyperparams import Algorithm
+from tests.narrowing import present
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7*7 }}"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
-
-class Page(HTMLParser):
-    """Text, tags and table rows of a page."""
-
-    VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
-
-    def __init__(self, html):
-        super().__init__()
-        self.tags, self.text, self.rows, self.open = [], [], [], []
-        self.feed(html)
-        self.close()
-        assert self.open == [], f"never closed: {self.open}"
-        self.words = " ".join(" ".join(self.text).split())
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in {"td", "th"}:
-            self.rows[-1].append("")
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] not in {"style", "script"}:
-            self.text.append(data)
-            if self.rows and ("td" in self.open or "th" in self.open):
-                self.rows[-1][-1] += data.strip()
+Made = tuple[Synthetic, Path, str, Page]
+"""A sweep, the path of its report, its HTML and what is on the page."""
 
 
-def report(tmp_path, synthetic, videos=None):
+def report(tmp_path: Path, synthetic: Synthetic, videos: dict[str, Path] | None = None) -> tuple[Path, str, Page]:
     path = build_report(
         tmp_path,
         target=tmp_path / "report",
@@ -82,7 +54,7 @@ def report(tmp_path, synthetic, videos=None):
 
 
 @pytest.fixture(scope="module")
-def typical(tmp_path_factory):
+def typical(tmp_path_factory: pytest.TempPathFactory) -> Made:
     synthetic = make_sweep(failed={3})
     folder = tmp_path_factory.mktemp("typical")
     (folder / "before.mp4").write_bytes(b"before-bytes")
@@ -91,9 +63,9 @@ def typical(tmp_path_factory):
     return synthetic, *report(folder, synthetic, videos)
 
 
-def test_the_winner_stands_on_the_page(typical):
+def test_the_winner_stands_on_the_page(typical: Made) -> None:
     synthetic, _, html, page = typical
-    best = synthetic.best
+    best = present(synthetic.best)
     assert f"Winner: {best.checkpoint.trial_id}" in page.words
     assert f"{best.confirmation.mean_return:.1f} ± {best.confirmation.std_return:.1f}" in page.words
     assert f"{best.selection_score:.1f} on 10 evaluation episodes" in page.words
@@ -105,24 +77,24 @@ def test_the_winner_stands_on_the_page(typical):
     assert '<span class="badge good">solved</span>' in html
 
 
-def test_the_loading_command_names_the_policy_file(typical):
+def test_the_loading_command_names_the_policy_file(typical: Made) -> None:
     _, path, _, page = typical
     policy = path.parent.parent / "best" / "policy.json"
     assert f"tune-jobs evaluate {policy}" in page.words
     assert f"load_policy({str(policy)!r})" in page.words
 
 
-def test_all_trials_stand_in_the_table_best_first(typical):
+def test_all_trials_stand_in_the_table_best_first(typical: Made) -> None:
     synthetic, _, _, page = typical
     rows = [row for row in page.rows if re.fullmatch(r"t\d{4}", row[0])]
     assert {row[0] for row in rows} == {trial.trial_id for trial in synthetic.trials}
-    assert rows[0][0] == synthetic.best.checkpoint.trial_id
+    assert rows[0][0] == present(synthetic.best).checkpoint.trial_id
     assert rows[-1][:2] == ["t0003", "failed"]
     scores = [float(row[5]) for row in rows[:-1]]
     assert scores == sorted(scores, reverse=True)
 
 
-def test_errors_are_visible_and_linked(typical):
+def test_errors_are_visible_and_linked(typical: Made) -> None:
     _, _, _, page = typical
     assert "t0003 RuntimeError: env.step raised ZeroDivisionError: the cart left the track" in page.words
     assert "Last lines of trials/t0003/log.txt" in page.words
@@ -130,7 +102,7 @@ def test_errors_are_visible_and_linked(typical):
     assert any(tag == "details" and attrs.get("id") == "error-t0003" for tag, attrs in page.tags)
 
 
-def test_videos_are_embedded_and_missing_ones_left_out(typical):
+def test_videos_are_embedded_and_missing_ones_left_out(typical: Made) -> None:
     _, _, _, page = typical
     (video,) = [attrs for tag, attrs in page.tags if tag == "video"]
     assert video["src"] == "data:video/mp4;base64," + base64.b64encode(b"before-bytes").decode()
@@ -139,7 +111,7 @@ def test_videos_are_embedded_and_missing_ones_left_out(typical):
     assert image["src"] == "data:image/gif;base64," + base64.b64encode(b"after-bytes").decode()
 
 
-def test_nothing_is_loaded_from_elsewhere(typical):
+def test_nothing_is_loaded_from_elsewhere(typical: Made) -> None:
     _, _, html, page = typical
     for tag, attrs in page.tags:
         for name in ("src", "href", "xlink:href", "data", "srcset"):
@@ -148,7 +120,7 @@ def test_nothing_is_loaded_from_elsewhere(typical):
     assert "@import" not in html
 
 
-def test_the_policy_of_the_page_allows_its_own_script_alone(typical):
+def test_the_policy_of_the_page_allows_its_own_script_alone(typical: Made) -> None:
     _, _, html, _ = typical
     (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -156,7 +128,7 @@ def test_the_policy_of_the_page_allows_its_own_script_alone(typical):
     assert "default-src 'none'" in html
 
 
-def test_tables_and_figures_lie_beside(typical):
+def test_tables_and_figures_lie_beside(typical: Made) -> None:
     synthetic, path, html, _ = typical
     figures = sorted(file.name for file in (path.parent / "figures").iterdir())
     assert figures == ["learning_curves.png", "score_by_lr.png", "score_per_episode.png"]
@@ -167,7 +139,7 @@ def test_tables_and_figures_lie_beside(typical):
     assert len(pd.read_csv(path.parent / "iterations.csv")) == sum(map(len, synthetic.results.values()))
 
 
-def test_how_it_was_run_is_told(typical):
+def test_how_it_was_run_is_told(typical: Made) -> None:
     synthetic, _, html, page = typical
     for text in ("2.60.0", "0123456789abcdef", "1 min 10 s", "10 (4711 to 4720)", "100 (900000 to 900099)"):
         assert text in page.words
@@ -175,7 +147,7 @@ def test_how_it_was_run_is_told(typical):
     assert yaml.safe_load(spec) == synthetic.sweep.spec
 
 
-def test_what_the_sweep_file_says_of_the_sweep_stands_at_the_head(tmp_path, typical):
+def test_what_the_sweep_file_says_of_the_sweep_stands_at_the_head(tmp_path: Path, typical: Made) -> None:
     synthetic = make_sweep()
     about = {"title": "Which size?", "source": None, "expected": "195 & more", "description": "Two\nlines."}
     synthetic.sweep = synthetic.sweep.model_copy(update={"spec": {**synthetic.sweep.spec, "about": about}})
@@ -185,7 +157,7 @@ def test_what_the_sweep_file_says_of_the_sweep_stands_at_the_head(tmp_path, typi
     assert "sweep file:" not in typical[-1].words
 
 
-def test_a_sweep_without_a_winner_says_why(tmp_path):
+def test_a_sweep_without_a_winner_says_why(tmp_path: Path) -> None:
     synthetic = make_sweep(failed=range(20))
     assert synthetic.best is None
     _, _, page = report(tmp_path, synthetic)
@@ -193,7 +165,7 @@ def test_a_sweep_without_a_winner_says_why(tmp_path):
     assert "Winner:" not in page.words
 
 
-def test_an_unconfirmed_sweep_names_the_leader_and_the_command(tmp_path):
+def test_an_unconfirmed_sweep_names_the_leader_and_the_command(tmp_path: Path) -> None:
     synthetic = make_sweep(pending=range(6, 20), with_best=False)
     synthetic.sweep = synthetic.sweep.model_copy(update={"state": "interrupted"})
     _, _, page = report(tmp_path, synthetic)
@@ -203,7 +175,7 @@ def test_an_unconfirmed_sweep_names_the_leader_and_the_command(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["one trial", "no trials", "nothing ran", "dqn", "no threshold"])
-def test_any_sweep_gives_a_page(tmp_path, kind):
+def test_any_sweep_gives_a_page(tmp_path: Path, kind: str) -> None:
     synthetic = {
         "one trial": lambda: make_sweep(points=[{}]),
         "no trials": lambda: make_sweep(points=[]),
@@ -219,7 +191,7 @@ def test_any_sweep_gives_a_page(tmp_path, kind):
         assert '<span class="badge">no threshold</span>' in html
 
 
-def test_several_seeds_a_point_show_their_points_and_lost_seeds(tmp_path):
+def test_several_seeds_a_point_show_their_points_and_lost_seeds(tmp_path: Path) -> None:
     synthetic = make_sweep(points=make_points(1, np.random.default_rng(0)), seeds_per_point=3, failed={4})
     _, _, page = report(tmp_path, synthetic)
     assert "3 seeds: the interval is too narrow" in page.words
@@ -227,7 +199,7 @@ def test_several_seeds_a_point_show_their_points_and_lost_seeds(tmp_path):
     assert "seeds missing: ranked after complete points" in page.words
 
 
-def test_the_page_says_what_solves_in_the_fewest_env_steps(typical):
+def test_the_page_says_what_solves_in_the_fewest_env_steps(typical: Made) -> None:
     _, path, _, page = typical
     first = pd.read_csv(path.parent / "steps_to_solve.csv").iloc[0]
     steps = f"{int(first['median_num_env_steps']):,}"
@@ -242,7 +214,7 @@ def test_the_page_says_what_solves_in_the_fewest_env_steps(typical):
     assert all("0 of" not in row[3] for row in page.rows[header + 1 : header + 8])
 
 
-def test_steps_to_solve_are_told_seed_by_seed(tmp_path):
+def test_steps_to_solve_are_told_seed_by_seed(tmp_path: Path) -> None:
     synthetic = make_sweep(points=[{"lr": 3e-3}, {"lr": 1e-7}], seeds_per_point=3, failed={1})
     _, _, page = report(tmp_path, synthetic)
     (row,) = [row for row in page.rows if "not solved" in row[-1]]
@@ -260,7 +232,9 @@ def test_steps_to_solve_are_told_seed_by_seed(tmp_path):
         ([{}], 195.0, "The sweep's one point reaches"),
     ],
 )
-def test_the_sentence_suits_the_sweep(tmp_path, points, threshold, sentence):
+def test_the_sentence_suits_the_sweep(
+    tmp_path: Path, points: list[dict[str, float]], threshold: float | None, sentence: str | None
+) -> None:
     env_id = "CartPole-v0" if threshold else "Own-v0"
     synthetic = make_sweep(points=points, threshold=threshold, env_id=env_id)
     if threshold is None:
@@ -273,7 +247,7 @@ def test_the_sentence_suits_the_sweep(tmp_path, points, threshold, sentence):
 @pytest.mark.parametrize(
     ("algorithm", "heading"), [("random", "Random play on"), ("constant", "A constant action on"), ("dqn", "DQN on")]
 )
-def test_a_baseline_has_no_before_and_after(tmp_path, algorithm, heading):
+def test_a_baseline_has_no_before_and_after(tmp_path: Path, algorithm: Algorithm, heading: str) -> None:
     synthetic = make_sweep(points=[{}], algorithm=algorithm)
     (tmp_path / "v.mp4").write_bytes(b"v")
     _, _, page = report(tmp_path, synthetic, {"before": tmp_path / "v.mp4", "after": tmp_path / "v.mp4"})
@@ -282,7 +256,7 @@ def test_a_baseline_has_no_before_and_after(tmp_path, algorithm, heading):
     assert ("Before and after" in page.words) == (algorithm == "dqn")
 
 
-def test_hostile_text_is_never_html(tmp_path):
+def test_hostile_text_is_never_html(tmp_path: Path) -> None:
     synthetic = make_sweep(
         points=[{"activation": HOSTILE, "lr": 1e-3}, {"activation": "$relu$", "lr": 2e-3}],
         failed={1},
@@ -302,25 +276,25 @@ def test_hostile_text_is_never_html(tmp_path):
     assert "{{ 7*7 }}" in page.words
 
 
-def test_a_winner_the_selection_has_moved_from_is_called_out(tmp_path):
+def test_a_winner_the_selection_has_moved_from_is_called_out(tmp_path: Path) -> None:
     synthetic = make_sweep(points=[{"lr": 1e-3}, {"lr": 3e-3}])
-    assert not winner_card(synthetic.best, synthetic.trials, synthetic.sweep, tmp_path)["stale"]
+    assert not winner_card(present(synthetic.best), synthetic.trials, synthetic.sweep, tmp_path)["stale"]
     old = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1)
-    synthetic.best = synthetic.best.model_copy(update={"checkpoint": old})
+    synthetic.best = present(synthetic.best).model_copy(update={"checkpoint": old})
     _, _, page = report(tmp_path, synthetic)
     assert "Another checkpoint leads by now" in page.words
 
 
-def test_returns_that_are_not_finite_cost_only_their_interval(tmp_path):
+def test_returns_that_are_not_finite_cost_only_their_interval(tmp_path: Path) -> None:
     synthetic = make_sweep()
-    broken = synthetic.best.confirmation.model_copy(update={"returns": (float("nan"),) * 100})
-    best = synthetic.best.model_copy(update={"confirmation": broken})
+    broken = present(synthetic.best).confirmation.model_copy(update={"returns": (float("nan"),) * 100})
+    best = present(synthetic.best).model_copy(update={"confirmation": broken})
     card = winner_card(best, synthetic.trials, synthetic.sweep, tmp_path)
     assert card["interval"] is None
     assert card["gain"] is None
 
 
-def test_episodes_that_are_not_finite_are_left_out_of_the_figure(tmp_path):
+def test_episodes_that_are_not_finite_are_left_out_of_the_figure(tmp_path: Path) -> None:
     synthetic = make_sweep(points=[{"lr": 3e-3}])
     row = synthetic.results["t0000"][0]
     synthetic.results["t0000"][0] = row.model_copy(update={"episode_returns": (float("nan"), float("inf"), 9.0)})
@@ -338,21 +312,23 @@ def test_episodes_that_are_not_finite_are_left_out_of_the_figure(tmp_path):
         ("evil_module:Own-v0", None, {}, None),
     ],
 )
-def test_the_goal_is_the_threshold_of_the_env_or_the_stop_rule(env_id, threshold, stop, goal):
+def test_the_goal_is_the_threshold_of_the_env_or_the_stop_rule(
+    env_id: str, threshold: float | None, stop: dict[str, float | None], goal: float | None
+) -> None:
     synthetic = make_sweep(points=[{"lr": 1e-3}], env_id=env_id, threshold=195.0)
-    confirmation = synthetic.best.confirmation.model_copy(update={"threshold": threshold})
-    best = synthetic.best.model_copy(update={"confirmation": confirmation})
+    confirmation = present(synthetic.best).confirmation.model_copy(update={"threshold": threshold})
+    best = present(synthetic.best).model_copy(update={"confirmation": confirmation})
     sweep = synthetic.sweep.model_copy(update={"spec": synthetic.sweep.spec | {"stop": stop}})
     assert goal_of(sweep, best) == goal
 
 
-def test_paths_below_the_current_folder_are_relative(tmp_path, monkeypatch):
+def test_paths_below_the_current_folder_are_relative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert shown_path(tmp_path / "sweeps" / "a") == "sweeps/a"
     assert shown_path(tmp_path.parent) == str(tmp_path.parent)
 
 
-def test_numbers_read_well():
+def test_numbers_read_well() -> None:
     assert [number(v) for v in (None, 0, 50176, 0.00123456, 1e-7, 200.0, True, "relu")] == [
         NONE, "0", "50,176", "0.001235", "1e-07", "200", "True", "relu",
     ]  # fmt: skip
@@ -371,7 +347,7 @@ def test_numbers_read_well():
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_pressing_a_heading_sorts_the_table(typical, tmp_path):
+def test_pressing_a_heading_sorts_the_table(typical: Made, tmp_path: Path) -> None:
     synthetic, _, html, _ = typical
     # The page's own policy would refuse the presses, so they are done in a copy without it.
     presses = (
@@ -382,7 +358,7 @@ def test_pressing_a_heading_sorts_the_table(typical, tmp_path):
     copy.write_text(re.sub(r"<meta http-equiv[^>]*>", "", html).replace("</body>", presses), encoding="utf-8")
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"
     done = subprocess.run(
-        [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path}/profile", "--dump-dom", copy.as_uri()],
+        [present(CHROMIUM), *flags.split(), f"--user-data-dir={tmp_path}/profile", "--dump-dom", copy.as_uri()],
         capture_output=True, text=True, check=True, timeout=600,
     )  # fmt: skip
     rows = [row for row in Page(done.stdout).rows if re.fullmatch(r"t\d{4}", row[0])]

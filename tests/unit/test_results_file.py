@@ -1,6 +1,7 @@
 """Which lines of a results.jsonl are read where they contradict each other."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -9,11 +10,11 @@ from tune_jobs.store.trial_store import TrialStore
 
 
 @pytest.fixture
-def trial(tmp_path):
+def trial(tmp_path: Path) -> TrialStore:
     return TrialStore(tmp_path, "t0000")
 
 
-def lines_of(*numbers):
+def lines_of(*numbers: int | tuple[int, int]) -> list[IterationRecord]:
     """Lines of these iterations; of a pair the second is the env steps."""
     pairs = [number if isinstance(number, tuple) else (number, 100 * number) for number in numbers]
     return [
@@ -35,7 +36,13 @@ def lines_of(*numbers):
         ((3, 2, 1), [2, 3], "does not follow iteration 3"),
     ],
 )
-def test_of_lines_that_contradict_each_other_the_fewest_are_left_out(trial, caplog, numbers, bad, reason):
+def test_of_lines_that_contradict_each_other_the_fewest_are_left_out(
+    trial: TrialStore,
+    caplog: pytest.LogCaptureFixture,
+    numbers: tuple[int | tuple[int, int], ...],
+    bad: list[int],
+    reason: str,
+) -> None:
     records = lines_of(*numbers)
     trial.keep_iterations(records)
     assert trial.read_iterations() == [record for number, record in enumerate(records, 1) if number not in bad]
@@ -45,7 +52,7 @@ def test_of_lines_that_contradict_each_other_the_fewest_are_left_out(trial, capl
 
 
 @pytest.mark.parametrize("field", ["iteration", "num_env_steps", "num_episodes"])
-def test_counts_in_results_are_not_negative(trial, caplog, field):
+def test_counts_in_results_are_not_negative(trial: TrialStore, caplog: pytest.LogCaptureFixture, field: str) -> None:
     trial.keep_iterations(lines_of(1, 2, 3))
     first, *others = trial.results_path.read_text().splitlines()
     trial.results_path.write_text("\n".join([json.dumps(json.loads(first) | {field: -1}), *others, ""]))

@@ -1,12 +1,15 @@
 """Search methods and schedulers that don't go with the rest of a sweep; plans whose points are chosen later."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 from spec_errors import MINIMAL, errors
 
 from analysis.records import ChangeRecord
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.transitions import pending_record
@@ -58,7 +61,9 @@ MACHINE = Machine(num_cpus=2)
         ),
     ],
 )
-def test_what_does_not_go_together_is_refused_with_both_names(changes, path, words):
+def test_what_does_not_go_together_is_refused_with_both_names(
+    changes: dict[str, Any], path: str, words: list[str]
+) -> None:
     message = errors(**changes)
     assert path in message
     for word in words:
@@ -68,7 +73,7 @@ def test_what_does_not_go_together_is_refused_with_both_names(changes, path, wor
 @pytest.mark.parametrize(
     "name", ["hidden_sizes", "activation", "num_envs", "vf_share_layers", "normalize_observations"]
 )
-def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name):
+def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name: str) -> None:
     values = {"hidden_sizes": [[8], [16]], "activation": ["tanh", "relu"], "num_envs": [4, 8]}.get(name, [True, False])
     assert f"space.{name}: can't be changed within a trial" in errors(
         **{**PBT, "space": {**LR, name: {"choice": values}}}
@@ -77,7 +82,7 @@ def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name):
     load_spec({**MINIMAL, "num_samples": 4, "space": {name: {"choice": values}}})
 
 
-def test_a_grid_is_a_population_of_its_values():
+def test_a_grid_is_a_population_of_its_values() -> None:
     spec = load_spec({**MINIMAL, "space": {"lr": {"grid": [1e-4, 1e-3, 1e-2]}}, "scheduler": "pbt"})
     assert spec.perturb_every_env_steps == 20_000
     assert len(make_plan(spec, MACHINE).trials) == 3
@@ -86,7 +91,7 @@ def test_a_grid_is_a_population_of_its_values():
 # -- plans
 
 
-def test_a_tpe_plan_names_all_trials_and_the_points_of_the_first():
+def test_a_tpe_plan_names_all_trials_and_the_points_of_the_first() -> None:
     spec = load_spec({**MINIMAL, **TPE, "seeds_per_point": 2, "search": {"type": "tpe", "num_startup_trials": 3}})
     plan = make_plan(spec, MACHINE)
     assert (len(plan.trials), plan.num_points, plan.max_concurrent) == (40, 20, 4)
@@ -96,16 +101,16 @@ def test_a_tpe_plan_names_all_trials_and_the_points_of_the_first():
     assert len({trial.seed for trial in plan.trials}) == 40
 
 
-def test_a_grid_is_a_choice_for_tpe_so_num_samples_is_the_number_of_points():
+def test_a_grid_is_a_choice_for_tpe_so_num_samples_is_the_number_of_points() -> None:
     spec = load_spec({**MINIMAL, **TPE, "space": {"lr": {"grid": [1e-4, 1e-3]}, "gamma": {"grid": [0.9, 0.99]}}})
     assert make_plan(spec, MACHINE).num_points == 20
 
 
-def test_unknown_points_count_with_the_largest_the_space_has():
+def test_unknown_points_count_with_the_largest_the_space_has() -> None:
     small = {**TPE, "search": {"type": "tpe", "num_startup_trials": 1}, "stop": {"num_env_steps": 1000}}
     sizes = {"train_batch_size": {"choice": [1024, 100_000]}, "num_envs": {"grid": [8, 16]}, **LR}
 
-    def bounds(**changes):
+    def bounds(**changes: Any) -> tuple[int, int]:
         plan = make_plan(load_spec({**MINIMAL, **small, **changes}), MACHINE)
         return plan.max_env_steps, plan.max_disk_bytes
 
@@ -115,7 +120,7 @@ def test_unknown_points_count_with_the_largest_the_space_has():
     assert bounds(space={**LR, "hidden_sizes": {"grid": [[8], [2048, 2048]]}})[1] > 10 * bounds(space=LR)[1]
 
 
-def test_a_population_counts_with_the_largest_values_it_may_mutate_to():
+def test_a_population_counts_with_the_largest_values_it_may_mutate_to() -> None:
     space = {"train_batch_size": {"choice": [1024, 100_000]}}
     changes = {**PBT, "num_samples": 12, "space": space, "stop": {"num_env_steps": 30_000}}
     plan = make_plan(load_spec({**MINIMAL, **changes}), MACHINE)
@@ -123,7 +128,7 @@ def test_a_population_counts_with_the_largest_values_it_may_mutate_to():
     assert plan.max_env_steps >= 12 * 100_000
 
 
-def test_a_dry_run_shows_points_that_are_not_known_yet(tmp_path, monkeypatch):
+def test_a_dry_run_shows_points_that_are_not_known_yet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from click.testing import CliRunner
 
     from tune_jobs.cli.commands import cli
@@ -143,7 +148,7 @@ def test_a_dry_run_shows_points_that_are_not_known_yet(tmp_path, monkeypatch):
 # -- resuming
 
 
-def written(tmp_path, changes):
+def written(tmp_path: Path, changes: dict[str, Any]) -> tuple[SweepStore, SweepPlan]:
     spec = load_spec({**MINIMAL, **changes})
     plan = make_plan(spec, MACHINE)
     store = SweepStore(tmp_path / "mine")
@@ -152,7 +157,7 @@ def written(tmp_path, changes):
     return store, plan
 
 
-def test_points_that_were_chosen_since_are_no_other_sweep(tmp_path):
+def test_points_that_were_chosen_since_are_no_other_sweep(tmp_path: Path) -> None:
     store, plan = written(tmp_path, TPE)
     last = store.trial("t0019")
     assert not last.read_record().has_point
@@ -164,7 +169,7 @@ def test_points_that_were_chosen_since_are_no_other_sweep(tmp_path):
         check_same_trials(store, plan)
 
 
-def test_values_that_a_population_changed_are_no_other_sweep_but_others_are(tmp_path):
+def test_values_that_a_population_changed_are_no_other_sweep_but_others_are(tmp_path: Path) -> None:
     store, plan = written(tmp_path, PBT)
     trial = store.trial("t0001")
     known = pending_record(plan.trials[1])
@@ -180,7 +185,7 @@ def test_values_that_a_population_changed_are_no_other_sweep_but_others_are(tmp_
         check_same_trials(store, plan)
 
 
-def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused():
+def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused() -> None:
     space = {
         "hidden_sizes": {"choice": [[number, number] for number in range(1, 2_602)]},
         "num_envs": {"randint": [1, 8]},
@@ -190,11 +195,11 @@ def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused():
         make_plan(load_spec({**MINIMAL, **TPE, "space": space}), MACHINE)
 
 
-def test_a_list_of_sizes_is_measured_once_however_many_points_it_stands_for(monkeypatch):
+def test_a_list_of_sizes_is_measured_once_however_many_points_it_stands_for(monkeypatch: pytest.MonkeyPatch) -> None:
     from tune_jobs.plan import sweep_plan as plan
 
     measured = []
-    real = plan.max_env_steps
+    real = plan.max_env_steps  # type: ignore[attr-defined]
     monkeypatch.setattr(plan, "max_env_steps", lambda spec, values: measured.append(values) or real(spec, values))
     spec = load_spec({**MINIMAL, **TPE, "space": {"num_envs": {"randint": [1, 8]}}, "num_samples": 1_000})
     make_plan(spec, MACHINE)

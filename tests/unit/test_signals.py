@@ -2,12 +2,15 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from signal import Signals
 
 import pytest
 
 from analysis.records import SweepRecord
+from tests.narrowing import present
 from tune_jobs.process.interruption import can_drive, current, taking_signals
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.interrupted import SweepInterrupted
@@ -16,12 +19,12 @@ from tune_jobs.sweeps.outcome import SweepResult
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
-def send(number):
+def send(number: Signals) -> None:
     # Python runs the handler before os.kill returns.
     os.kill(os.getpid(), number)
 
 
-def make_result():
+def make_result() -> SweepResult:
     sweep = SweepRecord(
         name="mine",
         state="completed",
@@ -35,7 +38,7 @@ def make_result():
 
 
 @pytest.fixture(autouse=True)
-def handlers():
+def handlers() -> Iterator[None]:
     """No test may leave a handler behind."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     yield
@@ -43,7 +46,7 @@ def handlers():
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_raises_where_nobody_is_asked(number):
+def test_a_signal_raises_where_nobody_is_asked(number: Signals) -> None:
     with taking_signals() as interruption:
         with pytest.raises(KeyboardInterrupt):
             send(number)
@@ -51,7 +54,7 @@ def test_a_signal_raises_where_nobody_is_asked(number):
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_the_first_signal_asks_and_the_second_raises(number):
+def test_the_first_signal_asks_and_the_second_raises(number: Signals) -> None:
     asked = []
     with taking_signals() as interruption, interruption.asking(lambda: asked.append(number)):
         send(number)
@@ -62,7 +65,7 @@ def test_the_first_signal_asks_and_the_second_raises(number):
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_hangup_is_never_the_second_signal(number):
+def test_a_hangup_is_never_the_second_signal(number: Signals) -> None:
     """A dropped ssh line sends two, to the job and to its group; who sends SIGTERM may send SIGHUP at once."""
     asked = []
     with taking_signals() as interruption, interruption.asking(lambda: asked.append(1)):
@@ -74,7 +77,7 @@ def test_a_hangup_is_never_the_second_signal(number):
             send(signal.SIGINT)
 
 
-def test_a_second_hangup_does_not_cut_short_what_the_first_one_ended():
+def test_a_second_hangup_does_not_cut_short_what_the_first_one_ended() -> None:
     done = []
     with taking_signals():
         try:
@@ -87,10 +90,10 @@ def test_a_second_hangup_does_not_cut_short_what_the_first_one_ended():
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_that_comes_while_one_asks_waits(number):
+def test_a_signal_that_comes_while_one_asks_waits(number: Signals) -> None:
     asked = []
 
-    def ask():
+    def ask() -> None:
         send(number)
         asked.append(1)
 
@@ -101,7 +104,7 @@ def test_a_signal_that_comes_while_one_asks_waits(number):
             send(signal.SIGTERM)
 
 
-def test_a_hangup_that_was_only_noted_has_not_ended_anything():
+def test_a_hangup_that_was_only_noted_has_not_ended_anything() -> None:
     with taking_signals() as interruption:
         with interruption.shielded():
             send(signal.SIGHUP)
@@ -109,13 +112,13 @@ def test_a_hangup_that_was_only_noted_has_not_ended_anything():
             send(signal.SIGHUP)
 
 
-def test_a_hangup_ends_each_of_a_loops_sweeps():
+def test_a_hangup_ends_each_of_a_loops_sweeps() -> None:
     for _ in range(2):
         with taking_signals(), pytest.raises(KeyboardInterrupt):
             send(signal.SIGHUP)
 
 
-def test_signals_wait_for_what_must_not_be_cut_short():
+def test_signals_wait_for_what_must_not_be_cut_short() -> None:
     asked = []
     with taking_signals() as interruption, interruption.asking(lambda: asked.append(1)):
         with interruption.shielded(), interruption.shielded():
@@ -127,7 +130,7 @@ def test_signals_wait_for_what_must_not_be_cut_short():
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_nohup_means_it(number):
+def test_nohup_means_it(number: Signals) -> None:
     """A shell that starts a job in the background lets it ignore SIGINT, which `kill -INT` doesn't mean."""
     before = signal.signal(number, signal.SIG_IGN)
     try:
@@ -139,9 +142,9 @@ def test_nohup_means_it(number):
         signal.signal(number, before)
 
 
-def test_an_interrupted_run_raises_with_what_there_is():
+def test_an_interrupted_run_raises_with_what_there_is() -> None:
     @run_alone
-    def run():
+    def run() -> SweepResult:
         with current().shielded():
             send(signal.SIGHUP)
         return make_result()
@@ -149,11 +152,11 @@ def test_an_interrupted_run_raises_with_what_there_is():
     with pytest.raises(SweepInterrupted) as caught:
         run()
     assert isinstance(caught.value, KeyboardInterrupt)
-    assert caught.value.result.interrupted
-    assert caught.value.result.exit_code == 130
+    assert present(caught.value.result).interrupted
+    assert present(caught.value.result).exit_code == 130
 
 
-def test_a_run_interrupted_before_it_began_has_no_result():
+def test_a_run_interrupted_before_it_began_has_no_result() -> None:
     @run_alone
     def run():
         send(signal.SIGINT)
@@ -164,15 +167,15 @@ def test_a_run_interrupted_before_it_began_has_no_result():
     assert caught.value.result is None
 
 
-def test_a_run_that_another_process_stopped_raises_nothing():
+def test_a_run_that_another_process_stopped_raises_nothing() -> None:
     @run_alone
-    def run():
+    def run() -> SweepResult:
         return make_result()
 
     assert run() == make_result()
 
 
-def test_a_process_runs_one_sweep_at_a_time():
+def test_a_process_runs_one_sweep_at_a_time() -> None:
     """The others get processes of their own: see test_apart.py."""
     assert can_drive()
     with taking_signals():
@@ -185,9 +188,9 @@ def test_a_process_runs_one_sweep_at_a_time():
     assert run_alone(make_result)() == make_result()
 
 
-def test_a_run_that_fails_lets_the_next_one_begin():
+def test_a_run_that_fails_lets_the_next_one_begin() -> None:
     @run_alone
-    def fails():
+    def fails() -> None:
         raise ValueError("broken")
 
     with pytest.raises(ValueError, match="broken"):

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from spec_errors import MINIMAL, errors, write
@@ -17,7 +18,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name
 # -- what is read
 
 
-def test_the_smallest_sweep_has_finite_caps():
+def test_the_smallest_sweep_has_finite_caps() -> None:
     spec = load_spec(MINIMAL)
     assert spec.env.id == "CartPole-v1"
     assert spec.stop.num_env_steps == 200_000
@@ -26,7 +27,7 @@ def test_the_smallest_sweep_has_finite_caps():
     assert spec.cpus_per_trial == 1
 
 
-def test_numbers_as_people_write_them(tmp_path):
+def test_numbers_as_people_write_them(tmp_path: Path) -> None:
     spec = load_spec(
         write(
             tmp_path,
@@ -45,7 +46,7 @@ stop: {num_env_steps: 5e4, time_s: 1e+2}
     assert (spec.stop.num_env_steps, spec.stop.time_s) == (50_000, 100.0)
 
 
-def test_zero_and_null_are_values_of_their_own():
+def test_zero_and_null_are_values_of_their_own() -> None:
     spec = load_spec(
         {
             **MINIMAL,
@@ -60,7 +61,7 @@ def test_zero_and_null_are_values_of_their_own():
     assert (spec.checkpoints.keep, spec.max_retries, spec.hyperparams["entropy_coeff"]) == (0, 0, 0)
 
 
-def test_sections_can_be_short_empty_or_full(tmp_path):
+def test_sections_can_be_short_empty_or_full(tmp_path: Path) -> None:
     spec = load_spec(
         write(
             tmp_path,
@@ -73,7 +74,7 @@ def test_sections_can_be_short_empty_or_full(tmp_path):
     assert spec.grace_env_steps == 10_000
 
 
-def test_a_resolved_spec_round_trips_through_json():
+def test_a_resolved_spec_round_trips_through_json() -> None:
     spec = load_spec(
         "cartpole-ppo", ["seeds_per_point=2", "space.gamma={loguniform: [0.9, 0.99]}", "hyperparams.gamma="]
     )
@@ -83,12 +84,12 @@ def test_a_resolved_spec_round_trips_through_json():
     assert load_spec(dumped) == spec
 
 
-def test_domains_can_be_given_as_objects():
+def test_domains_can_be_given_as_objects() -> None:
     spec = load_spec({**MINIMAL, "space": {"lr": Uniform(uniform=(1e-4, 1e-3)), "activation": Grid(grid=("relu",))}})
     assert spec.space["lr"] == Uniform(uniform=(1e-4, 1e-3))
 
 
-def test_a_spec_cannot_be_changed():
+def test_a_spec_cannot_be_changed() -> None:
     with pytest.raises(Exception, match="frozen"):
         load_spec(MINIMAL).num_samples = 3
 
@@ -96,7 +97,7 @@ def test_a_spec_cannot_be_changed():
 # -- presets
 
 
-def test_every_preset_loads_says_what_it_is_and_has_no_name():
+def test_every_preset_loads_says_what_it_is_and_has_no_name() -> None:
     presets = list_presets()
     assert {"cartpole-ppo", "cartpole-random"} <= {preset.name for preset in presets}
     for preset in presets:
@@ -108,7 +109,7 @@ def test_every_preset_loads_says_what_it_is_and_has_no_name():
         assert re.match(r"-?[\d.,]+ \(", preset.expected), f"{preset.name}: {preset.expected!r}"
 
 
-def test_a_preset_is_what_its_about_says():
+def test_a_preset_is_what_its_about_says() -> None:
     text = (
         "about:\n  title: 'Plain title: with a colon'\n  source: 'a book: chapter 2'\n  shows: what happens\n"
         "  expected: 195 (x)\n  env_steps: 3,000\n  time: 2 s on 2 cores\n  description: >-\n    Free words,\n"
@@ -122,7 +123,7 @@ def test_a_preset_is_what_its_about_says():
     assert read_preset("bare", "env: x\n")[1:-1] == ("",) * 7
 
 
-def test_any_sweep_may_say_what_it_is_about(tmp_path):
+def test_any_sweep_may_say_what_it_is_about(tmp_path: Path) -> None:
     spec = load_spec(write(tmp_path, "about: Which one?\nenv: CartPole-v1\nalgorithm: ppo\n"), ["about.expected=high"])
     assert (spec.about.title, spec.about.expected, spec.about.description) == ("Which one?", "high", "")
     assert SweepSpec.model_validate(json.loads(spec.model_dump_json())) == spec
@@ -130,7 +131,7 @@ def test_any_sweep_may_say_what_it_is_about(tmp_path):
     assert load_spec("cartpole-ppo").about.title == find_preset("cartpole-ppo").title
 
 
-def test_a_sweep_that_says_nothing_of_itself_is_written_as_if_there_were_no_such_field():
+def test_a_sweep_that_says_nothing_of_itself_is_written_as_if_there_were_no_such_field() -> None:
     # Fields that are null are what older versions may not know.
     assert load_spec(MINIMAL).model_dump(mode="json")["about"] is None
     assert load_spec({**MINIMAL, "about": {"title": ""}}).model_dump(mode="json")["about"] is None
@@ -144,16 +145,16 @@ def test_a_sweep_that_says_nothing_of_itself_is_written_as_if_there_were_no_such
         ({"titel": "x"}, "about.titel: there is no field 'titel' here. Did you mean 'title'?"),
     ],
 )
-def test_what_a_sweep_says_of_itself_is_text(about, part):
+def test_what_a_sweep_says_of_itself_is_text(about, part) -> None:
     assert part in errors(about=about)
 
 
-def test_the_words_of_about_are_not_proposed_as_settings():
+def test_the_words_of_about_are_not_proposed_as_settings() -> None:
     assert "Did you mean 'num_env_steps'?" in errors(stop={"env_steps": 5})
     assert "Did you mean 'time_s'?" in errors(stop={"time": 5})
 
 
-def test_the_cartpole_preset_is_the_tutorials_sweep():
+def test_the_cartpole_preset_is_the_tutorials_sweep() -> None:
     spec = load_spec("cartpole-ppo")
     assert spec.env.id == "CartPole-v0"
     assert spec.space["hidden_sizes"].values == ([32], [64])
@@ -163,7 +164,7 @@ def test_the_cartpole_preset_is_the_tutorials_sweep():
     assert spec.stop.training_return == 195
 
 
-def test_an_unknown_source_names_the_nearest_preset(tmp_path):
+def test_an_unknown_source_names_the_nearest_preset(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r"'cartpol-ppo'.*Did you mean 'cartpole-ppo'"):
         load_spec("cartpol-ppo")
     with pytest.raises(SpecError, match="is a folder"):
@@ -172,7 +173,7 @@ def test_an_unknown_source_names_the_nearest_preset(tmp_path):
         find_preset("cartpole")
 
 
-def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
+def test_a_file_wins_over_a_preset_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("cartpole-ppo").write_text("env: Acrobot-v1\nalgorithm: dqn\n")
     assert load_spec("cartpole-ppo").env.id == "Acrobot-v1"
@@ -266,13 +267,13 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path, monkeypatch):
         ({"env": "x", "hyperparams": {"lr": object()}}, ["JSON"]),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place_and_value(fields, parts):
+def test_what_is_wrong_is_told_with_its_place_and_value(fields: dict[str, Any], parts: list[str]) -> None:
     message = errors(**fields)
     for part in parts:
         assert part in message
 
 
-def test_every_problem_is_told_at_once():
+def test_every_problem_is_told_at_once() -> None:
     message = errors(
         base={},
         algorithm="dqn",
@@ -293,7 +294,7 @@ def test_every_problem_is_told_at_once():
         assert part in message
 
 
-def test_whole_values_of_a_quantised_float_range_are_accepted():
+def test_whole_values_of_a_quantised_float_range_are_accepted() -> None:
     assert load_spec({**MINIMAL, "space": {"num_epochs": {"quniform": [2, 8, 2]}}}).space["num_epochs"].q == 2
 
 
@@ -315,13 +316,13 @@ def test_whole_values_of_a_quantised_float_range_are_accepted():
         ("env: x\nalgorithm: ppo\nhyperparams: {lr: &a [*a]}\n", "line 3, column 19: contains itself"),
     ],
 )
-def test_bad_yaml_is_told_with_its_line(tmp_path, text, part):
+def test_bad_yaml_is_told_with_its_line(tmp_path: Path, text: str, part: str) -> None:
     with pytest.raises(SpecError) as caught:
         load_spec(write(tmp_path, text))
     assert part in caught.value.message
 
 
-def test_a_file_that_is_no_text(tmp_path):
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "sweep.yaml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SpecError, match="can't be read"):
@@ -333,18 +334,18 @@ def test_a_file_that_is_no_text(tmp_path):
 
 
 @pytest.mark.parametrize(("penalty", "limit"), [(1e39, "at most"), (-1e300, "at least -")])
-def test_a_failure_penalty_that_is_infinite_to_learners_is_refused(penalty, limit):
+def test_a_failure_penalty_that_is_infinite_to_learners_is_refused(penalty: float, limit: str) -> None:
     told = errors(env={"id": "CartPole-v1", "failure_penalty": penalty})
     assert f"env.failure_penalty: {penalty!r} is not allowed: it should be {limit}" in told
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a b", "-x", "x" * 101, "é", "x\n"])
-def test_bad_sweep_names(name):
+def test_bad_sweep_names(name: str) -> None:
     with pytest.raises(SpecError, match="sweep name"):
         check_sweep_name(name)
 
 
 @pytest.mark.parametrize("name", ["a", "cartpole-ppo_2.1", "0", "x" * 100])
-def test_good_sweep_names(name):
+def test_good_sweep_names(name: str) -> None:
     assert check_sweep_name(name) == name
     assert load_spec({**MINIMAL, "name": name}).name == name

@@ -13,7 +13,7 @@ from spec_errors import MINIMAL, write
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import TrialPlan, make_plan
+from tune_jobs.plan.sweep_plan import TrialPlan, make_plan  # type: ignore[attr-defined]
 from tune_jobs.spec.domains import DOMAIN_KINDS
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec

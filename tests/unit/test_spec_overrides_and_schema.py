@@ -1,11 +1,14 @@
 """Sweep files: `--set`, and their JSON Schema."""
 
+from collections.abc import Iterator
+from typing import Any, cast
+
 import pytest
 from pydantic import BaseModel
 from spec_errors import MINIMAL, errors
 
 from policies.errors import SpecError
-from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from tune_jobs.spec.domains import DOMAIN_KINDS
 from tune_jobs.spec.file import json_schema, list_presets, load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -13,7 +16,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 # -- --set
 
 
-def test_set_overrides_and_creates_fields():
+def test_set_overrides_and_creates_fields() -> None:
     spec = load_spec(
         "cartpole-ppo",
         [
@@ -41,16 +44,16 @@ def test_set_overrides_and_creates_fields():
     "path",
     ["num_samples", "stop", "stop.time_s", "env.args.x", "hyperparams.grad_clip", "hyperparams.tau", "space.gamma"],
 )
-def test_set_to_nothing_of_what_is_not_there_changes_nothing(path):
+def test_set_to_nothing_of_what_is_not_there_changes_nothing(path: str) -> None:
     assert load_spec(MINIMAL, [f"{path}="]) == load_spec(MINIMAL)
 
 
-def test_an_empty_field_is_only_a_default_if_there_is_one():
+def test_an_empty_field_is_only_a_default_if_there_is_one() -> None:
     assert load_spec({**MINIMAL, "stop": None}) == load_spec(MINIMAL)
     assert "num_sample: there is no field 'num_sample' here." in errors(num_sample=None)
 
 
-def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed():
+def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed() -> None:
     assert "is fixed at 0.001 and searched" in errors(
         space={"lr": {"uniform": [1e-4, 1e-2]}}, overrides=["hyperparams.lr=1e-3"]
     )
@@ -78,20 +81,20 @@ def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed():
         ("space.lrr=", "space.lrr: "),
     ],
 )
-def test_bad_overrides(override, part):
+def test_bad_overrides(override: str, part: str) -> None:
     with pytest.raises(SpecError) as caught:
         load_spec("cartpole-ppo", [override])
     assert part in caught.value.message
 
 
-def test_a_problem_says_that_it_came_from_set():
+def test_a_problem_says_that_it_came_from_set() -> None:
     message = errors(num_samples=0, overrides=["seed=-1"])
     lines = message.splitlines()
     assert [("(from --set)" in line) for line in lines if "seed" in line or "num_samples" in line].count(True) == 1
     assert any(line.strip().startswith("seed:") and line.endswith("(from --set)") for line in lines)
 
 
-def test_overrides_leave_the_mapping_they_were_given_alone():
+def test_overrides_leave_the_mapping_they_were_given_alone() -> None:
     source = {**MINIMAL, "stop": {"num_env_steps": 10}}
     load_spec(source, ["stop.num_env_steps=20"])
     assert source["stop"] == {"num_env_steps": 10}
@@ -100,7 +103,7 @@ def test_overrides_leave_the_mapping_they_were_given_alone():
 # -- JSON Schema
 
 
-def test_the_schema_accepts_presets_and_refuses_what_is_wrong():
+def test_the_schema_accepts_presets_and_refuses_what_is_wrong() -> None:
     jsonschema = pytest.importorskip("jsonschema")
     schema = json_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
@@ -133,7 +136,7 @@ VALUES = [
 ]  # fmt: skip
 
 
-def fields(model=SweepSpec, path=()):
+def fields(model: type = SweepSpec, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     for name, field in model.model_fields.items():
         yield (*path, name)
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
@@ -154,7 +157,9 @@ CASES = [
 @pytest.mark.parametrize(
     ("algorithm", "path"), CASES, ids=lambda part: part if isinstance(part, str) else ".".join(part)
 )
-def test_the_schema_and_the_model_refuse_the_same_values_of_a_field(algorithm, path):
+def test_the_schema_and_the_model_refuse_the_same_values_of_a_field(
+    algorithm: Algorithm, path: tuple[str, ...]
+) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     validator = jsonschema.Draft202012Validator(json_schema())
     for value in VALUES:
@@ -168,13 +173,13 @@ def test_the_schema_and_the_model_refuse_the_same_values_of_a_field(algorithm, p
         except SpecError as error:
             # Told by the field itself, not by what goes together.
             words = ("it should be", "is not a number", "of the wrong type")
-            told = [problem for problem in error.problems if any(word in problem.text for word in words)]
+            told = [problem for problem in cast("Any", error).problems if any(word in problem.text for word in words)]
             assert not told or list(validator.iter_errors(data)), value
         else:
             assert list(validator.iter_errors(data)) == [], value
 
 
-def test_the_schema_accepts_every_preset():
+def test_the_schema_accepts_every_preset() -> None:
     import yaml
 
     jsonschema = pytest.importorskip("jsonschema")
@@ -186,7 +191,7 @@ def test_the_schema_accepts_every_preset():
         assert set(yaml.safe_load(preset.text)) <= set(data)
 
 
-def test_the_schema_describes_every_field():
+def test_the_schema_describes_every_field() -> None:
     schema = json_schema()
     for name in (
         "StopSpec",

@@ -11,6 +11,7 @@ from store_parts import (
     RESULTS,
     SWEEP,
     TRIAL,
+    Reopen,
     fill,
     killed,
     make_best,
@@ -19,17 +20,19 @@ from store_parts import (
     make_sweep,
     make_trial,
 )
+from stores import Harness
 
 from analysis.records import (
     FORMAT_VERSION,
     CheckpointRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
+from tune_jobs.store.contract import Sweep, Trial
 
 # -- names, and that there is a sweep
 
 
-def test_a_sweep_is_there_from_its_record_on_and_sweeps_are_listed_by_name(harness):
+def test_a_sweep_is_there_from_its_record_on_and_sweeps_are_listed_by_name(harness: Harness) -> None:
     storage = harness.storage()
     assert list(storage.sweeps()) == []
     for name in ("b", "a", "half"):
@@ -44,7 +47,7 @@ def test_a_sweep_is_there_from_its_record_on_and_sweeps_are_listed_by_name(harne
     assert harness.storage().sweep("a").exists()
 
 
-def test_a_name_is_given_once(harness, sweep, another):
+def test_a_name_is_given_once(harness: Harness, sweep: Sweep, another: Reopen) -> None:
     for take in (another().create, lambda: harness.storage().new_sweep("mine")):
         with pytest.raises(SpecError, match="'mine' is already") as raised:
             take()
@@ -58,7 +61,7 @@ def test_a_name_is_given_once(harness, sweep, another):
     another().create()
 
 
-def test_a_discarded_sweep_is_gone_with_all_that_it_had(harness, sweep, trial):
+def test_a_discarded_sweep_is_gone_with_all_that_it_had(harness: Harness, sweep: Sweep, trial: Trial) -> None:
     sweep.write_record(make_sweep())
     trial.write_record(make_trial())
     trial.write_checkpoint(make_checkpoint(1), fill)
@@ -70,19 +73,19 @@ def test_a_discarded_sweep_is_gone_with_all_that_it_had(harness, sweep, trial):
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/a", "../mine", "a\0"])
-def test_no_name_leads_out_of_the_storage(harness, sweep, name):
+def test_no_name_leads_out_of_the_storage(harness: Harness, sweep: Sweep, name: str) -> None:
     for ask in (harness.storage().sweep, harness.storage().is_taken):
         with pytest.raises(NotFoundError):
             ask(name)
 
 
-def test_a_sweep_is_found_by_its_place_too(harness, sweep):
+def test_a_sweep_is_found_by_its_place_too(harness: Harness, sweep: Sweep) -> None:
     sweep.write_record(make_sweep())
     assert harness.by_place(sweep).read_record() == make_sweep()
     assert harness.by_place(sweep).name == "mine"
 
 
-def test_a_rehearsal_leaves_the_name_free_and_nothing_behind(harness):
+def test_a_rehearsal_leaves_the_name_free_and_nothing_behind(harness: Harness) -> None:
     storage = harness.storage()
     with storage.sweep("mine").rehearsal() as other:
         assert other.name != "mine"
@@ -95,7 +98,7 @@ def test_a_rehearsal_leaves_the_name_free_and_nothing_behind(harness):
 # -- records
 
 
-def test_records_come_back_as_they_were(sweep, trial, another):
+def test_records_come_back_as_they_were(sweep: Sweep, trial: Trial, another: Reopen) -> None:
     records = make_sweep(run_time_s=0.0, git_commit="abc"), make_trial(
         status="failed", error="no\nroom ☃", evaluation_return=0.0, time_s=float("inf"),
         checkpoints=(make_checkpoint(1, evaluation_return=-1.0),),
@@ -110,7 +113,7 @@ def test_records_come_back_as_they_were(sweep, trial, another):
         records = make_sweep(state="completed"), make_trial(status="completed")
 
 
-def test_trials_are_read_by_index_and_those_without_a_record_are_none_yet(sweep, another):
+def test_trials_are_read_by_index_and_those_without_a_record_are_none_yet(sweep: Sweep, another: Reopen) -> None:
     assert sweep.read_trials() == []
     for index in (10, 2, 0):
         sweep.trial(f"t{index:04d}").write_record(make_trial(index))
@@ -118,7 +121,7 @@ def test_trials_are_read_by_index_and_those_without_a_record_are_none_yet(sweep,
     assert [record.index for record in another().read_trials()] == [0, 2, 10]
 
 
-def test_what_is_not_there_is_not_found(sweep, trial):
+def test_what_is_not_there_is_not_found(sweep: Sweep, trial: Trial) -> None:
     for read in (sweep.read_record, trial.read_record, sweep.read_best):
         with pytest.raises(NotFoundError) as raised:
             read()
@@ -133,7 +136,9 @@ def test_what_is_not_there_is_not_found(sweep, trial):
     [b"", b'{"name": "mi', b"[]", b"{}", b"\xff\xfe\x00", b'{"format_version": 1e999}', b"[" * 100_000],
     ids=["empty", "half", "list", "fields missing", "no text", "no number", "deep"],
 )
-def test_a_damaged_record_is_an_error_that_names_it(harness, sweep, trial, key, content):
+def test_a_damaged_record_is_an_error_that_names_it(
+    harness: Harness, sweep: Sweep, trial: Trial, key: str, content: bytes
+) -> None:
     harness.put("mine", key, content)
     read = {SWEEP: sweep.read_record, TRIAL: trial.read_record, BEST: sweep.read_best}[key]
     with pytest.raises(CheckpointError) as raised:
@@ -143,7 +148,7 @@ def test_a_damaged_record_is_an_error_that_names_it(harness, sweep, trial, key, 
 
 
 @pytest.mark.parametrize("key", [SWEEP, BEST])
-def test_a_record_of_a_newer_format_is_refused_and_says_what_to_do(harness, sweep, key):
+def test_a_record_of_a_newer_format_is_refused_and_says_what_to_do(harness: Harness, sweep: Sweep, key: str) -> None:
     sweep.write_record(make_sweep(format_version=FORMAT_VERSION + 1))
     sweep.write_best(make_best())
     data = json.loads(harness.content("mine", key)) | {"format_version": FORMAT_VERSION + 1}
@@ -154,7 +159,7 @@ def test_a_record_of_a_newer_format_is_refused_and_says_what_to_do(harness, swee
 
 
 @pytest.mark.parametrize("key", [SWEEP, TRIAL])
-def test_a_field_that_a_newer_version_added_is_left_out(harness, sweep, trial, key):
+def test_a_field_that_a_newer_version_added_is_left_out(harness: Harness, sweep: Sweep, trial: Trial, key: str) -> None:
     sweep.write_record(make_sweep())
     trial.write_record(make_trial())
     data = json.loads(harness.content("mine", key)) | {"mood": "good"}
@@ -162,7 +167,7 @@ def test_a_field_that_a_newer_version_added_is_left_out(harness, sweep, trial, k
     assert (sweep.read_record(), trial.read_record()) == (make_sweep(), make_trial())
 
 
-def test_a_record_that_is_another_trials_is_refused(harness, sweep, trial):
+def test_a_record_that_is_another_trials_is_refused(harness: Harness, sweep: Sweep, trial: Trial) -> None:
     sweep.trial("t0001").write_record(make_trial(1))
     harness.put("mine", TRIAL, harness.content("mine", "trials/t0001/trial.json"))
     for read in (trial.read_record, sweep.read_trials):
@@ -170,12 +175,14 @@ def test_a_record_that_is_another_trials_is_refused(harness, sweep, trial):
             read()
 
 
-def test_a_record_whose_writing_fails_is_the_one_before(sweep, trial, another, monkeypatch):
+def test_a_record_whose_writing_fails_is_the_one_before(
+    sweep: Sweep, trial: Trial, another: Reopen, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where the writer cannot go on, there is no half of it, and nothing that a later reader stumbles over."""
     sweep.write_record(make_sweep())
     trial.write_record(make_trial())
 
-    def fails(*_):
+    def fails(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
@@ -190,12 +197,14 @@ def test_a_record_whose_writing_fails_is_the_one_before(sweep, trial, another, m
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_record_whose_writer_is_killed_is_the_one_before_or_the_one_after(sweep, another, call):
+def test_a_record_whose_writer_is_killed_is_the_one_before_or_the_one_after(
+    sweep: Sweep, another: Reopen, call: str
+) -> None:
     sweep.write_record(make_sweep())
 
-    def act(die):
+    def act(die) -> None:
         setattr(os, call, die)
-        Path.replace = die
+        Path.replace = die  # type: ignore[method-assign]
         sweep.write_record(make_sweep(num_trials=9))
 
     killed(act)
@@ -208,7 +217,7 @@ def test_a_record_whose_writer_is_killed_is_the_one_before_or_the_one_after(swee
 
 
 @pytest.mark.parametrize("name", NO_IDS)
-def test_no_id_leads_elsewhere(sweep, name):
+def test_no_id_leads_elsewhere(sweep: Sweep, name: str) -> None:
     with pytest.raises(NotFoundError):
         sweep.trial(name)
     with pytest.raises(NotFoundError):
@@ -216,7 +225,7 @@ def test_no_id_leads_elsewhere(sweep, name):
 
 
 @pytest.mark.parametrize("trial_id", ["../t0000", "t0000/../../../../x", "/x"])
-def test_no_record_names_a_place(sweep, trial, trial_id):
+def test_no_record_names_a_place(sweep: Sweep, trial: Trial, trial_id: str) -> None:
     trial.write_checkpoint(make_checkpoint(1), fill)
     foreign = CheckpointRecord.model_construct(trial_id=trial_id, iteration=1, num_env_steps=1)
     with pytest.raises(NotFoundError):
@@ -228,7 +237,7 @@ def test_no_record_names_a_place(sweep, trial, trial_id):
 # -- results
 
 
-def test_results_are_appended_and_replaced(trial, another):
+def test_results_are_appended_and_replaced(trial: Trial, another: Reopen) -> None:
     assert not trial.has_results()
     assert trial.read_iterations() == []
     trial.keep_iterations([])
@@ -244,7 +253,9 @@ def test_results_are_appended_and_replaced(trial, another):
     assert another().trial("t0000").read_iterations() == [*first, make_iteration(3)]
 
 
-def test_of_damaged_results_the_others_are_read(harness, trial, caplog):
+def test_of_damaged_results_the_others_are_read(
+    harness: Harness, trial: Trial, caplog: pytest.LogCaptureFixture
+) -> None:
     trial.append_iterations([make_iteration(1)])
     assert trial.scores_of({1}) == {1: [(100, None)]}
     written = harness.content("mine", RESULTS)

@@ -2,22 +2,24 @@
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 from policy_factory import make_portable
-from store_parts import BEST, PACK, fill, killed, make_best, make_checkpoint, make_iteration, numbers
+from store_parts import BEST, PACK, Reopen, fill, killed, make_best, make_checkpoint, make_iteration, numbers
+from stores import Harness
 
 from policies.acting.load import load_policy
 from policies.errors import CannotRunError, CheckpointError
 from policies.files import open_to_append
-from tune_jobs.store.contract import Assignment
+from tune_jobs.store.contract import Assignment, Sweep, Trial
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.probe import answer
 
 # -- who writes: locks, and owners by epoch
 
 
-def test_one_process_at_a_time_drives_a_sweep(sweep, another):
+def test_one_process_at_a_time_drives_a_sweep(sweep: Sweep, another: Reopen) -> None:
     assert not sweep.is_driven()
     with sweep.lock():
         assert another().is_driven()
@@ -33,8 +35,8 @@ def test_one_process_at_a_time_drives_a_sweep(sweep, another):
         pass
 
 
-def test_a_killed_driver_holds_no_lock(sweep, another):
-    def act(die):
+def test_a_killed_driver_holds_no_lock(sweep: Sweep, another: Reopen) -> None:
+    def act(die) -> None:
         with another().lock():
             die()
 
@@ -44,7 +46,7 @@ def test_a_killed_driver_holds_no_lock(sweep, another):
         pass
 
 
-def test_who_was_run_before_has_lost_it(sweep, another):
+def test_who_was_run_before_has_lost_it(sweep: Sweep, another: Reopen) -> None:
     first = sweep.take()
     with first.held():
         pass
@@ -63,7 +65,7 @@ def test_who_was_run_before_has_lost_it(sweep, another):
     assert not another().owner(first.token).is_current()
 
 
-def test_who_lost_a_trial_writes_nothing_of_it(harness, trial, another):
+def test_who_lost_a_trial_writes_nothing_of_it(harness: Harness, trial: Trial, another: Reopen) -> None:
     trial.take()
     trial.append_iterations([make_iteration(1)])
     trial.write_checkpoint(make_checkpoint(1), fill)
@@ -89,10 +91,10 @@ def test_who_lost_a_trial_writes_nothing_of_it(harness, trial, another):
     assert {key: harness.content("mine", key) for key in harness.keys("mine")} == before
 
 
-def test_a_trial_that_is_lost_while_its_checkpoint_is_written_gets_none(trial, another):
+def test_a_trial_that_is_lost_while_its_checkpoint_is_written_gets_none(trial: Trial, another: Reopen) -> None:
     trial.take()
 
-    def write(folder):
+    def write(folder: Path) -> None:
         fill(folder)
         another().trial("t0000").take()
 
@@ -101,7 +103,7 @@ def test_a_trial_that_is_lost_while_its_checkpoint_is_written_gets_none(trial, a
     assert numbers(another) == []
 
 
-def test_a_trial_and_a_pack_are_taken_only_for_who_owns_the_run(sweep, trial, another):
+def test_a_trial_and_a_pack_are_taken_only_for_who_owns_the_run(sweep: Sweep, trial: Trial, another: Reopen) -> None:
     run = sweep.take()
     pack = sweep.pack("p00").take(run)
     trial.take(pack)
@@ -117,7 +119,7 @@ def test_a_trial_and_a_pack_are_taken_only_for_who_owns_the_run(sweep, trial, an
     assert not trial.is_lost()
 
 
-def test_who_has_not_taken_a_trial_is_kept_from_nothing(trial, another):
+def test_who_has_not_taken_a_trial_is_kept_from_nothing(trial: Trial, another: Reopen) -> None:
     """A reader, or a tool that works on a sweep that nobody runs."""
     trial.take()
     reader = another().trial("t0000")
@@ -129,14 +131,16 @@ def test_who_has_not_taken_a_trial_is_kept_from_nothing(trial, another):
 # -- packs
 
 
-def test_an_assignment_comes_back_as_it_was_written(sweep, another):
+def test_an_assignment_comes_back_as_it_was_written(sweep: Sweep, another: Reopen) -> None:
     for assignment in (Assignment(("t0002", "t0000"), {"t0000": 2}), Assignment()):
         sweep.pack("p00").write(assignment)
         assert another().pack("p00").read() == assignment
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{}", b'{"trial_ids": ["../x"], "num_failures": {}}', b"\xff"])
-def test_an_assignment_that_cannot_be_read_is_an_error_that_names_it(harness, sweep, content):
+def test_an_assignment_that_cannot_be_read_is_an_error_that_names_it(
+    harness: Harness, sweep: Sweep, content: bytes | None
+) -> None:
     if content is not None:
         harness.put("mine", PACK, content)
     with pytest.raises(CheckpointError, match="p00"):
@@ -146,7 +150,9 @@ def test_an_assignment_that_cannot_be_read_is_an_error_that_names_it(harness, sw
 # -- logs and tallies
 
 
-def test_a_log_is_appended_to_and_its_end_is_told(sweep, trial, another, capfd):
+def test_a_log_is_appended_to_and_its_end_is_told(
+    sweep: Sweep, trial: Trial, another: Reopen, capfd: pytest.CaptureFixture[str]
+) -> None:
     pack = sweep.pack("p00")
     assert trial.log_tail() == pack.log_tail() == ""
     for log in (trial, pack):
@@ -161,7 +167,7 @@ def test_a_log_is_appended_to_and_its_end_is_told(sweep, trial, another, capfd):
     assert str(os.getpid()) in capfd.readouterr().out
 
 
-def test_a_tally_is_forgotten_whether_there_is_one_or_not(trial):
+def test_a_tally_is_forgotten_whether_there_is_one_or_not(trial: Trial) -> None:
     trial.take()
     trial.tally_path.write_bytes(b"")
     trial.forget_tally()
@@ -172,7 +178,7 @@ def test_a_tally_is_forgotten_whether_there_is_one_or_not(trial):
 # -- requests to stop
 
 
-def test_a_stop_is_asked_for_and_forgotten(sweep, another):
+def test_a_stop_is_asked_for_and_forgotten(sweep: Sweep, another: Reopen) -> None:
     assert not sweep.stop_requested()
     sweep.clear_stop_request()
     another().request_stop()
@@ -185,7 +191,7 @@ def test_a_stop_is_asked_for_and_forgotten(sweep, another):
 # -- what comes of it
 
 
-def test_the_best_is_read_with_its_policy(sweep, another):
+def test_the_best_is_read_with_its_policy(sweep: Sweep, another: Reopen) -> None:
     policy = make_portable("CartPole-v1", seed=3)
     sweep.write_best(make_best(), policy)
     assert another().has_best()
@@ -195,10 +201,12 @@ def test_the_best_is_read_with_its_policy(sweep, another):
     assert load_policy(another().best_folder).env_id == "CartPole-v1"
 
 
-def test_a_policy_that_cannot_be_written_leaves_the_best_that_was_there(sweep, another, monkeypatch):
+def test_a_policy_that_cannot_be_written_leaves_the_best_that_was_there(
+    sweep: Sweep, another: Reopen, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sweep.write_best(make_best(), make_portable("CartPole-v1"))
 
-    def fails(*_):
+    def fails(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
@@ -209,7 +217,7 @@ def test_a_policy_that_cannot_be_written_leaves_the_best_that_was_there(sweep, a
     assert load_policy(another().best_folder).env_id == "CartPole-v1"
 
 
-def test_an_edited_best_is_refused(harness, sweep):
+def test_an_edited_best_is_refused(harness: Harness, sweep: Sweep) -> None:
     sweep.write_best(make_best())
     data = json.loads(harness.content("mine", BEST)) | {"selection_score": 99.0}
     harness.put("mine", BEST, json.dumps(data).encode())
@@ -217,7 +225,7 @@ def test_an_edited_best_is_refused(harness, sweep):
         sweep.read_best()
 
 
-def test_films_are_those_that_were_written(sweep, another):
+def test_films_are_those_that_were_written(sweep: Sweep, another: Reopen) -> None:
     sweep.write_best(make_best(), make_portable("CartPole-v1"))
     with sweep.writing_films() as paths:
         assert set(paths) == {"before_mp4", "after_mp4", "after_gif", "before_after_mp4"}
@@ -226,7 +234,7 @@ def test_films_are_those_that_were_written(sweep, another):
     assert {name: path.read_bytes() for name, path in films.items()} == {"after_mp4": b"film"}
 
 
-def test_a_report_is_written_over_the_one_before(harness, sweep):
+def test_a_report_is_written_over_the_one_before(harness: Harness, sweep: Sweep) -> None:
     for text in (b"one", b"two"):
         with sweep.writing_report() as folder:
             folder.mkdir(exist_ok=True)
@@ -234,7 +242,7 @@ def test_a_report_is_written_over_the_one_before(harness, sweep):
         assert harness.content("mine", "report/index.html") == text
 
 
-def test_events_are_appended(harness, trial):
+def test_events_are_appended(harness: Harness, trial: Trial) -> None:
     for data in (b"one", b"two"):
         trial.append_events("events.1", data)
     assert harness.content("mine", "trials/t0000/tensorboard/events.1") == b"onetwo"
@@ -243,7 +251,7 @@ def test_events_are_appended(harness, trial):
 # -- of machines
 
 
-def test_who_sees_the_same_sweep_can_answer(harness, sweep):
+def test_who_sees_the_same_sweep_can_answer(harness: Harness, sweep: Sweep) -> None:
     before = harness.keys("mine")
     with sweep.probing() as probe:
         assert not probe.is_same("", "node")
@@ -255,7 +263,7 @@ def test_who_sees_the_same_sweep_can_answer(harness, sweep):
     assert harness.keys("mine") == before
 
 
-def test_ray_tunes_state_is_begun_anew_and_the_driver_prints_to_a_file(sweep, another):
+def test_ray_tunes_state_is_begun_anew_and_the_driver_prints_to_a_file(sweep: Sweep, another: Reopen) -> None:
     sweep.clear_tune_folder()
     sweep.tune_folder.mkdir(parents=True)
     (sweep.tune_folder / "state.json").touch()

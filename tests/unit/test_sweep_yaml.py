@@ -2,6 +2,8 @@
 
 import math
 import tracemalloc
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +21,7 @@ MERGES = "a: &a {k: 1}\n" + "".join(
 )
 
 
-def refused(text, label="x.yaml"):
+def refused(text: str, label: str = "x.yaml") -> str:
     with pytest.raises(SpecError) as caught:
         parse_yaml(text, label)
     assert caught.value.hint
@@ -37,7 +39,7 @@ def refused(text, label="x.yaml"):
         ("a: 1\nb: \udcff\n", r"line 2: the character '\udcff' is not allowed in YAML"),
     ],
 )
-def test_what_is_no_yaml_is_told_in_whole_sentences_with_its_place(text, message):
+def test_what_is_no_yaml_is_told_in_whole_sentences_with_its_place(text: str, message: str) -> None:
     assert refused(text) == f"x.yaml, {message}"
 
 
@@ -56,7 +58,7 @@ def test_what_is_no_yaml_is_told_in_whole_sentences_with_its_place(text, message
         ("!!int '5'", 5), ("!!float 5", 5), ("|\n    010\n", "010\n"),
     ],
 )  # fmt: skip
-def test_words_mean_what_yaml_1_2_says_with_underscores(text, value):
+def test_words_mean_what_yaml_1_2_says_with_underscores(text: str, value: Any) -> None:
     if text == "-":
         assert parse_yaml("- '-'", "x") == value
         return
@@ -65,7 +67,7 @@ def test_words_mean_what_yaml_1_2_says_with_underscores(text, value):
 
 
 @pytest.mark.parametrize(("text", "value"), [(".inf", math.inf), ("-.INF", -math.inf), ("+.Inf", math.inf)])
-def test_infinity_is_read_as_yaml_writes_it(text, value):
+def test_infinity_is_read_as_yaml_writes_it(text: str, value: float) -> None:
     assert parse_yaml(text, "x") == value
     assert math.isnan(parse_yaml(".NaN", "x"))
 
@@ -95,7 +97,7 @@ def test_infinity_is_read_as_yaml_writes_it(text, value):
         ("{[a]: 3}", ["a list or a mapping stands as a key"]),
     ],
 )
-def test_what_has_two_meanings_or_none_is_refused_with_both_and_its_place(text, parts):
+def test_what_has_two_meanings_or_none_is_refused_with_both_and_its_place(text: str, parts: list[str]) -> None:
     with pytest.raises(SpecError) as caught:
         parse_yaml(f"first: 1\nkey: {text}", "x.yaml")
     assert caught.value.message.startswith("x.yaml, line 2, column ")
@@ -103,11 +105,11 @@ def test_what_has_two_meanings_or_none_is_refused_with_both_and_its_place(text, 
         assert part in str(caught.value)
 
 
-def test_keys_are_texts_as_they_are_written():
+def test_keys_are_texts_as_they_are_written() -> None:
     assert parse_yaml("{no: 1, 010: 2, 1: 3, true: 4, ~: 5}", "x") == {"no": 1, "010": 2, "1": 3, "true": 4, "~": 5}
 
 
-def test_a_merged_mapping_gives_way_to_what_is_written():
+def test_a_merged_mapping_gives_way_to_what_is_written() -> None:
     text = "a: &a {x: 1, y: 1}\nb: &b {y: 2, z: 2}\nc: {<<: [*a, *b], x: 3}\nd: {<<: *a, z: 4}"
     read = parse_yaml(text, "x")
     assert read["c"] == {"x": 3, "y": 1, "z": 2}
@@ -124,14 +126,14 @@ def test_a_merged_mapping_gives_way_to_what_is_written():
         ("a: 1\n---\na: 2", "x.yaml, line 2"),
     ],
 )
-def test_nothing_stands_twice(text, part):
+def test_nothing_stands_twice(text: str, part: str) -> None:
     assert part in refused(text)
 
 
 @pytest.mark.parametrize(
     "text", ["a: \x00", "\x07", "a: '\ud800'", 'a: "\\u12"', "%YAML 3.0\n---\na: 1", "a: b: c", "\t- a"]
 )
-def test_what_is_no_yaml_is_told_so(text):
+def test_what_is_no_yaml_is_told_so(text: str) -> None:
     assert refused(text).startswith("x.yaml")
 
 
@@ -156,13 +158,13 @@ def test_what_is_no_yaml_is_told_so(text):
         ("seed: 0x" + "f" * 5_000, ["a number of 5,002 digits"]),
     ],
 )
-def test_what_stands_for_too_much_is_refused_before_it_is_built(text, parts):
+def test_what_stands_for_too_much_is_refused_before_it_is_built(text: str, parts: list[str]) -> None:
     message = refused(text)
     for part in parts:
         assert part in message
 
 
-def test_a_refusal_needs_little_memory():
+def test_a_refusal_needs_little_memory() -> None:
     tracemalloc.start()
     refused(LAUGHS)
     _, peak = tracemalloc.get_traced_memory()
@@ -171,7 +173,7 @@ def test_a_refusal_needs_little_memory():
     assert peak < 20_000_000
 
 
-def test_the_limits_hold_for_set_too():
+def test_the_limits_hold_for_set_too() -> None:
     flow = "{" + LAUGHS.strip().replace("\n", ", ") + "}"
     with pytest.raises(SpecError, match=r"--set env.args.*values and keys"):
         load_spec({"env": "x", "algorithm": "ppo"}, [f"env.args={flow}"])
@@ -179,7 +181,7 @@ def test_the_limits_hold_for_set_too():
         load_spec({"env": "x", "algorithm": "ppo"}, ["env." + ".".join("a" * 5_000) + "=1"])
 
 
-def test_a_file_of_megabytes_is_not_read(tmp_path):
+def test_a_file_of_megabytes_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_bytes(b"#" * 5_000_000)
     with pytest.raises(SpecError, match="larger than"):

@@ -1,13 +1,17 @@
 """How far a trial is outlives its process, and is in the record of one that failed."""
 
+from __future__ import annotations
+
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from fake_engine import FakeEngine
+from fake_engine import FakeClock, FakeEngine
 from fake_pack import Pack
 from test_packed_env_failures import go_on
 from test_packed_envs import make, own_modules
@@ -20,6 +24,13 @@ from policies.envs.checked import CheckedEnvs
 from policies.envs.make import make_vector_env
 from policies.envs.tallies import Reached, begin_tally, only_tally, read_tally, tally_of
 from policies.errors import EnvError
+from tests.narrowing import present
+from tune_jobs.store.record_keeper import RecordKeeper
+from tune_jobs.store.sweep_store import SweepStore
+
+if TYPE_CHECKING:
+    from policies.packed.envs.cartpole import CartPoleEnvs
+    from policies.packed.envs.scalar import ScalarEnvs
 
 __all__ = ["kept", "make", "own_modules"]
 
@@ -28,12 +39,12 @@ FAULTY = "odd_envs:Faulty"
 
 
 @pytest.fixture(autouse=True)
-def no_tallies(monkeypatch):
+def no_tallies(monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a process of its own: tests of other files leave trials that were not run to their end."""
     monkeypatch.setattr(tallies, "_tallies", {})
 
 
-def test_a_tally_outlives_a_process_that_is_killed(tmp_path):
+def test_a_tally_outlives_a_process_that_is_killed(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys\nfrom pathlib import Path\nfrom policies.envs.tallies import Reached, begin_tally\n"
         "tally = begin_tally('a', Path(sys.argv[1]), Reached(2, 200, 3, 7.0))\n"
@@ -45,19 +56,23 @@ def test_a_tally_outlives_a_process_that_is_killed(tmp_path):
         timeout=600, check=False,
     )  # fmt: skip
     assert child.returncode == -9
-    reached = read_tally(path)
-    assert (reached.num_iterations, reached.num_env_steps, reached.num_episodes) == (2, 240, 8)
+    reached = present(read_tally(path))
+    assert (reached.num_iterations, reached.num_env_steps, reached.num_episodes) == (
+        2,
+        240,
+        8,
+    )
     assert reached.time_s >= 7.0
 
 
-def test_a_process_that_has_lost_its_trial_counts_into_nothing(tmp_path):
+def test_a_process_that_has_lost_its_trial_counts_into_nothing(tmp_path: Path) -> None:
     old = begin_tally("a", tmp_path / ".tally", BEGUN)
     begin_tally("a", tmp_path / ".tally", BEGUN)
     old.add(100, 1)
     assert read_tally(tmp_path / ".tally") == BEGUN
 
 
-def test_what_is_no_tally_says_nothing(tmp_path):
+def test_what_is_no_tally_says_nothing(tmp_path: Path) -> None:
     assert read_tally(tmp_path / ".tally") is None
     for content in (b"", b"x" * 31, np.array([np.nan, 1, 1, 1]).tobytes()):
         (tmp_path / ".tally").write_bytes(content)
@@ -68,22 +83,26 @@ def test_what_is_no_tally_says_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
-def test_env_steps_of_a_pack_are_counted_up_to_the_failure(make, tmp_path, kind):
+def test_env_steps_of_a_pack_are_counted_up_to_the_failure(
+    make: Callable[..., CartPoleEnvs | ScalarEnvs], tmp_path: Path, kind: str
+) -> None:
     for name in ("a", "b"):
         begin_tally(name, tmp_path / name, BEGUN)
     envs = make(FAULTY, kind, env_args={"raises": "OwnStop", "action": 1}, members={"a": 1, "b": 2}, num_processes=2)
     for index in range(12):
         go_on(envs, "b", 1 if index == 9 else 0)
     # Three sub-environments each; an episode takes seven steps.
-    assert (tally_of("a").reached.num_env_steps, tally_of("a").reached.num_episodes) == (236, 6)
-    assert (tally_of("b").reached.num_env_steps, tally_of("b").reached.num_episodes) == (227, 6)
-    assert read_tally(tmp_path / "b") == tally_of("b").reached
+    assert (present(tally_of("a")).reached.num_env_steps, present(tally_of("a")).reached.num_episodes) == (236, 6)
+    assert (present(tally_of("b")).reached.num_env_steps, present(tally_of("b")).reached.num_episodes) == (227, 6)
+    assert read_tally(tmp_path / "b") == present(tally_of("b")).reached
     envs.remove("b")
     go_on(envs)
-    assert tally_of("b").reached.num_env_steps == 227
+    assert present(tally_of("b")).reached.num_env_steps == 227
 
 
-def test_env_steps_of_a_vector_env_are_counted_without_those_that_reset(monkeypatch, tmp_path):
+def test_env_steps_of_a_vector_env_are_counted_without_those_that_reset(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(env_faults, "_notes_signals", True)
     begin_tally("a", tmp_path / "a", BEGUN)
     envs = CheckedEnvs(make_vector_env(FAULTY, {"raises": "OwnStop", "action": 1}, 2), FAULTY)
@@ -93,21 +112,21 @@ def test_env_steps_of_a_vector_env_are_counted_without_those_that_reset(monkeypa
     with pytest.raises(EnvError):
         envs.step(np.ones(2, dtype=np.int64))
     # Ten steps, one of which only reset.
-    assert (only_tally().reached.num_env_steps, only_tally().reached.num_episodes) == (218, 5)
+    assert (present(only_tally()).reached.num_env_steps, present(only_tally()).reached.num_episodes) == (218, 5)
     begin_tally("b", tmp_path / "b", BEGUN)
     assert only_tally() is None
 
 
-def test_a_trial_s_tally_follows_it_and_is_gone_at_its_end(tmp_path):
+def test_a_trial_s_tally_follows_it_and_is_gone_at_its_end(tmp_path: Path) -> None:
     trial = Trial(tmp_path, engine=FakeEngine(raise_at=4), evaluation={"every_iterations": 2})
     path = trial.store.tally_path
     assert read_tally(path) == Reached(0, 0, 0, 0.0)
     trial.run_to(2)
-    tally_of("t0000").add(30, 2)
+    present(tally_of("t0000")).add(30, 2)
     with pytest.raises(ZeroDivisionError):
         trial.run()
     # The fourth iteration is not whole; of it is known what was counted while it lasted.
-    found = read_tally(path)
+    found = present(read_tally(path))
     assert (found.num_iterations, found.num_env_steps, found.num_episodes) == (3, 300, 3)
     again = Trial(tmp_path, stop={"num_iterations": 5})
     again.run()
@@ -115,19 +134,21 @@ def test_a_trial_s_tally_follows_it_and_is_gone_at_its_end(tmp_path):
     assert tally_of("t0000") is None
 
 
-def test_a_member_that_fails_tells_how_far_it_was(tmp_path):
-    def engine(trial_id):
+def test_a_member_that_fails_tells_how_far_it_was(tmp_path: Path) -> None:
+    def engine(trial_id: str) -> FakeEngine:
         return FakeEngine(raise_at=4 if trial_id == "t0001" else None)
 
     pack = Pack(tmp_path, engine, max_retries=1, stop={"num_iterations": 6}, checkpoints={"every_iterations": 2})
     pack.add("t0000", "t0001").run()
     reached = [report.reached for report in pack.of("t0001") if report.error is not None]
-    assert [(one.num_iterations, one.num_env_steps) for one in reached] == [(3, 300), (3, 300)]
+    assert [(present(one).num_iterations, present(one).num_env_steps) for one in reached] == [(3, 300), (3, 300)]
     assert not pack.store("t0000").tally_path.exists()
     assert tally_of("t0001") is None
 
 
-def test_the_record_of_a_failed_trial_says_how_far_it_was(kept):
+def test_the_record_of_a_failed_trial_says_how_far_it_was(
+    kept: tuple[SweepStore, RecordKeeper, FakeClock, list[Any]],
+) -> None:
     store, keeper, _, _ = kept
     begin_tally("a", store.trial("t0003").tally_path, Reached(5, 512, 9, 2.5))
     keeper.started("t0003")

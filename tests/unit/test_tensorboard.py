@@ -73,7 +73,7 @@ def test_a_run_that_goes_on_writes_a_file_of_its_own(tmp_path: Path) -> None:
     assert [len(read(path)) for path in files(tmp_path, trial.trial_id)] == [2, 2]
 
 
-def test_writing_event_files_loads_no_torch():
+def test_writing_event_files_loads_no_torch() -> None:
     code = (
         "import sys, types\n"
         "from tune_jobs.store.event_files import ScalarWriter\n"

@@ -4,6 +4,8 @@ import builtins
 import importlib.util
 import json
 import math
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,29 +13,39 @@ import pytest
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
 from policies.errors import CannotRunError, SpecError
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.search.tpe import _known_trials, propose_point
 from tune_jobs.spec.domains import draw_point
 from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 pytest.importorskip("optuna")
 
 SPACE = {"lr": {"loguniform": [1e-5, 1e-1]}, "activation": {"choice": ["tanh", "relu", "silu"]}}
 
 
-def make_spec(num_samples=40, startup=8, **changes):
+def make_spec(num_samples: int = 40, startup: int = 8, **changes: Any) -> SweepSpec:
     search = {"type": "tpe", "num_startup_trials": startup}
     base = {"env": "CartPole-v1", "algorithm": "ppo", "space": SPACE, "num_samples": num_samples, "search": search}
     return load_spec({**base, **changes})
 
 
-def valley(point):
+def valley(point: dict[str, Any]) -> float:
     """Best, 0, at lr 1e-3 with silu."""
-    return -abs(math.log10(point["lr"]) + 3) - (point["activation"] != "silu")
+    return cast("float", -abs(math.log10(point["lr"]) + 3) - (point["activation"] != "silu"))
 
 
-def record(index, point, score=None, *, status="completed", point_index=None, steps=200_000):
+def record(
+    index: int,
+    point: dict[str, Any],
+    score: float | None = None,
+    *,
+    status: str = "completed",
+    point_index: None = None,
+    steps: int = 200_000,
+) -> TrialRecord:
     point_index = index if point_index is None else point_index
     kept = {"trial_id": f"t{index:04d}", "iteration": 1, "num_env_steps": steps, "evaluation_return": score}
     return TrialRecord(
@@ -42,9 +54,9 @@ def record(index, point, score=None, *, status="completed", point_index=None, st
     )  # fmt: skip
 
 
-def search(spec, score, *, at_once=1):
+def search(spec: SweepSpec, score: Callable[[dict[str, Any]], float], *, at_once: int = 1) -> list[dict[str, Any]]:
     """All points of a sweep, `at_once` trials running at a time."""
-    records = []
+    records: list[Any] = []
     for index in range(spec.num_samples):
         point = propose_point(spec, records, index, lambda point: None)
         records.append(record(index, point, status="running"))
@@ -55,7 +67,7 @@ def search(spec, score, *, at_once=1):
 
 
 @pytest.mark.parametrize("at_once", [1, 4])
-def test_later_points_concentrate_where_scores_are_better_than_those_of_random_ones(at_once):
+def test_later_points_concentrate_where_scores_are_better_than_those_of_random_ones(at_once: int) -> None:
     gains, silu = [], []
     for seed in range(3):
         spec = make_spec(seed=seed)
@@ -68,7 +80,7 @@ def test_later_points_concentrate_where_scores_are_better_than_those_of_random_o
     assert np.mean(silu) > 0.55
 
 
-def test_points_are_the_planned_random_ones_until_enough_have_ended():
+def test_points_are_the_planned_random_ones_until_enough_have_ended() -> None:
     spec = make_spec(startup=8)
     points = search(spec, valley)
     plan = make_plan(spec, Machine(num_cpus=2))
@@ -76,7 +88,7 @@ def test_points_are_the_planned_random_ones_until_enough_have_ended():
     assert points[8] != draw_point(spec.space, 8, spec.seed)
 
 
-def test_the_same_records_give_the_same_point_whatever_ran_before():
+def test_the_same_records_give_the_same_point_whatever_ran_before() -> None:
     spec = make_spec()
     points = search(spec, valley)[:12]
     records = [record(index, point, valley(point)) for index, point in enumerate(points)]
@@ -87,7 +99,7 @@ def test_the_same_records_give_the_same_point_whatever_ran_before():
     assert propose_point(spec, records, 13, lambda point: None) != first
 
 
-def test_trials_that_run_at_the_same_time_are_kept_apart():
+def test_trials_that_run_at_the_same_time_are_kept_apart() -> None:
     spec = make_spec(startup=4, space={"lr": SPACE["lr"]})
     ended = [record(index, {"lr": lr}, valley({"lr": lr, "activation": "silu"})) for index, lr in enumerate(
         [1e-5, 1e-4, 9e-4, 1e-3, 1.1e-3, 1e-2, 1e-1])]  # fmt: skip
@@ -95,8 +107,8 @@ def test_trials_that_run_at_the_same_time_are_kept_apart():
     running = [record(7 + k, {"lr": 1e-3 * (1 + k / 50)}, status="running") for k in range(6)]
     beside = [propose_point(spec, ended + running, 13 + k, lambda point: None)["lr"] for k in range(12)]
 
-    def near(values):
-        return np.mean(np.abs(np.log10(values) + 3) < 0.1)
+    def near(values: Sequence[float]) -> np.float64:
+        return cast("np.float64", np.mean(np.abs(np.log10(values) + 3) < 0.1))
 
     assert near(beside) < near(alone)
 
@@ -110,7 +122,7 @@ def test_trials_that_run_at_the_same_time_are_kept_apart():
         {"status": "stopped", "score": -50.0, "steps": 20_000},
     ],
 )
-def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad):
+def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad: dict[str, Any]) -> None:
     spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
     grid = np.linspace(0.02, 0.98, 24)
     records = [
@@ -120,24 +132,27 @@ def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad)
     assert np.mean(np.array(proposed) < 0.5) > 0.8
 
 
-def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_steps_within_a_rung_do_not_matter():
+def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_steps_within_a_rung_do_not_matter() -> None:
     spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
 
-    def proposed(left, right):
+    def proposed(left: dict[str, float], right: dict[str, float]) -> np.float64:
         records = [
             record(index, {"lr": lr}, status="stopped", **(left if lr < 0.5 else right))
             for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24)))
         ]
-        return np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)])
+        return cast(
+            "np.float64",
+            np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)]),
+        )
 
     assert proposed({"score": 1.0, "steps": 31_000}, {"score": 9.0, "steps": 10_400}) > 0.8
     assert proposed({"score": 9.0, "steps": 10_000}, {"score": 1.0, "steps": 10_400}) > 0.8
 
 
-def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended():
+def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended() -> None:
     spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, seeds_per_point=2)
 
-    def proposed(other_seed):
+    def proposed(other_seed: dict[str, Any]) -> np.float64:
         records = []
         for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24))):
             second = {"score": 1.0} if lr < 0.5 else other_seed
@@ -145,7 +160,10 @@ def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended():
                 record(2 * index, {"lr": lr}, 1.0 if lr < 0.5 else 5.0, point_index=index),
                 record(2 * index + 1, {"lr": lr}, point_index=index, **second),
             ]
-        return np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)])
+        return cast(
+            "np.float64",
+            np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)]),
+        )
 
     assert proposed({"score": -9.0}) > 0.8  # mean -2
     assert proposed({"score": 5.0}) < 0.2
@@ -153,7 +171,7 @@ def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended():
     assert proposed({"score": 99.0, "status": "running"}) > 0.8
 
 
-def test_every_kind_of_domain_keeps_its_bounds_steps_and_types():
+def test_every_kind_of_domain_keeps_its_bounds_steps_and_types() -> None:
     space = {
         "lr": {"qloguniform": [0.01, 0.5, 0.01]},
         "gamma": {"quniform": [0.9, 0.99, 0.03]},
@@ -182,12 +200,12 @@ def test_every_kind_of_domain_keeps_its_bounds_steps_and_types():
         assert not any(isinstance(value, np.generic) for value in point.values())
 
 
-def test_a_proposal_whose_values_do_not_go_together_is_replaced():
+def test_a_proposal_whose_values_do_not_go_together_is_replaced() -> None:
     spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}})
     records = [record(index, {"lr": lr}, lr) for index, lr in enumerate([0.1, 0.3, 0.5, 0.7, 0.9])]
     asked = []
 
-    def check(point):
+    def check(point: dict[str, float]) -> None:
         asked.append(point)
         if point["lr"] > 0.5:
             raise SpecError("too large")
@@ -195,20 +213,20 @@ def test_a_proposal_whose_values_do_not_go_together_is_replaced():
     assert all(propose_point(spec, records, 5 + k, check)["lr"] <= 0.5 for k in range(5))
     assert len(asked) > 5
 
-    def refuse(point):
+    def refuse(point: dict[str, float]) -> None:
         raise SpecError("never")
 
     with pytest.raises(SpecError, match="never"):
         propose_point(spec, records, 5, refuse)
 
 
-def test_without_optuna_the_plan_says_what_to_install(monkeypatch):
+def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     find_spec, real_import = importlib.util.find_spec, builtins.__import__
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find_spec(name, *rest)
     )
 
-    def no_optuna(name, *rest):
+    def no_optuna(name: str, *rest: Any):
         assert not name.startswith("optuna")
         return real_import(name, *rest)
 
@@ -219,8 +237,8 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch):
     make_plan(make_spec(search={"type": "random"}), Machine(num_cpus=2))
 
 
-def test_the_model_learns_from_the_score_that_the_selection_goes_by():
+def test_the_model_learns_from_the_score_that_the_selection_goes_by() -> None:
     spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
     one = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0})
     (known,) = _known_trials(spec, [one])
-    assert known.value == score_trial(one).score == 3.0
+    assert known.value == present(score_trial(one)).score == 3.0

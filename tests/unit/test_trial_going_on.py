@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_engine import FakeClock, FakeEngine
@@ -10,13 +12,14 @@ from trial_runs import Trial
 
 from policies.envs.tallies import tally_of
 from policies.errors import NonFiniteWeightsError
+from tests.narrowing import present
 from tune_jobs.store.ownership import Owner, OwnershipLostError
 from tune_jobs.store.sweep_store import SweepStore
 
 # -- going on
 
 
-def test_a_trial_goes_on_from_its_latest_checkpoint(tmp_path):
+def test_a_trial_goes_on_from_its_latest_checkpoint(tmp_path: Path) -> None:
     """Opened by another process: results after the checkpoint are done again and stand there once."""
     first = Trial(tmp_path, scores=lambda i: -float(i), checkpoints={"every_iterations": 4, "keep": 1})
     first.run_to(6)
@@ -37,16 +40,16 @@ def test_a_trial_goes_on_from_its_latest_checkpoint(tmp_path):
     assert second.kept == [1, 9]
 
 
-def test_results_are_written_before_the_checkpoint_that_counts_on_them(tmp_path):
+def test_results_are_written_before_the_checkpoint_that_counts_on_them(tmp_path: Path) -> None:
     """Killed right after it is saved, a trial goes on from it: results that were not written would leave a hole."""
     trial = Trial(tmp_path, evaluation={"every_iterations": 50})
     known = []
-    trial.engine.save = lambda folder: known.append([record.iteration for record in trial.results])
+    trial.engine.save = lambda folder: known.append([record.iteration for record in trial.results])  # type: ignore[method-assign]
     trial.loop.advance(math.inf)
     assert known == [list(range(1, number + 1)) for number in (10, 20, 30, 40, 50)]
 
 
-def test_a_trial_without_a_checkpoint_begins_again(tmp_path):
+def test_a_trial_without_a_checkpoint_begins_again(tmp_path: Path) -> None:
     first = Trial(tmp_path, evaluation={"every_iterations": 50})
     first.loop.advance(-1.0)
     assert first.results
@@ -55,7 +58,7 @@ def test_a_trial_without_a_checkpoint_begins_again(tmp_path):
     assert (second.results, second.loop.iteration) == ([], 0)
 
 
-def test_time_goes_on_where_it_was(tmp_path):
+def test_time_goes_on_where_it_was(tmp_path: Path) -> None:
     clock = FakeClock()
     first = Trial(tmp_path, clock=clock, checkpoints={"every_iterations": 1, "keep": 1})
     clock.now += 40.0
@@ -69,9 +72,11 @@ def test_time_goes_on_where_it_was(tmp_path):
     assert second.loop.advance(math.inf).status == "completed"
 
 
-def test_the_window_of_100_episodes_goes_on_too(tmp_path):
-    task = {"stop": {"training_return": 20.0, "num_iterations": 300}, "evaluation": {"every_iterations": 999},
-            "checkpoints": {"every_iterations": 60, "keep": 1}}  # fmt: skip
+def test_the_window_of_100_episodes_goes_on_too(tmp_path: Path) -> None:
+    task: dict[str, Any] = {
+        "stop": {"training_return": 20.0, "num_iterations": 300}, "evaluation": {"every_iterations": 999},
+        "checkpoints": {"every_iterations": 60, "keep": 1},
+    }  # fmt: skip
     first = Trial(tmp_path, **task)
     for _ in range(70):
         first.loop.advance(-1.0)
@@ -80,8 +85,8 @@ def test_the_window_of_100_episodes_goes_on_too(tmp_path):
     assert second.run().num_iterations == 100
 
 
-def test_the_newest_score_goes_on_too(tmp_path):
-    task = {"evaluation": {"every_iterations": 4}, "checkpoints": {"every_iterations": 3, "keep": 1}}
+def test_the_newest_score_goes_on_too(tmp_path: Path) -> None:
+    task: dict[str, Any] = {"evaluation": {"every_iterations": 4}, "checkpoints": {"every_iterations": 3, "keep": 1}}
     first = Trial(tmp_path, **task)
     while first.loop.iteration < 6:
         first.loop.advance(-1.0)
@@ -90,7 +95,7 @@ def test_the_newest_score_goes_on_too(tmp_path):
     assert report.best_iteration == 4
 
 
-def test_a_torn_last_line_is_dropped(tmp_path):
+def test_a_torn_last_line_is_dropped(tmp_path: Path) -> None:
     first = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
     first.run_to(4)
     whole = first.store.results_path.read_text()
@@ -105,7 +110,7 @@ def test_a_torn_last_line_is_dropped(tmp_path):
     assert [record.iteration for record in second.results] == [1, 2, 3, 4, 5, 6]
 
 
-def test_half_written_checkpoints_are_removed_and_never_used(tmp_path):
+def test_half_written_checkpoints_are_removed_and_never_used(tmp_path: Path) -> None:
     first = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
     first.run_to(2)
     half = first.store.checkpoints_folder / ".000004.123"
@@ -118,8 +123,8 @@ def test_half_written_checkpoints_are_removed_and_never_used(tmp_path):
 # -- who trains it
 
 
-def test_who_lost_the_trial_writes_nothing_any_more(tmp_path):
-    task = {"checkpoints": {"every_iterations": 2, "keep": 9}, "stop": {"num_iterations": 9}}
+def test_who_lost_the_trial_writes_nothing_any_more(tmp_path: Path) -> None:
+    task: dict[str, Any] = {"checkpoints": {"every_iterations": 2, "keep": 9}, "stop": {"num_iterations": 9}}
     old = Trial(tmp_path, **task)
     old.run_to(3)
     new = Trial(tmp_path, **task)
@@ -139,17 +144,17 @@ def test_who_lost_the_trial_writes_nothing_any_more(tmp_path):
     assert [record.iteration for record in new.results] == list(range(1, 10))
 
 
-def test_a_trial_that_is_taken_while_a_checkpoint_is_written_keeps_none_of_it(tmp_path):
+def test_a_trial_that_is_taken_while_a_checkpoint_is_written_keeps_none_of_it(tmp_path: Path) -> None:
     old = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 9})
     old.run_to(3)
     save, others = old.engine.save, []
 
-    def taken_meanwhile(folder):
+    def taken_meanwhile(folder: Path) -> None:
         others.append(Trial(tmp_path, stop={"num_iterations": 6}))
         folder.mkdir(exist_ok=True)
         save(folder)
 
-    old.engine.save = taken_meanwhile
+    old.engine.save = taken_meanwhile  # type: ignore[method-assign]
     with pytest.raises(OwnershipLostError):
         old.loop.advance(math.inf)
     (new,) = others
@@ -158,7 +163,7 @@ def test_a_trial_that_is_taken_while_a_checkpoint_is_written_keeps_none_of_it(tm
     assert new.run().status == "completed"
 
 
-def test_a_trial_that_had_reached_its_end_is_done_at_once(tmp_path):
+def test_a_trial_that_had_reached_its_end_is_done_at_once(tmp_path: Path) -> None:
     """Killed after its last checkpoint, before anybody was told."""
     Trial(tmp_path, stop={"num_iterations": 5}).run()
     again = Trial(tmp_path, stop={"num_iterations": 5})
@@ -169,7 +174,7 @@ def test_a_trial_that_had_reached_its_end_is_done_at_once(tmp_path):
     assert len(again.results) == 5
 
 
-def test_a_process_runs_one_trial_after_another(tmp_path):
+def test_a_process_runs_one_trial_after_another(tmp_path: Path) -> None:
     engine = FakeEngine()
     for name in ("a", "b"):
         trial = Trial(tmp_path / name, engine=engine, stop={"num_iterations": 3})
@@ -181,7 +186,7 @@ def test_a_process_runs_one_trial_after_another(tmp_path):
 # -- the end that nobody wants
 
 
-def test_nan_weights_end_a_trial_as_failed(tmp_path):
+def test_nan_weights_end_a_trial_as_failed(tmp_path: Path) -> None:
     trial = Trial(tmp_path, engine=FakeEngine(nan_from=5), checkpoints={"every_iterations": 2, "keep": 2})
     progress = trial.run()
     assert (progress.status, progress.num_iterations, progress.stop_reason) == ("failed", 5, None)
@@ -194,11 +199,11 @@ def test_nan_weights_end_a_trial_as_failed(tmp_path):
     assert [(r.iteration, r.evaluation_return) for r in trial.results][-2:] == [(4, 4.0), (5, None)]
 
 
-def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path):
+def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path: Path) -> None:
     class Engine(FakeEngine):
         def train_iteration(self):
             if self.iteration == 3:
-                tally_of("t0000").add(40, 2)
+                present(tally_of("t0000")).add(40, 2)
                 raise NonFiniteWeightsError("The gradients of an update are NaN or infinite.", "Lower lr.")
             return super().train_iteration()
 
@@ -215,14 +220,14 @@ def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path):
     assert [record.iteration for record in trial.results] == [1, 2, 3]
 
 
-def test_what_an_engine_raises_is_raised_and_what_was_done_is_written(tmp_path):
+def test_what_an_engine_raises_is_raised_and_what_was_done_is_written(tmp_path: Path) -> None:
     trial = Trial(tmp_path, engine=FakeEngine(raise_at=4), evaluation={"every_iterations": 50})
     with pytest.raises(ZeroDivisionError, match="the cart left the track"):
         trial.run()
     assert [record.iteration for record in trial.results] == [1, 2, 3]
 
 
-def test_a_stop_request_pauses_with_a_checkpoint_of_this_very_iteration(tmp_path):
+def test_a_stop_request_pauses_with_a_checkpoint_of_this_very_iteration(tmp_path: Path) -> None:
     trial = Trial(tmp_path, evaluation={"every_iterations": 3})
     trial.run_to(3)
     trial.loop.advance(-1.0)
@@ -238,7 +243,7 @@ def test_a_stop_request_pauses_with_a_checkpoint_of_this_very_iteration(tmp_path
     assert again.run_to(6).num_env_steps == 600
 
 
-def test_a_stop_request_right_after_a_checkpoint_writes_no_other(tmp_path):
+def test_a_stop_request_right_after_a_checkpoint_writes_no_other(tmp_path: Path) -> None:
     trial = Trial(tmp_path)
     trial.run_to(3)
     before = {path: path.stat().st_mtime_ns for path in trial.store.checkpoints_folder.rglob("*")}
@@ -247,7 +252,7 @@ def test_a_stop_request_right_after_a_checkpoint_writes_no_other(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in trial.store.checkpoints_folder.rglob("*")} == before
 
 
-def test_a_stop_request_before_the_first_iteration_saves_nothing(tmp_path):
+def test_a_stop_request_before_the_first_iteration_saves_nothing(tmp_path: Path) -> None:
     trial = Trial(tmp_path)
     SweepStore(tmp_path).request_stop()
     progress = trial.loop.advance(math.inf)
@@ -255,7 +260,7 @@ def test_a_stop_request_before_the_first_iteration_saves_nothing(tmp_path):
     assert trial.kept == []
 
 
-def test_results_tell_all_that_an_iteration_gave(tmp_path):
+def test_results_tell_all_that_an_iteration_gave(tmp_path: Path) -> None:
     clock = FakeClock(step=0.5)
     engine = FakeEngine(lambda iteration: (float(iteration), -2.0))
     trial = Trial(tmp_path, engine=engine, clock=clock, stop={"num_iterations": 3}, evaluation={"every_iterations": 2})

@@ -3,11 +3,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
@@ -17,12 +19,13 @@ from policies.acting.movies import GifWriter, Mp4Writer
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.acting.video import record_comparison, record_video
 from policies.errors import CannotRunError, EnvError, NonFiniteWeightsError, SpecError
+from tests.narrowing import present
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
 
 
-def read_mp4(path):
+def read_mp4(path: Path) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
     """Size, frames a second and the frames."""
     reader = imageio_ffmpeg.read_frames(str(path))
     meta = next(reader)
@@ -31,7 +34,7 @@ def read_mp4(path):
     return meta, frames
 
 
-def gif_frames(path):
+def gif_frames(path: Path) -> tuple[tuple[int, int], int, list[tuple[int, NDArray[np.uint8]]]]:
     with Image.open(path) as image:
         frames = []
         for index in range(image.n_frames):
@@ -40,7 +43,7 @@ def gif_frames(path):
         return image.size, image.info.get("loop"), frames
 
 
-def test_the_filmed_episode_is_the_evaluated_one_and_plays_in_real_time(tmp_path):
+def test_the_filmed_episode_is_the_evaluated_one_and_plays_in_real_time(tmp_path: Path) -> None:
     policy = balancing_policy(skill="poor")
     mp4, gif = tmp_path / "new" / "a.mp4", tmp_path / "new" / "a.gif"
     episodes = record_video(policy, env_id="CartPole-v0", seeds=[4, 5], mp4=mp4, gif=gif, caption="me")
@@ -58,29 +61,29 @@ def test_the_filmed_episode_is_the_evaluated_one_and_plays_in_real_time(tmp_path
     assert 0 < head.find(b"moov") < head.find(b"mdat")  # playable before it has come whole
 
 
-def test_the_frames_show_the_env_under_a_caption(tmp_path):
+def test_the_frames_show_the_env_under_a_caption(tmp_path: Path) -> None:
     record_video(balancing_policy(), env_id="CartPole-v0", seeds=0, mp4=tmp_path / "a.mp4", max_steps=3)
     record_video(balancing_policy(), env_id="CartPole-v0", seeds=0, mp4=tmp_path / "b.mp4", max_steps=3, caption="")
     (_, frames), (_, untitled) = read_mp4(tmp_path / "a.mp4"), read_mp4(tmp_path / "b.mp4")
     env = gym.make("CartPole-v0", render_mode="rgb_array")
     env.reset(seed=0)
-    picture = env.render()
-    scene = frames[0][-picture.shape[0] :].astype(int)
+    picture = present(env.render())
+    scene = frames[0][-cast("Any", picture).shape[0] :].astype(int)
     assert np.abs(scene - picture).mean() < 2  # H.264 is not exact
-    strip, without = (film[0][: -picture.shape[0]].astype(int) for film in (frames, untitled))
+    strip, without = (film[0][: -cast("Any", picture).shape[0]].astype(int) for film in (frames, untitled))
     half = strip.shape[1] // 2
     assert strip[:, :half].max() > 150 > without[:, :half].max()
     assert strip[:, half:].max() > 150
     assert np.abs(frames[0][:40].astype(int) - frames[3][:40]).max() > 50  # the counters count
 
 
-def test_a_random_policy_is_filmed_as_it_is_evaluated(tmp_path):
+def test_a_random_policy_is_filmed_as_it_is_evaluated(tmp_path: Path) -> None:
     policy = RandomPolicy.for_env("CartPole-v1")
     filmed = record_video(policy, env_id="CartPole-v1", seeds=8, gif=tmp_path / "a.gif")
     assert filmed == evaluate_policy(policy, env_id="CartPole-v1", seeds=[8])
 
 
-def test_two_episodes_are_filmed_alone_and_side_by_side(tmp_path):
+def test_two_episodes_are_filmed_alone_and_side_by_side(tmp_path: Path) -> None:
     left, right = balancing_policy(skill="poor"), balancing_policy()
     results = record_comparison(
         left,
@@ -113,8 +116,8 @@ def test_two_episodes_are_filmed_alone_and_side_by_side(tmp_path):
     assert (tmp_path / "right.gif").read_bytes() == (tmp_path / "alone.gif").read_bytes()
 
 
-def test_tiny_frames_are_enlarged(tmp_path):
-    args = {"env_id": "TestWalk-v0", "env_args": {"end": 3.0}, "seeds": 0, "max_steps": 5}
+def test_tiny_frames_are_enlarged(tmp_path: Path) -> None:
+    args: dict[str, Any] = {"env_id": "TestWalk-v0", "env_args": {"end": 3.0}, "seeds": 0, "max_steps": 5}
     record_video(make_policy("TestWalk-v0"), mp4=tmp_path / "a.mp4", gif=tmp_path / "a.gif", **args)
     meta, frames = read_mp4(tmp_path / "a.mp4")
     assert meta["fps"] == 20.0
@@ -123,20 +126,20 @@ def test_tiny_frames_are_enlarged(tmp_path):
     assert len(frames) == 6 + 20
 
 
-def test_an_env_without_pictures_is_refused(tmp_path):
+def test_an_env_without_pictures_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EnvError, match="TestNotDrawable-v0 cannot be filmed: it has no render mode 'rgb_array'"):
         record_video(make_policy("TestNotDrawable-v0"), env_id="TestNotDrawable-v0", seeds=0, mp4=tmp_path / "a.mp4")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_env_that_raises_leaves_no_file(tmp_path):
-    args = {"env_id": "TestWalk-v0", "env_args": {"fail_at": 4}, "seeds": 0}
+def test_an_env_that_raises_leaves_no_file(tmp_path: Path) -> None:
+    args: dict[str, Any] = {"env_id": "TestWalk-v0", "env_args": {"fail_at": 4}, "seeds": 0}
     with pytest.raises(EnvError, match="the motor broke"):
         record_video(make_policy("TestWalk-v0"), mp4=tmp_path / "a.mp4", gif=tmp_path / "a.gif", **args)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_env_that_draws_no_frames_is_refused(tmp_path, monkeypatch):
+def test_an_env_that_draws_no_frames_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from policy_factory import Walk
 
     for drawn in (None, np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3))):
@@ -148,7 +151,7 @@ def test_an_env_that_draws_no_frames_is_refused(tmp_path, monkeypatch):
         record_video(make_policy("TestWalk-v0"), env_id="TestWalk-v0", seeds=0, mp4=tmp_path / "a.mp4")
 
 
-def test_what_cannot_be_filmed_is_refused(tmp_path):
+def test_what_cannot_be_filmed_is_refused(tmp_path: Path) -> None:
     portable = make_portable("CartPole-v0")
     portable.network.layers[0].weight[0, 0] = np.nan
     with pytest.raises(NonFiniteWeightsError):
@@ -163,7 +166,7 @@ def test_what_cannot_be_filmed_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_cannot_be_written_is_one_clear_error(tmp_path):
+def test_a_file_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for name in ("mp4", "gif"):
         with pytest.raises(CannotRunError, match="Cannot write"):
@@ -176,7 +179,7 @@ def test_a_file_that_cannot_be_written_is_one_clear_error(tmp_path):
             )
 
 
-def test_an_encoder_that_fails_is_one_clear_error(tmp_path, monkeypatch):
+def test_an_encoder_that_fails_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = tmp_path / "ffmpeg"
     broken.write_text("#!/bin/sh\nread -r line\necho 'no such codec' >&2\nexit 1\n")
     broken.chmod(0o755)
@@ -191,7 +194,7 @@ def test_an_encoder_that_fails_is_one_clear_error(tmp_path, monkeypatch):
         writer.add(picture, 5)
     assert list(tmp_path.iterdir()) == [broken]
 
-    def none_there():
+    def none_there() -> None:
         raise RuntimeError("no binary for this machine")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none_there)
@@ -201,17 +204,17 @@ def test_an_encoder_that_fails_is_one_clear_error(tmp_path, monkeypatch):
         pass
 
 
-def test_a_gif_stays_within_its_size_and_its_time(tmp_path, monkeypatch):
+def test_a_gif_stays_within_its_size_and_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policies.acting.movies, "_GIF_MAX_FRAMES", 40)
     rng = np.random.default_rng(0)
     writer = GifWriter(tmp_path / "a.gif", 50, max_bytes=60_000)
     drawn = []
 
-    def noise():
+    def noise() -> Image:
         drawn.append(1)
         return Image.fromarray(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8))
 
-    def red():
+    def red() -> Image:
         return Image.new("RGB", (80, 60), (255, 0, 0))
 
     for step in range(300):
@@ -231,12 +234,12 @@ def test_a_gif_stays_within_its_size_and_its_time(tmp_path, monkeypatch):
         np.testing.assert_allclose(frame.mean(axis=(0, 1)), (255, 0, 0), atol=5)
 
 
-def test_a_gif_without_pictures_is_refused(tmp_path):
+def test_a_gif_without_pictures_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CannotRunError, match="no picture"):
         GifWriter(tmp_path / "a.gif", 50).save()
 
 
-def test_a_white_background_stays_white_and_nothing_is_printed(tmp_path):
+def test_a_white_background_stays_white_and_nothing_is_printed(tmp_path: Path) -> None:
     code = (
         "from policies.acting.video import record_video; from policies.acting.policy import RandomPolicy; from pathlib "
         "import Path\n"
@@ -255,7 +258,7 @@ def test_a_white_background_stays_white_and_nothing_is_printed(tmp_path):
     assert all(frame[100, 10].min() >= 254 for _, frame in frames)
 
 
-def test_odd_sizes_become_even(tmp_path):
+def test_odd_sizes_become_even(tmp_path: Path) -> None:
     with Mp4Writer(tmp_path / "a.mp4", 12.5) as writer:
         writer.add(Image.new("RGB", (31, 21), (255, 255, 255)), 4)
     meta, frames = read_mp4(tmp_path / "a.mp4")
