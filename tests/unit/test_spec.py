@@ -126,6 +126,7 @@ def test_a_preset_is_what_its_about_says() -> None:
 def test_any_sweep_may_say_what_it_is_about(tmp_path: Path) -> None:
     spec = load_spec(write(tmp_path, "about: Which one?\nenv: CartPole-v1\nalgorithm: ppo\n"), ["about.expected=high"])
     assert (spec.about.title, spec.about.expected, spec.about.description) == ("Which one?", "high", "")
+    assert spec.model_dump(mode="json")["about"] == {"title": "Which one?", "expected": "high"}
     assert SweepSpec.model_validate(json.loads(spec.model_dump_json())) == spec
     assert SweepSpec(**MINIMAL, about="Which one?").about.title == "Which one?"
     assert load_spec("cartpole-ppo").about.title == find_preset("cartpole-ppo").title

@@ -222,9 +222,9 @@ class SweepFields(Section):
     )
 
     @field_serializer("about")
-    def _null_if_empty(self, about: AboutSpec) -> AboutSpec | None:
-        # In sweep.json null, as of any field that is left out: versions that don't know it read the sweep too.
-        return None if about == AboutSpec() else about
+    def _only_what_is_said(self, about: AboutSpec) -> dict[str, str] | None:
+        # In sweep.json null if nothing is: versions that don't know the field skip one that is null.
+        return about.model_dump(exclude_defaults=True) or None
 
     @property
     def grace_env_steps(self) -> int:
