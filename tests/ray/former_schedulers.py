@@ -8,10 +8,14 @@ import math
 from typing import Any
 
 from ray.tune.experiment import Trial
-from ray.tune.schedulers import ASHAScheduler, MedianStoppingRule, TrialScheduler
+from ray.tune.schedulers import ASHAScheduler, HyperBandScheduler, MedianStoppingRule, TrialScheduler
 
 from tune_jobs.ray_tune.scheduling import WORST_SCORE
 from tune_jobs.spec.sections import SchedulerSpec
+
+
+def _is_unscored(score: float) -> bool:
+    return math.isnan(score) or score <= WORST_SCORE
 
 
 class _EndsUnscored(TrialScheduler):  # type: ignore[misc]
@@ -19,7 +23,7 @@ class _EndsUnscored(TrialScheduler):  # type: ignore[misc]
         if not result.get("evaluated"):
             return "CONTINUE"
         score = result.get("score", WORST_SCORE)
-        if (math.isnan(score) or score <= WORST_SCORE) and result["num_env_steps"] >= self.grace_env_steps:
+        if _is_unscored(score) and result["num_env_steps"] >= self.grace_env_steps:
             return "STOP"
         return super().on_trial_result(tune_controller, trial, result)
 
@@ -42,6 +46,38 @@ def former(spec: SchedulerSpec, max_env_steps: int) -> Any:
         made = _Median(grace_period=grace, **common)
     made.grace_env_steps = grace
     return made
+
+
+class FormerHyperBand(HyperBandScheduler):  # type: ignore[misc]
+    """Ray's, beginning with the bracket that ends most trials; no first milestone is 0."""
+
+    def __init__(self, grace_env_steps: int, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._grace_env_steps = grace_env_steps
+        milestone = vars(self)["_get_r0"]
+        # Rounded down it may be 0, before a trial's first evaluation.
+        self._get_r0 = lambda num_halvings: max(1, milestone(num_halvings))
+
+    def _create_bracket(self, position: int) -> Any:
+        return super()._create_bracket(self._s_max_1 - 1 - position)
+
+    def on_trial_result(self, tune_controller: Any, trial: Any, result: dict[str, Any]) -> str:
+        if not result.get("evaluated"):
+            return str(TrialScheduler.CONTINUE)
+        unscored = _is_unscored(result.get("score", WORST_SCORE))
+        if unscored and result["num_env_steps"] >= self._grace_env_steps:
+            return str(TrialScheduler.STOP)
+        return str(super().on_trial_result(tune_controller, trial, result))
+
+
+def former_hyperband(spec: SchedulerSpec, max_env_steps: int) -> Any:
+    """HyperBand of a sweep; see `SchedulerSpec`, whose `grace_env_steps` is set."""
+    grace = spec.grace_env_steps
+    assert grace is not None
+    return FormerHyperBand(
+        grace, time_attr="grace_periods", metric="score", mode="max", max_t=max(1, math.ceil(max_env_steps / grace)),
+        reduction_factor=spec.reduction_factor, stop_last_trials=False,
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,18 +30,16 @@ def run_scripted(
         evaluate_every: Reports between two evaluations.
     """
     # Defined in here, or the worker processes would look for a module that only this one has.
-    from tune_jobs.ray_tune.early_stopping import grace_env_steps
     from tune_jobs.ray_tune.trainable import TrialTrainable
     from tune_jobs.store.progress import Progress
 
-    grace, steps = grace_env_steps(scheduler, max_env_steps), STEPS
+    steps = STEPS
 
     class Scripted(TrialTrainable):
         def step(self) -> dict[str, Any]:
             path = Path(self._trial[0]) / f"{self._trial[1]}.txt"
             count = 1 + (int(path.read_text()) if path.exists() else 0)
             path.write_text(str(count))
-            self._grace = grace
             score = scores[int(self._trial[1].removeprefix("t"))]
             evaluated = count % evaluate_every == 0
             progress = Progress(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from former_schedulers import FakedController, FakedTrial, former
 
-from tune_jobs.ray_tune.early_stopping import TuneScheduler, build_scheduler, build_tune_scheduler
+from tune_jobs.ray_tune.early_stopping import build_scheduler, build_tune_scheduler
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
 from tune_jobs.spec.sections import SchedulerSpec, SchedulerType
 
 pytestmark = [
@@ -162,7 +163,7 @@ def test_without_a_scheduler_everyone_goes_on_to_the_end() -> None:
 
 @pytest.mark.parametrize("kind", ["pbt", "hyperband"])
 def test_what_pauses_trials_is_none_for_packs(kind: SchedulerType) -> None:
-    with pytest.raises(ValueError, match="Tune's own"):
+    with pytest.raises(ValueError, match=f"with {kind}, which packs"):
         build_scheduler(SchedulerSpec(type=kind), MAX_ENV_STEPS)
 
 

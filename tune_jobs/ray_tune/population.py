@@ -23,8 +23,8 @@ from analysis.records import ChangeRecord, TrialRecord
 from policies import random_streams
 from policies.errors import CheckpointError, SpecError
 from tune_jobs.plan.sweep_plan import point_hyperparams
-from tune_jobs.ray_tune.early_stopping import OfTune, TuneScheduler, name_of, standing_of
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
+from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, name_of, standing_of
 from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep

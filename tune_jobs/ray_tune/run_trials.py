@@ -23,7 +23,7 @@ from policies.errors import TuneJobsError, said_by
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
-from tune_jobs.ray_tune.early_stopping import TuneScheduler, build_tune_scheduler, waits_for_others
+from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -31,6 +31,7 @@ from tune_jobs.ray_tune.population import PopulationScheduler
 from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
 from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
+from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep

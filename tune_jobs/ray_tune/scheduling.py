@@ -6,6 +6,7 @@ trials and controller, so that the same scheduler decides for members of packs a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
@@ -16,6 +17,11 @@ from tune_jobs.store.progress import Progress
 WORST_SCORE = -1e300
 """The score for an evaluation that is not a finite number: it must lose every comparison, but NaN loses none, since
 `nan < cutoff` is False."""
+
+
+def is_unscored(score: float) -> bool:
+    """Whether an evaluation was not a finite number."""
+    return math.isnan(score) or score <= WORST_SCORE
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,8 @@ class Decision(Enum):
     STOP = "stop"
     GIVE_WAY = "give way"
     """It pauses, and continues after the trials that wait for a place."""
+    WAIT = "wait"
+    """It saves and waits for other trials until the scheduler lets it continue or ends it."""
     SAVE = "save"
     """It saves and continues: other trials may be told to continue from its checkpoint."""
 

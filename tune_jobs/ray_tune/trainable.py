@@ -27,8 +27,8 @@ from policies.envs.tallies import end_tally
 from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
-from tune_jobs.ray_tune.early_stopping import METRIC, grace_env_steps
 from tune_jobs.ray_tune.scheduling import score_of
+from tune_jobs.ray_tune.tune_scheduler import METRIC
 from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Ownership
@@ -136,19 +136,9 @@ def this_node() -> str:
     return f"{ray.util.get_node_ip_address()}/{ray.get_runtime_context().get_node_id()[:8]}"
 
 
-def compared_by(progress: Progress, grace: int) -> dict[str, Any]:
-    """Return the numbers by which Tune's schedulers compare a trial.
-
-    Args:
-        progress: The trial's progress.
-        grace: Env steps of a grace period.
-    """
-    return {
-        "evaluated": progress.evaluated,
-        "num_env_steps": progress.num_env_steps,
-        "grace_periods": progress.num_env_steps / grace,
-        METRIC: score_of(progress),
-    }
+def compared_by(progress: Progress) -> dict[str, Any]:
+    """Return the numbers by which schedulers compare a trial."""
+    return {"evaluated": progress.evaluated, "num_env_steps": progress.num_env_steps, METRIC: score_of(progress)}
 
 
 def owner_of_run(config: Mapping[str, Any]) -> Ownership | None:
@@ -197,7 +187,6 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             end_tally(self._loop.task.trial_id)
         self._trial = (Path(config["sweep_folder"]), str(config["trial_id"]))
         self._loop = None
-        self._grace = 1
 
     def step(self) -> dict[str, Any]:
         """Train until the next report.
@@ -233,7 +222,6 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         if key not in self._evaluators:
             with watchdog(task.iteration_timeout_s, self._file):
                 self._evaluators[key] = Evaluator(task.env_id, task.env_args, task.evaluation_seeds)
-        self._grace = grace_env_steps(reader.spec.scheduler, reader.spec.stop.num_env_steps)
         loop = TrialLoop(task, self._engine_of(task), self._evaluators[key], under=self._run)
         with watchdog(task.iteration_timeout_s, self._file):
             loop.open()
@@ -254,7 +242,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
     def _report(self, progress: Progress) -> dict[str, Any]:
         return {
             "done": progress.status != "running",
-            **compared_by(progress, self._grace),
+            **compared_by(progress),
             # Tune looks into results, and takes them apart.
             "progress": progress.model_dump(),
             "node": self._node,

@@ -1,0 +1,75 @@
+"""HyperBand decides as Ray Tune's does wherever that comes to an end, and no trial waits for ever."""
+
+from collections.abc import Sequence
+
+import pytest
+from former_schedulers import former_hyperband
+from hyperband_sweeps import decided
+
+from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
+from tune_jobs.ray_tune.hyperband import HyperBand
+from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
+
+pytestmark = pytest.mark.ray
+
+REPORTS = [(100,), (100, 200, 300), (400,)]
+
+
+def reach(rule: HyperBand, number: int, steps: int, score: float) -> Decision:
+    return rule.reached(Standing(f"t{number:04d}", steps, score, evaluated=True), NobodyWaits())
+
+
+def made(num_trials: int, max_env_steps: int = 800) -> HyperBand:
+    """Of a grace period of 100 env steps; half of the trials go on at each milestone."""
+    rule = HyperBand(100, max_env_steps, 2.0)
+    for number in range(num_trials):
+        rule.begins(f"t{number:04d}")
+    return rule
+
+
+@pytest.mark.parametrize("every", REPORTS)
+def test_decisions_and_their_order_are_those_of_rays_own(every: Sequence[int]) -> None:
+    num_ended, words = 0, set()
+    for seed in range(40):
+        expected, is_over = decided(seed, former_hyperband, every=every)
+        if is_over:
+            num_ended += 1
+            found, _ = decided(seed, build_tune_scheduler, every=every)
+            assert found == expected, seed
+            words |= {one[0] for one in found}
+    assert num_ended > 10
+    assert words == {"runs", "CONTINUE", "PAUSE", "STOP", "failed", "tried again"}
+
+
+@pytest.mark.parametrize("every", REPORTS)
+def test_every_sweep_comes_to_its_end_which_with_rays_own_it_does_not(every: Sequence[int]) -> None:
+    assert all(decided(seed, build_tune_scheduler, every=every)[1] for seed in range(40))
+    assert not all(decided(seed, former_hyperband, every=every)[1] for seed in range(40))
+
+
+def test_evaluations_that_are_further_apart_than_milestones_keep_nobody_waiting() -> None:
+    rule = made(8)
+    assert [reach(rule, number, 400, number) for number in range(7)] == [Decision.WAIT] * 7
+    # The first milestones were 100, 200 and 400 env steps: one of eight goes on.
+    assert reach(rule, 7, 400, 7.0) is Decision.GO_ON
+    assert rule.take_ended() == [f"t{number:04d}" for number in range(7)]
+    assert list(rule.in_turn()) == ["t0007"]
+
+
+def test_those_that_wait_do_not_wait_for_one_that_ended_by_itself() -> None:
+    rule = made(8)
+    for number in range(8):
+        reach(rule, number, 100, number)
+    assert rule.take_ended() == ["t0000", "t0001", "t0002", "t0003"]
+    assert [reach(rule, number, 200, number) for number in (4, 5, 6)] == [Decision.WAIT] * 3
+    assert [rule.waits(f"t{number:04d}") for number in (4, 5, 6, 7)] == [True, True, True, False]
+    rule.gone("t0007")
+    assert rule.take_ended() == ["t0004"]
+    assert not any(map(rule.waits, rule.in_turn()))
+
+
+def test_a_trial_without_a_score_is_ended_and_one_without_an_evaluation_goes_on() -> None:
+    rule = made(2)
+    assert rule.reached(Standing("t0000", 700, 1.0, evaluated=False), NobodyWaits()) is Decision.GO_ON
+    assert reach(rule, 0, 100, WORST_SCORE) is Decision.STOP
+    assert reach(rule, 0, 100, float("nan")) is Decision.STOP

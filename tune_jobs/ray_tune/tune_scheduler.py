@@ -1,0 +1,84 @@
+"""Connects a scheduler of ours to Ray Tune, and tells the scheduler what it may know of Tune's trials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ray.tune.experiment import Trial
+from ray.tune.schedulers import FIFOScheduler, TrialScheduler
+from typing_extensions import override
+
+from tune_jobs.ray_tune.scheduling import Decision, Scheduler, Standing
+
+if TYPE_CHECKING:
+    from ray.tune.execution.tune_controller import TuneController
+
+METRIC = "score"
+"""The field of a report by which trials are compared."""
+
+_IN_TUNES_WORDS = {
+    Decision.GO_ON: TrialScheduler.CONTINUE,
+    Decision.STOP: TrialScheduler.STOP,
+    Decision.GIVE_WAY: TrialScheduler.PAUSE,
+    Decision.WAIT: TrialScheduler.PAUSE,
+}
+
+
+class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
+    """Connects a `Scheduler` to Ray Tune; trials begin in their order.
+
+    Args:
+        scheduler: The scheduler that decides.
+    """
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        super().__init__()
+        self.scheduler = scheduler
+
+    @override
+    def on_trial_add(self, tune_controller: TuneController, trial: Trial) -> None:
+        self.scheduler.begins(name_of(trial))
+
+    @override
+    def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
+        decision = self.scheduler.reached(standing_of(trial, result), OfTune(tune_controller))
+        # Copying needs the trial to be paused, which `PopulationScheduler` does.
+        assert isinstance(decision, Decision)
+        return str(_IN_TUNES_WORDS[decision])
+
+    @override
+    def on_trial_complete(
+        self,
+        tune_controller: TuneController,
+        trial: Trial,
+        result: dict[str, Any],
+    ) -> None:
+        # A trial that ends before its first report has no standing.
+        if METRIC in result:
+            self.scheduler.ended(standing_of(trial, result))
+
+
+@dataclass(frozen=True)
+class OfTune:
+    """The other trials, as Tune's controller knows them; implements `Others`."""
+
+    controller: TuneController
+
+    def wait(self) -> bool:
+        """Whether a trial waits for a place."""
+        return any(trial.status in (Trial.PENDING, Trial.PAUSED) for trial in self.controller.get_live_trials())
+
+    def ended(self) -> set[str]:
+        """Return the ids of the trials that have ended."""
+        return {name_of(trial) for trial in self.controller.get_trials() if trial.is_finished()}
+
+
+def name_of(trial: Trial) -> str:
+    """Return our id of one of Tune's trials."""
+    return str(trial.config["trial_id"])
+
+
+def standing_of(trial: Trial, result: dict[str, Any]) -> Standing:
+    """Return a trial's standing by its report."""
+    return Standing(name_of(trial), result["num_env_steps"], result[METRIC], bool(result.get("evaluated")))
