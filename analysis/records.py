@@ -97,7 +97,7 @@ class ChangeRecord(_Record):
 
 
 class TrialPlan(_Record):
-    """What of a trial is known before it begins: one point and one seed."""
+    """What is known of a trial before it begins: its point, its seed and its place in the sweep."""
 
     trial_id: TrialId
     index: int

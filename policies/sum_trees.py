@@ -1,8 +1,9 @@
 """Binary trees of sums, to draw rows in proportion to their priorities: for one memory or for many at once.
 
 Words: the *leaves* of a tree are its rows' priorities, and every other node is the sum of the two under it. All trees
-are of one size, and lie level by level, one after another: the nodes under node i of a level are 2i and 2i + 1 of the
-next, whichever tree they are of. So many trees cost what one does, and a row's leaf is where its tree begins + the row.
+have the same size and are stored level by level, one tree after another: the nodes under node i of a level are nodes
+2i and 2i + 1 of the next level, in every tree. So finding a leaf takes no more additions among many trees than in one.
+The leaf of a row of tree t is t * num_leaves + row.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ Sums = NDArray[np.float64]
 
 
 class SumTrees:
-    """Trees of sums; all leaves are 0 at first.
+    """Trees of sums, whose leaves are all 0 at first.
 
     Args:
-        num_trees: How many.
-        capacity: Rows of each; the leaves are as many or more, a power of 2.
+        num_trees: The number of trees.
+        capacity: The number of rows of each; the number of leaves is the next power of 2, at least 2.
     """
 
     def __init__(self, num_trees: int, capacity: int) -> None:
@@ -36,16 +37,16 @@ class SumTrees:
 
     @property
     def leaves(self) -> Sums:
-        """Of all trees, one after another."""
+        """The leaves of all trees, one tree after another."""
         return self._levels[-1]
 
     def clear(self, tree: int) -> None:
-        """Make all leaves of a tree 0."""
+        """Set all leaves of a tree to 0."""
         for level, sums in enumerate(self._levels):
             sums[tree << level : (tree + 1) << level] = 0.0
 
     def resized(self, num_trees: int, capacity: int) -> SumTrees:
-        """More trees or larger ones, with the leaves that are there."""
+        """Return more trees or larger ones with the same leaves."""
         other = SumTrees(num_trees, capacity)
         leaves = self.leaves.reshape(-1, self.num_leaves)
         other.leaves.reshape(-1, other.num_leaves)[: len(leaves), : self.num_leaves] = leaves
@@ -55,23 +56,23 @@ class SumTrees:
         return other
 
     def set(self, leaves: Indices, values: NDArray[Any]) -> None:
-        """Set some leaves; of one that is named more than once the last value stays."""
+        """Set some leaves; a leaf that is named more than once gets its last value."""
         levels = self._levels
         levels[-1][leaves] = values
         nodes = leaves
-        # All levels, whatever the rows are, and if there are none.
+        # Every level is updated, whichever the rows are, and if there are none.
         for level in range(len(levels) - 1, 0, -1):
             below, nodes = levels[level], nodes >> 1
             left = 2 * nodes
             levels[level - 1][nodes] = below[left] + below[left + 1]
 
     def find(self, trees: Indices, heights: Sums) -> Indices:
-        """The leaves at these heights of the stack of a tree's leaves.
+        """Return the leaves that lie at these heights if a tree's leaves are stacked.
 
         Rounding may lead one step beyond the last leaf that is not 0.
 
         Args:
-            trees: Of each height its tree.
+            trees: The tree of each height.
             heights: From 0 to the tree's total.
         """
         nodes = trees

@@ -1,4 +1,4 @@
-"""Where a trial stands: what its process tells the one that drives the sweep."""
+"""What a trial's process tells the process that drives the sweep."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from analysis.records import TrialState
 
 
 class Progress(TrialState):
-    """The state of a trial as its process knows it, which is all but its failures, its node and its process's number.
+    """The state of a trial as its process knows it: everything but the number of failures, the node and the pid.
 
-    Its status is running, paused (asked to stop), completed or failed; a pack says stopped of a member that was to be
-    ended.
+    The status is running, paused (the trial was asked to stop), completed or failed; a pack uses stopped for a member
+    that it was told to end.
     """
 
-    # It is no file of another version: what has no field is a mistake.
+    # Unlike a file, it cannot be of another version: an unknown name is a mistake.
     model_config = ConfigDict(extra="forbid")
 
     evaluated: bool

@@ -1,6 +1,6 @@
-"""What becomes of a trial's record: each way in which its status, or what it is to train, changes.
+"""How a trial's record changes: every change of its status and of what it is to train is a function here.
 
-Who drives the sweep is the only one that changes records; times are Unix times, seconds.
+Only the process that drives the sweep changes records. Times are Unix times in seconds.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ _MAX_ERROR = 20_000
 
 
 def pending_record(plan: TrialPlan) -> TrialRecord:
-    """The record of a trial that has not begun."""
+    """Return the record of a trial that has not begun."""
     return TrialRecord.model_validate(dict(plan))
 
 
 def with_point(record: TrialRecord, point: dict[str, Any], hyperparams: dict[str, Any]) -> TrialRecord:
-    """A trial whose point was chosen."""
+    """Return the record after the trial's point was chosen."""
     return record.model_copy(update={"point": point, "hyperparams": hyperparams, "has_point": True})
 
 
 def with_change(record: TrialRecord, change: ChangeRecord, hyperparams: dict[str, Any]) -> TrialRecord:
-    """A trial of a population that is to go on from another one's checkpoint, with other values."""
+    """Return the record of a trial of a population that is to continue from another's checkpoint, with other values."""
     changes = (*record.changes, change)
     return record.model_copy(update={"point": change.after, "hyperparams": hyperparams, "changes": changes})
 
 
 def with_checkpoints(record: TrialRecord, checkpoints: Sequence[CheckpointRecord]) -> TrialRecord:
-    """A trial whose checkpoints are these, as far as is seen from outside of its process."""
+    """Return the record with the checkpoints that were found on disk."""
     return record.model_copy(update={"checkpoints": tuple(checkpoints)})
 
 
 def begun(record: TrialRecord, now: float) -> TrialRecord:
-    """A trial that a process took."""
+    """Return the record after a process took the trial."""
     started_at = now if record.started_at is None else record.started_at
     return record.model_copy(update={"status": "running", "started_at": started_at, "ended_at": None, "error": None})
 
 
 def told(record: TrialRecord, progress: Progress, *, node: str, pid: int) -> TrialRecord:
-    """A trial whose process told where it stands."""
+    """Return the record after the trial's process told where the trial stands."""
     state = {name: getattr(progress, name) for name in TrialState.model_fields}
     notes = (*record.notes, *(note for note in progress.notes if note not in record.notes))[-_MAX_NOTES:]
     if progress.status == "stopped":
@@ -59,12 +59,12 @@ def told(record: TrialRecord, progress: Progress, *, node: str, pid: int) -> Tri
 
 
 def paused(record: TrialRecord) -> TrialRecord:
-    """A trial that goes on later, from its latest checkpoint."""
+    """Return the record of a trial that will continue from its latest checkpoint."""
     return record.model_copy(update={"status": "paused"})
 
 
 def stopped(record: TrialRecord, now: float) -> TrialRecord:
-    """A trial that the scheduler ended."""
+    """Return the record after the scheduler ended the trial."""
     return record.model_copy(update={"status": "stopped", "stop_reason": _by_scheduler(record), "ended_at": now})
 
 
@@ -73,14 +73,14 @@ def _by_scheduler(state: TrialState) -> str:
 
 
 def failed(record: TrialRecord, error: str, now: float, *, retried: bool, reached: Reached | None) -> TrialRecord:
-    """A trial that failed, for good or to be tried again.
+    """Return the record after the trial failed, for good or to be tried again.
 
     Args:
         record: The trial.
-        error: Why; of a long one the middle is left out.
+        error: Why it failed; the middle of a long text is left out.
         now: When.
         retried: Whether it is tried again.
-        reached: How far it was; None: as far as it was known to be.
+        reached: How far it was; None: as far as the record says.
     """
     changes: dict[str, Any] = {} if reached is None else dataclasses.asdict(reached)
     changes |= {"num_failures": record.num_failures + 1, "error": fit(error, _MAX_ERROR)}
@@ -90,5 +90,5 @@ def failed(record: TrialRecord, error: str, now: float, *, retried: bool, reache
 
 
 def tried_again(record: TrialRecord) -> TrialRecord:
-    """A trial that failed for good, and is to run again after all."""
+    """Return the record of a trial that failed for good and is to run again."""
     return record.model_copy(update={"status": "pending", "error": None})
