@@ -1,4 +1,4 @@
-"""What a sweep leaves behind, as typed records; the files of a sweep folder are these as JSON.
+"""The results of a sweep as typed records, which the files of a sweep folder hold as JSON.
 
 Words: *training return* is the mean undiscounted return of the last 100 whole exploring episodes; *evaluation return*
 the mean of greedy episodes on the sweep's fixed evaluation seeds. `None` stands for "not known (yet)"; a score that is
@@ -17,9 +17,9 @@ FORMAT_VERSION = 2
 
 TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
 SweepState = Literal["created", "running", "interrupted", "completed"]
-"""`created`: written, and not begun by anybody."""
+"""`created` means written, but not begun."""
 TRIAL_ID_PATTERN = "t[0-9]{4,9}"
-"""What trials are called: part of their folders' paths."""
+"""The ids of trials, which are part of their folders' paths."""
 TrialId = Annotated[str, Field(pattern=f"^{TRIAL_ID_PATTERN}$")]
 Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Iteration = Count
@@ -27,7 +27,7 @@ FINISHED: frozenset[TrialStatus] = frozenset({"completed", "failed", "stopped"})
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """The value, or None if it is None, NaN or infinite."""
+    """Return the value, or None if it is None, NaN or infinite."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
@@ -61,7 +61,7 @@ class CheckpointRecord(_Record):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def path(self) -> str:
-        """Folder, relative to the sweep folder, with forward slashes; what a file says of it is not read."""
+        """The folder, relative to the sweep folder, with forward slashes; it is never read from a file."""
         return f"trials/{self.trial_id}/checkpoints/{self.iteration:06d}"
 
 
@@ -85,11 +85,11 @@ class IterationRecord(_Record):
 
 
 class ChangeRecord(_Record):
-    """A trial of a population that went on from a copy of another's checkpoint, with other hyperparameters."""
+    """A trial of a population that continued from a copy of another's checkpoint, with other hyperparameters."""
 
     iteration: int = Field(description="Iterations the trial itself had done.")
     num_env_steps: int = Field(description="Env steps the trial itself had done.")
-    source_trial_id: TrialId = Field(description="Whose weights and optimizer state it went on with.")
+    source_trial_id: TrialId = Field(description="The trial whose weights and optimizer state it continued with.")
     source_iteration: int = Field(description="Iteration of the copied checkpoint in that trial.")
     before: dict[str, Any] = Field(description="The trial's searched values until then.")
     after: dict[str, Any] = Field(description="Its searched values from then on.")
@@ -97,7 +97,7 @@ class ChangeRecord(_Record):
 
 
 class TrialPlan(_Record):
-    """What is known of a trial before it begins: its point, its seed and its place in the sweep."""
+    """What is known about a trial before it begins: its point, its seed and its place in the sweep."""
 
     trial_id: TrialId
     index: int
@@ -116,7 +116,7 @@ class TrialPlan(_Record):
 
 
 class TrialState(_Record):
-    """What becomes of a trial. Its process tells it; failures are counted by who drives the sweep."""
+    """The state of a trial, which its process reports; the process that drives the sweep counts the failures."""
 
     status: TrialStatus = "pending"
     stop_reason: str | None = Field(None, description="The stop rule, cap or scheduler that ended it.")
@@ -130,7 +130,7 @@ class TrialState(_Record):
     evaluation_return: float | None = Field(None, description="The newest evaluation.")
     best_evaluation_return: float | None = None
     best_iteration: int | None = None
-    notes: tuple[str, ...] = Field((), description="What of it was damaged, and what it went on from instead.")
+    notes: tuple[str, ...] = Field((), description="What was damaged in it, and what it continued from instead.")
     node: str | None = Field(None, description="Address or name of the node it last ran on.")
     pid: int | None = Field(None, description="Process it last ran in.")
     started_at: float | None = Field(None, description="Unix time, seconds.")
@@ -147,14 +147,14 @@ class TrialRecord(TrialState, TrialPlan):
     """One training run: trial.json. The fields of a plan come first there, then those of the state."""
 
     def point_at(self, iteration: int) -> dict[str, Any]:
-        """The searched values the trial had in an iteration; they change only in a population."""
-        # A change after iteration i acts from i + 1 on.
+        """Return the searched values that the trial had in an iteration; they change only in a population."""
+        # A change after iteration i takes effect from i + 1 on.
         later = [change for change in self.changes if change.iteration >= iteration]
         return later[0].before if later else self.point
 
     @property
     def first_hyperparams(self) -> dict[str, Any]:
-        """All values the trial began with."""
+        """All hyperparameters that the trial began with."""
         return {**self.hyperparams, **self.changes[0].before} if self.changes else self.hyperparams
 
 
@@ -204,12 +204,12 @@ class BestRecord(_Record):
 
     @property
     def optimism_gap(self) -> float:
-        """Selection score minus confirmation mean: what choosing the maximum flattered it by."""
+        """Selection score minus confirmation mean: how much choosing the maximum raised the score."""
         return self.selection_score - self.confirmation.mean_return
 
 
 class SweepRecord(_Record):
-    """sweep.json."""
+    """The record of a sweep: sweep.json."""
 
     format_version: int = FORMAT_VERSION
     name: str
@@ -225,4 +225,4 @@ class SweepRecord(_Record):
     versions: dict[str, str] = Field(default_factory=dict)
     git_commit: str | None = None
     address: str | None = None
-    allowed_modules: tuple[str, ...] = Field((), description="Of the user's own, which its trials may import.")
+    allowed_modules: tuple[str, ...] = Field((), description="Modules of the user's own that its trials may import.")

@@ -26,7 +26,7 @@ _WANTED = {
     "float_parsing": "a number",
     "finite_number": "a finite number",
     "string_type": "a text",
-    "string_too_short": "no empty text",
+    "string_too_short": "a text that is not empty",
     "tuple_type": "a list",
     "list_type": "a list",
     "dict_type": "a mapping of names to values",

@@ -155,7 +155,7 @@ def _as_json(env_id: str, env_args: Mapping[str, Any] | None) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise EnvError(
             f"The arguments of {env_id!r} cannot be written to a sweep file: {error}.",
-            "Give numbers, strings, true, false, lists and mappings with strings as keys.",
+            "Give numbers, texts, true, false, lists and mappings with texts as keys.",
         ) from error
     return args
 

@@ -200,7 +200,7 @@ BAD_INPUT: dict[str, tuple[dict[str, Any], int, list[str]]] = {
     "no file": ({"spec": "nothing.yaml"}, 2, ["'nothing.yaml'", "cartpole-ppo"]),
     "no yaml": ({"text": "env: [\n"}, 2, ["sweep.yaml, line 2"]),
     "bad name": ({"more": ["--name", "a/b"]}, 2, ["'a/b'"]),
-    "bad --set": ({"set": "oops"}, 2, ["--set oops: this is no assignment"]),
+    "bad --set": ({"set": "oops"}, 2, ["--set oops: this is not an assignment"]),
     "too many CPUs": ({"set": "resources.num_env_runners=1000"}, 5, ["1,001 CPUs", "this machine has"]),
     "contradiction": (
         {"set": "hyperparams.minibatch_size=4096"},

@@ -37,7 +37,7 @@ def test_a_driver_that_outlived_its_client_keeps_others_away(store: SweepStore) 
     """A client that was killed has lost the sweep's lock; its driver on the cluster runs a little longer."""
     with store.driver_lock():
         assert not (store.folder / ".lock").exists()
-        with pytest.raises(CannotRunError, match="still being run on a cluster"), store.lock():
+        with pytest.raises(CannotRunError, match="A cluster still runs sweep"), store.lock():
             pass
         assert store.is_driven()
     # The client holds one, its driver the other.

@@ -53,7 +53,7 @@ BAD_FILES = {
     "empty": (lambda data: data.update(files={}), "policy.json"),
     "no policy": (lambda data: data["files"].pop("policy.json"), "policy.json"),
     "no weights": (lambda data: data["files"].pop("policy.safetensors"), "policy.safetensors"),
-    "no engine": (lambda data: data["files"].pop("engine.json"), "engine.json|nothing that training"),
+    "no engine": (lambda data: data["files"].pop("engine.json"), "engine.json|no state from which training"),
     "one too many": (lambda data: data["files"].update(more=ENTRY), "lacks the file more"),
     "no hash": (lambda data: data["files"]["policy.json"].pop("sha256"), "files.policy.json"),
     "a number as hash": (lambda data: data["files"]["policy.json"].update(sha256=1), "files.policy.json"),
@@ -61,7 +61,7 @@ BAD_FILES = {
     "a truth as size": (lambda data: data["files"]["policy.json"].update(bytes=True), "files.policy.json"),
     "an entry of another type": (lambda data: data["files"].update({"policy.json": 7}), "files.policy.json is 7"),
     **{
-        f"the name {name!r}": (lambda data, name=name: data["files"].update({name: ENTRY}), "no file in the folder")
+        f"the name {name!r}": (lambda data, name=name: data["files"].update({name: ENTRY}), "not a file in the folder")
         for name in ("../x", "/etc/passwd", "a/../../x", "", ".", "./policy.json", "a//b", "nul\0", "a/")
     },
 }

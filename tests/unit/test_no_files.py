@@ -210,8 +210,8 @@ def test_results_that_are_far_too_large_cost_the_others_nothing(folder: Path, ca
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ('{"name": "mine", "name": "yours"}', "'name' is there twice"),
-        ('{"spec": {"seed": 1, "seed": 2}}', "'seed' is there twice"),
+        ('{"name": "mine", "name": "yours"}', "'name' occurs twice"),
+        ('{"spec": {"seed": 1, "seed": 2}}', "'seed' occurs twice"),
         ('{"created_at": NaN}', "NaN is no JSON"),
         ('{"created_at": -Infinity}', "-Infinity is no JSON"),
     ],

@@ -28,7 +28,7 @@ def test_who_takes_it_has_a_larger_epoch_and_who_had_it_has_lost_it(path: Path) 
     second = Owner.take(path)
     assert epoch(path) == 2
     assert (first.is_current(), second.is_current()) == (False, True)
-    with pytest.raises(OwnershipLostError, match="taken up by another process"), first.held():
+    with pytest.raises(OwnershipLostError, match="taken over by another process"), first.held():
         pytest.fail("entered")
     with pytest.raises(OwnershipLostError):
         first.check()

@@ -48,7 +48,7 @@ def test_what_can_be_packed_is_packed() -> None:
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"scheduler": "pbt"}, "scheduler.type is pbt, whose trials go on from copies of each other"),
+        ({"scheduler": "pbt"}, "scheduler.type is pbt, whose trials continue from copies of each other"),
         ({"scheduler": "hyperband"}, "scheduler.type is hyperband, which pauses trials until others have come as far"),
         ({"resources": {"num_env_runners": 1}}, "resources.num_env_runners is 1, and packs have no env runners"),
         (IMAGES, "env.pixels is true, and packs have no convolutions"),

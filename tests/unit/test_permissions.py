@@ -47,9 +47,9 @@ def test_a_sweep_that_may_not_be_looked_at_does_not_hide_the_others(
 ) -> None:
     closed(storage / "other")
     assert [status.sweep.name for status in sweeps.list_sweeps(storage)] == ["mine"]
-    assert f"{storage}/other/sweep.json cannot be looked at: Permission denied" in caplog.text
+    assert f"{storage}/other/sweep.json cannot be read: Permission denied" in caplog.text
     assert sweeps.status("mine", storage=storage).counts == {"completed": 4}
-    with pytest.raises(CheckpointError, match=r"other/sweep.json cannot be looked at: Permission denied"):
+    with pytest.raises(CheckpointError, match=r"other/sweep.json cannot be read: Permission denied"):
         sweeps.status("other", storage=storage)
 
 
@@ -58,11 +58,11 @@ def test_a_part_of_a_sweep_that_may_not_be_looked_at_is_named(
     storage: Path, closed: Callable[..., Any], part: str
 ) -> None:
     closed(storage / "mine" / Path(part))
-    with pytest.raises(CheckpointError, match=f"mine/{part}.* cannot be looked at: Permission denied"):
+    with pytest.raises(CheckpointError, match=f"mine/{part}.* cannot be read: Permission denied"):
         sweeps.trials("mine", storage=storage)
 
 
 def test_a_storage_folder_that_may_not_be_looked_into_is_named(storage: Path, closed: Callable[..., Any]) -> None:
     closed(storage)
-    with pytest.raises(CheckpointError, match=f"{storage} cannot be looked at: Permission denied"):
+    with pytest.raises(CheckpointError, match=f"{storage} cannot be read: Permission denied"):
         sweeps.list_sweeps(storage)

@@ -76,7 +76,7 @@ def test_a_manifest_of_another_checkpoint_is_refused(sweep: Path, precious: Path
     ["../../precious", "..", "", "t1", "t0000/../t0000", "t\u0660\u0660\u0660\u0660", "t0000\n", "t" + "0" * 300],
 )
 def test_a_trial_is_called_by_its_number_alone(sweep: Path, precious: Path, name: str) -> None:
-    with pytest.raises(NotFoundError, match="no trial's id"):
+    with pytest.raises(NotFoundError, match="is not a trial's id"):
         SweepStore(sweep).trial(name)
     with pytest.raises(ValueError, match="trial_id"):
         TrialRecord(trial_id=name, index=0, point_index=0, seed=1, point={})
@@ -89,7 +89,7 @@ def test_the_record_in_a_trials_folder_is_that_trials(sweep: Path) -> None:
     store.trial("t0000").write_record(TrialRecord(trial_id="t0000", index=0, point_index=0, seed=1, point={}))
     assert [record.trial_id for record in store.read_trials()] == ["t0000"]
     edit(store.trial("t0000").record_path, trial_id="t0001")
-    with pytest.raises(CheckpointError, match="lies in the folder of t0000"):
+    with pytest.raises(CheckpointError, match="is in the folder of t0000"):
         store.read_trials()
 
 

@@ -84,7 +84,7 @@ def test_a_sweep_of_numpy_values_is_the_same_as_one_of_python_values(tmp_path: P
         (float("nan"), "nan is not a finite number"),
         (np.float32("inf"), "inf is not a finite number"),
         pytest.param(10**5000, "more than 40 digits", id="digits"),
-        ({(1, 2): 3}, "has the key (1, 2), which is no text"),
+        ({(1, 2): 3}, "has the key (1, 2), which is not a text"),
         ("a\ud800", r"has '\ud800', which is half a character"),
         ({"\udcff": 1}, r"has '\udcff', which is half a character"),
         (np.zeros(MAX_VALUES + 1), "more than 50,000 values"),

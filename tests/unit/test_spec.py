@@ -263,7 +263,7 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path: Path, monkeypatch: pyte
         ),
         (
             {"space": {"lr": {"grid": [1e-3]}}, "hyperparams": {"lr": 0.1}},
-            ["hyperparams.lr: is fixed at 0.1 and"],
+            ["hyperparams.lr: is fixed at 0.1 but also searched in space.lr"],
         ),
         ({"env": "x", "hyperparams": {"lr": object()}}, ["JSON"]),
     ],
@@ -302,7 +302,7 @@ def test_whole_values_of_a_quantised_float_range_are_accepted() -> None:
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("env: a\nenv: b\n", "sweep.yaml, line 2, column 1: the key 'env' stands twice"),
+        ("env: a\nenv: b\n", "sweep.yaml, line 2, column 1: the key 'env' occurs twice"),
         (
             "env: a\nspace:\n  lr: {grid: [1]}\n  lr: {grid: [2]}\n",
             "sweep.yaml, line 4, column 3: the key 'lr'",
@@ -329,7 +329,7 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="can't be read"):
         load_spec(path)
     path.write_bytes("env: CartPole-v1\nname: caf\u00e9\n".encode("latin-1"))
-    with pytest.raises(SpecError, match="can't be read: line 2 is no UTF-8, from byte 0xe9 on") as caught:
+    with pytest.raises(SpecError, match="can't be read: line 2 is not UTF-8, from byte 0xe9 on") as caught:
         load_spec(path)
     assert "UTF-8" in caught.value.hint
 

@@ -54,7 +54,7 @@ def test_an_empty_field_is_only_a_default_if_there_is_one() -> None:
 
 
 def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed() -> None:
-    assert "is fixed at 0.001 and searched" in errors(
+    assert "is fixed at 0.001 but also searched" in errors(
         space={"lr": {"uniform": [1e-4, 1e-2]}}, overrides=["hyperparams.lr=1e-3"]
     )
     spec = load_spec("cartpole-ppo", ["space.lr=", "hyperparams.lr=1e-3"])
@@ -65,9 +65,9 @@ def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed() 
 @pytest.mark.parametrize(
     ("override", "part"),
     [
-        ("stop", "--set stop: this is no assignment"),
-        ("=3", "this is no assignment"),
-        ("stop..x=3", "this is no assignment"),
+        ("stop", "--set stop: this is not an assignment"),
+        ("=3", "this is not an assignment"),
+        ("stop..x=3", "this is not an assignment"),
         ("num_samples.x=3", "num_samples is 5, which has no fields"),
         ("stop.num_env_step=3", "stop.num_env_step: there is no field 'num_env_step' here."),
         ("stop.num_env_steps=-3", "stop.num_env_steps: -3 is not allowed"),

@@ -98,7 +98,7 @@ def test_a_spec_that_was_changed_in_the_sweeps_record_is_told_in_its_words(
 
 
 @pytest.mark.parametrize(
-    ("space", "why"), [({}, "it has no space"), ({"lr": {"grid": [0.1, 0.2]}}, "its space has grids alone")]
+    ("space", "why"), [({}, "it has no space"), ({"lr": {"grid": [0.1, 0.2]}}, "its space has only grids")]
 )
 def test_a_sweep_of_the_same_points_again_is_not_extended(
     tmp_path: Path, space: dict[str, dict[str, list[float]]], why: str

@@ -29,7 +29,7 @@ def test_one_process_at_a_time_drives_a_sweep(sweep: Sweep, another: Reopen) -> 
     with another().driver_lock():
         assert sweep.is_driven()
         for held in (sweep.lock, sweep.driver_lock):
-            with pytest.raises(CannotRunError, match="still being run"), held():
+            with pytest.raises(CannotRunError, match="A cluster still runs"), held():
                 pass
     with sweep.lock(), another().driver_lock():
         pass

@@ -33,8 +33,8 @@ def refused(text: str, label: str = "x.yaml") -> str:
     [
         ("a: 1\n---\na: 2\n", "line 2, column 1: expected a single document in the stream, but found another document"),
         ("a: &x 1\nb: &x 2\n", "line 2, column 4: found duplicate anchor 'x'; first occurrence, second occurrence"),
-        ("a:\n\tb: 1\n", "line 2, column 1: a tab stands where YAML takes spaces alone"),
-        ("a: 1\t\nb: 2\n", "line 1, column 5: a tab stands where YAML takes spaces alone"),
+        ("a:\n\tb: 1\n", "line 2, column 1: there is a tab where YAML takes only spaces"),
+        ("a: 1\t\nb: 2\n", "line 1, column 5: there is a tab where YAML takes only spaces"),
         ("a: 1\nb: \x07\n", r"line 2: the character '\x07' is not allowed in YAML"),
         ("a: 1\nb: \udcff\n", r"line 2: the character '\udcff' is not allowed in YAML"),
     ],
@@ -94,7 +94,7 @@ def test_infinity_is_read_as_yaml_writes_it(text: str, value: float) -> None:
         ("!!binary aGk=", ["the tag !!binary"]),
         ("!!set {a, b}", ["the tag !!set"]),
         ("!mine 3", ["the tag !mine"]),
-        ("{[a]: 3}", ["a list or a mapping stands as a key"]),
+        ("{[a]: 3}", ["a list or a mapping is used as a key"]),
     ],
 )
 def test_what_has_two_meanings_or_none_is_refused_with_both_and_its_place(text: str, parts: list[str]) -> None:
@@ -119,8 +119,8 @@ def test_a_merged_mapping_gives_way_to_what_is_written() -> None:
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("a: &a {x: 1}\nb: {<<: *a, <<: *a}", "x.yaml, line 2, column 13: the key '<<' stands twice (several"),
-        ("{a: 1, 'a': 2}", "the key 'a' stands twice"),
+        ("a: &a {x: 1}\nb: {<<: *a, <<: *a}", "x.yaml, line 2, column 13: the key '<<' occurs twice (several"),
+        ("{a: 1, 'a': 2}", "the key 'a' occurs twice"),
         ("<<: 3", "expected a mapping or list of mappings for merging, but found scalar"),
         ("<<: [3]", "expected a mapping for merging, but found scalar"),
         ("a: 1\n---\na: 2", "x.yaml, line 2"),
@@ -150,7 +150,7 @@ def test_what_is_no_yaml_is_told_so(text: str) -> None:
         ("- " * 20_000, ["is nested 65 deep; at most 64"]),
         (
             "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}]\n" for i in range(1, 200)),
-            ["levels, one in the other; at most 64"],
+            ["nested levels; at most 64"],
         ),
         ("x: [" + "1," * 100_001 + "]", ["has more than 100,000 values and keys"]),
         ("x: " + "y" * MAX_CHARACTERS, ["has 262,147 characters; at most 262,144"]),

@@ -133,7 +133,7 @@ def test_who_lost_the_trial_writes_nothing_any_more(tmp_path: Path) -> None:
         return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
     before = everything()
-    with pytest.raises(OwnershipLostError, match="taken up by another process"):
+    with pytest.raises(OwnershipLostError, match="taken over by another process"):
         old.loop.advance(math.inf)
     with pytest.raises(OwnershipLostError):
         old.loop.pause()

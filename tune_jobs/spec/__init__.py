@@ -1,1 +1,1 @@
-"""The sweep file as a typed model."""
+"""The sweep file: its typed model, its rules, and how it is read."""

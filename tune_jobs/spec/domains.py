@@ -26,22 +26,21 @@ from policies.suggestions import did_you_mean
 
 
 def _refuse_coercion(value: Any) -> Any:
-    # Pydantic would read true as 1 and "5" as 5: a quoted or misspelt value is better refused than guessed
-    # at.
+    # Pydantic would read true as 1 and "5" as 5, but a quoted or misspelt value is better refused than guessed.
     if isinstance(value, bool | str):
         raise ValueError(f"{value!r} is not a number")  # noqa: TRY004 - pydantic reports ValueErrors only
     return value
 
 
 Number = Annotated[float, BeforeValidator(_refuse_coercion), Field(allow_inf_nan=False)]
-"""A finite float; texts and true/false are refused."""
+"""A finite float; strings and true/false are refused."""
 
 WholeNumber = Annotated[int, BeforeValidator(_refuse_coercion)]
-"""An int, or a float without a fraction such as 1e5; texts and true/false are refused."""
+"""An int, or a float without a fraction such as 1e5; strings and true/false are refused."""
 
 
 class _Domain(BaseModel, ABC):
-    """Values of one hyperparameter; the one field of a subclass has the name of its kind."""
+    """The values of one hyperparameter; the only field of a subclass has the name of its kind."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -55,9 +54,9 @@ class _Domain(BaseModel, ABC):
 
     @abstractmethod
     def probes(self) -> list[tuple[int | None, Any]]:
-        """Values to validate, each with its index in the sweep file (None: no value of its own there).
+        """Return values to validate, each with its index in the sweep file (None: it is not listed there).
 
-        If the hyperparameter accepts all of these, it accepts whatever the domain can give.
+        If the hyperparameter accepts all of these, it accepts every value of the domain.
         """
 
 
@@ -76,7 +75,7 @@ class Listed(_Domain):
             raise ValueError("is empty: list at least one value, or take it out of the space")
         seen: list[str] = []
         for value in self.values:
-            # The type counts, as 1 == True == 1.0 in Python; so does an inner list, which can't be hashed.
+            # Values of different types differ, though 1 == True == 1.0 in Python; inner lists are compared as text.
             key = repr(value)
             if key in seen:
                 raise ValueError(
@@ -86,10 +85,10 @@ class Listed(_Domain):
         return self
 
     def index_of(self, value: Any) -> int:
-        """Place of a value in the list; the type counts, a tuple is a list.
+        """Return the index of a value in the list; types have to be equal, but a tuple equals a list.
 
         Raises:
-            ValueError: It isn't in the list.
+            ValueError: The value isn't in the list.
         """
         return [json.dumps(known) for known in self.values].index(json.dumps(value))
 
@@ -111,7 +110,7 @@ class Grid(Listed):
 
 
 class Choice(Listed):
-    """One of the values, each as likely as the others."""
+    """One of the values, all equally likely."""
 
     kind: ClassVar[str] = "choice"
     choice: tuple[Any, ...] = Field(description="Values to draw from, each as likely as the others.")
@@ -122,29 +121,29 @@ class Choice(Listed):
 
 
 class Range(_Domain):
-    """A domain between two ends, perhaps on a log scale, perhaps of multiples of a step q."""
+    """A domain between two ends, possibly on a log scale, possibly of multiples of a step q."""
 
     is_log: ClassVar[bool] = False
 
     @property
     def low(self) -> float:
-        """Lower end, included."""
+        """The lower end, which is included."""
         return float(getattr(self, self.kind)[0])
 
     @property
     def high(self) -> float:
-        """Upper end as in the sweep file."""
+        """The upper end as in the sweep file."""
         return float(getattr(self, self.kind)[1])
 
     @property
     def q(self) -> float | None:
-        """Step of a quantised domain, else None."""
+        """The step of a quantised domain, else None."""
         ends = getattr(self, self.kind)
         return float(ends[2]) if len(ends) == 3 else None
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Least and greatest value that can be drawn."""
+        """The least and the greatest value that can be drawn."""
         if self.q is not None:
             first, last = self.factors
             return _multiple(first, self.q), _multiple(last, self.q)
@@ -152,7 +151,7 @@ class Range(_Domain):
 
     @property
     def factors(self) -> tuple[int, int]:
-        """First and last multiple of q that can be drawn, as factors of q (of 1 where there is no q)."""
+        """The first and the last multiple of q that can be drawn, as factors of q (of 1 if there is no q)."""
         q = self.q or 1.0
         first, last = _index(self.low, q, up=True), _index(self.high, q, up=False)
         # As in ray.tune: upper ends of whole ranges are included, except that a step of 1 changes nothing.
@@ -167,7 +166,7 @@ class Range(_Domain):
             raise ValueError(f"goes from {low!r} to {high!r}: the first number must be less than the second")
         if self.is_log and low <= 0:
             raise ValueError(f"starts at {low!r}: a log scale needs a start greater than 0")
-        # Beyond these, what is drawn is not what was asked for, or an error of NumPy's.
+        # Beyond these limits, NumPy would draw wrong values or raise an error.
         if self.is_whole and max(-low, high) >= 2**63:
             raise ValueError(f"goes from {low!r} to {high!r}: whole numbers are drawn below 2**63")
         if not math.isfinite(high - low) or (self.q is not None and max(-low, high) > 2.0**53 * self.q):
@@ -183,17 +182,17 @@ class Range(_Domain):
         low, high = self.bounds
         if self.is_whole:
             return [(0, int(low)), (1, int(high))]
-        # The ends alone don't tell whether a hyperparameter that is a whole number could be given a fraction.
+        # The ends alone don't show whether a hyperparameter that has to be a whole number could get a fraction.
         fraction = None if self.q is not None and self.q.is_integer() else low + (high - low) / math.pi
         inside = [] if fraction is None else [(None, fraction)]
         return [(0, low), (1, high), *inside]
 
     def at_factor(self, factor: int) -> Any:
-        """The value that is so many times q: int in a whole range, else float."""
+        """Return `factor` times q: an int in a range of whole numbers, else a float."""
         return factor * int(self.q or 1) if self.is_whole else _multiple(factor, self.q or 1.0)
 
     def sample(self, rng: np.random.Generator) -> Any:
-        """Draw one value: int from a whole range, else float."""
+        """Draw one value: an int from a range of whole numbers, else a float."""
         if self.is_whole:
             first, last = self.factors
             return self.at_factor(_draw_whole(rng, first, last, log=self.is_log))
@@ -243,7 +242,7 @@ class RandInt(Range):
 
 
 class LogRandInt(Range):
-    """As randint, on a log scale."""
+    """The same as randint, on a log scale."""
 
     kind: ClassVar[str] = "lograndint"
     is_whole: ClassVar[bool] = True
@@ -252,7 +251,7 @@ class LogRandInt(Range):
 
 
 class QRandInt(Range):
-    """A whole multiple of q between the ends, both included (with q = 1: as randint)."""
+    """A whole multiple of q between the ends, both included (with q = 1, the same as randint)."""
 
     kind: ClassVar[str] = "qrandint"
     is_whole: ClassVar[bool] = True
@@ -262,7 +261,7 @@ class QRandInt(Range):
 
 
 class QLogRandInt(Range):
-    """As qrandint, on a log scale."""
+    """The same as qrandint, on a log scale."""
 
     kind: ClassVar[str] = "qlograndint"
     is_whole: ClassVar[bool] = True
@@ -288,7 +287,7 @@ def _kind_of(value: Any) -> str | None:
 
 
 def _check_shape(value: Any) -> Any:
-    """Refuse what is no domain at all with a message that shows how to write one."""
+    """Refuse a value that is not a domain, with a message that shows how to write one."""
     if isinstance(value, _Domain):
         return value
     if isinstance(value, list | tuple):
@@ -327,7 +326,7 @@ Domain = Annotated[
 
 
 def num_points(space: Mapping[str, Domain], num_samples: int) -> int:
-    """How many points `draw_points` gives."""
+    """Return how many points `draw_points` returns."""
     return num_samples * math.prod(len(domain.values) for domain in space.values() if isinstance(domain, Grid))
 
 
@@ -339,7 +338,7 @@ def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) 
 
     Args:
         space: Domains by hyperparameter. Their order is the order of the grid (the last one varies fastest).
-        num_samples: How often the grid is gone through, each time with new random values.
+        num_samples: How often the whole grid is repeated, each time with new random values.
         sweep_seed: Seed of the sweep, at least 0.
 
     Returns:
@@ -356,11 +355,11 @@ def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) 
 def draw_point(
     space: Mapping[str, Domain], index: int, sweep_seed: int, given: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Draw point `index` alone; grids are drawn from like choices.
+    """Draw only point `index`; values of grids are drawn like those of choices.
 
     Args:
         space: Domains by hyperparameter.
-        index: Of the point.
+        index: The index of the point.
         sweep_seed: Seed of the sweep, at least 0.
         given: Values that are not drawn.
     """
@@ -370,7 +369,7 @@ def draw_point(
 
 
 def _index(end: float, q: float, *, up: bool) -> int:
-    """An end as a factor of q, rounded into the range; 0.3 is 3 times 0.1, not a little less."""
+    """Return an end as a factor of q, rounded into the range; 0.3 counts as exactly 3 times 0.1."""
     factor = end / q
     if math.isclose(factor, round(factor)):
         return round(factor)
@@ -378,7 +377,7 @@ def _index(end: float, q: float, *, up: bool) -> int:
 
 
 def _multiple(factor: int, q: float) -> float:
-    """`factor * q` without the binary dust of 3 * 0.1."""
+    """Return `factor * q` without binary rounding errors such as that of 3 * 0.1."""
     return float(Decimal(repr(q)) * factor)
 
 

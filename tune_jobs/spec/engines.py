@@ -1,10 +1,10 @@
-"""The engines: what each can train, why it can't train the rest, and where its code is.
+"""The table of engines: what each can train, why it can't train the rest, and where its code is.
 
-The one table of them. A further engine is one more entry and the module that the entry names; everything else, the
-fields of the sweep file, the plan, the processes of trials and packs, checkpoints and `restore`, goes by the table.
+A new engine needs one more entry and the module that the entry names. Everything else uses the table: the fields of the
+sweep file, the plan, the processes of trials and packs, checkpoints and `restore`.
 
-Code is named by text and loaded by `tune_jobs.training.registry` where it is needed: the table itself is looked at by
-whoever reads a sweep file, and loads neither ray nor torch.
+Code is named by strings and loaded by `tune_jobs.training.registry` where it is needed, because the table is also used
+to read sweep files, which loads neither ray nor torch.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from policies.errors import CheckpointError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, RandomHyperparams
 
 Need = Literal["rl_module", "convolutions", "env_runners", "copies", "pauses", "unseeded"]
-"""What a sweep or a trial may need of its engine: an RLModule of the user's own; convolutions; env runners in processes
-of their own; to go on from copies of other trials' checkpoints; to be paused until others have come as far; an
-environment whose episodes don't follow from its seeds."""
+"""What a sweep or a trial may need from its engine: an RLModule of the user's own; convolutions; env runners in
+processes of their own; to continue from copies of other trials' checkpoints; to be paused until others have reached the
+same env steps; an environment whose episodes don't follow from its seeds."""
 
 
 @dataclass(frozen=True)
@@ -27,38 +27,38 @@ class Engine:
     """One engine: an entry of the table."""
 
     name: str
-    """In sweep files, in records of trials and in manifests of checkpoints."""
+    """The name in sweep files, in records of trials and in manifests of checkpoints."""
     title: str
     """The subject of "... trains them all" in messages."""
     trained: str
-    """What messages call a trial of it: "t0001 is not ..."."""
+    """The words for a trial of this engine in messages: "t0001 is not ..."."""
     about: str
-    """A line for the sweep file's schema."""
+    """A description in one line, for the sweep file's schema."""
     algorithms: frozenset[str]
-    """Those that it trains at all."""
+    """The algorithms that it can train."""
     constructor: str
-    """`module:Class` of a `TrainingEngine`, made without arguments, or of a `PackEngine`."""
+    """`module:Class` of a `TrainingEngine`, which is made without arguments, or of a `PackEngine`."""
     restore: str | None = None
-    """`module:function`, checkpoint folder -> RLlib `Algorithm` that trains on from it; None: there is none."""
+    """`module:function` that turns a checkpoint folder into an RLlib `Algorithm`; None: that is not possible."""
     trains_many: bool = False
     """Whether it is a `PackEngine`."""
     lacks: Mapping[Need, str] = field(default_factory=dict)
-    """What it cannot give a trial, and why not, as the end of a sentence that begins with the setting that needs it; it
-    is empty where that beginning says all."""
+    """The needs that it does not fulfil, each with the reason: the end of a sentence that begins with the setting that
+    needs it, or empty if that beginning is enough."""
     can_be_asked_for: bool = True
     """Whether the sweep file's `engine` may name it."""
     gives_way: bool = False
-    """Whether a sweep that names it though it does not train the algorithm is no error, but trained by another."""
+    """Whether another engine is used, without an error, if a sweep names this one but it cannot train the algorithm."""
     old_state: str | None = None
-    """A file or folder that tells its checkpoints, where a manifest is from before manifests named engines; None: there
-    were none then."""
+    """A file or folder by which its checkpoints are recognised if their manifests are too old to name engines; None:
+    there are no such checkpoints."""
 
     def why_not(self, need: Need, setting: str) -> str | None:
-        """Why it cannot train what has a need, as a sentence without its full stop, or None if it can.
+        """Return why it does not fulfil a need, as a sentence without its full stop, or None if it does.
 
         Args:
-            need: What is needed.
-            setting: What needs it, as "rl_module is nets:Net": the sentence begins so.
+            need: The need.
+            setting: The setting that needs it, as the beginning of a sentence: "rl_module is nets:Net".
         """
         if need not in self.lacks:
             return None
@@ -83,7 +83,7 @@ ENGINES: tuple[Engine, ...] = (
             "rl_module": "and packs have no networks but their own",
             "convolutions": "and packs have no convolutions",
             "env_runners": "and packs have no env runners",
-            "copies": "whose trials go on from copies of each other",
+            "copies": "whose trials continue from copies of each other",
             "pauses": "which pauses trials until others have come as far",
             "unseeded": "",
         },
@@ -97,7 +97,7 @@ ENGINES: tuple[Engine, ...] = (
         algorithms=_LEARNING,
         constructor="tune_jobs.training.rllib:RLlibEngine",
         restore="tune_jobs.training.rllib:algorithm_from_checkpoint",
-        # It is asked for as "not packed", which baselines never are.
+        # A sweep that names this engine asks for trials that are not packed, which is always so for baselines.
         gives_way=True,
         old_state="rllib",
     ),
@@ -112,23 +112,23 @@ ENGINES: tuple[Engine, ...] = (
         old_state="baseline.json",
     ),
 )
-"""In the order in which a trial is offered to them. The last one that trains an algorithm takes what no other can."""
+"""The engines, in the order in which they are tried. The last one for an algorithm can train what no other can."""
 
 
 def find_engine(name: str) -> Engine | None:
-    """The engine of a name, or None."""
+    """Return the engine of a name, or None if there is none."""
     return next((engine for engine in ENGINES if engine.name == name), None)
 
 
 def engine_named(name: str, where: str = "A record") -> Engine:
-    """The engine of a name that was read from a file.
+    """Return the engine of a name that was read from a file.
 
     Args:
-        name: Its name.
-        where: What the file is called in the message.
+        name: The engine's name.
+        where: The file's name for the message.
 
     Raises:
-        CheckpointError: There is none of this name.
+        CheckpointError: There is no engine of this name.
     """
     engine = find_engine(name)
     if engine is None:
@@ -141,16 +141,16 @@ def engine_named(name: str, where: str = "A record") -> Engine:
 
 
 def engines_for(algorithm: str) -> tuple[Engine, ...]:
-    """Those that train an algorithm, in the order in which trials are offered to them."""
+    """Return the engines that can train an algorithm, in the order in which they are tried."""
     return tuple(engine for engine in ENGINES if algorithm in engine.algorithms)
 
 
 def engine_on_record(name: str, algorithm: str) -> Engine:
-    """The engine that goes on with a trial whose record names one.
+    """Return the engine that continues a trial, by its record.
 
     Args:
-        name: As the record says; one of before engines were named reads as rllib, whatever the algorithm is.
-        algorithm: Of the trial.
+        name: The engine's name in the record; old records without one read as rllib for every algorithm.
+        algorithm: The trial's algorithm.
 
     Raises:
         CheckpointError: There is no such engine.

@@ -1,4 +1,4 @@
-"""Reading a sweep file: YAML, presets, `--set`, and all that is wrong with them in one message."""
+"""Read sweep files: YAML, presets and `--set`, with all their problems in one message."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.yaml import parse_yaml
 from tune_jobs.store.names import SWEEP_RECORD
 
-# What the characters that are read may take up at most, at 4 bytes each.
+# The most bytes of a file, for the most characters that are read, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
 _SECTIONS_OF_TEXT = {"about": "title", "env": "id", "scheduler": "type", "search": "type"}
-"""Sections that may be written as one text, and the field that it stands for."""
+"""Sections that may be written as one string, and the field that it stands for."""
 
 
 class Preset(NamedTuple):
-    """A sweep file that ships with the package; all but name and text stand under its key `about`."""
+    """A sweep file that ships with the package; all but name and text are under its key `about`."""
 
     name: str
     title: str
@@ -51,26 +51,26 @@ class Preset(NamedTuple):
 
 
 def list_presets() -> list[Preset]:
-    """The presets, by name."""
+    """Return the presets, by name."""
     return [read_preset(name, file.read_text(encoding="utf-8")) for name, file in _preset_files().items()]
 
 
 def read_preset(name: str, text: str) -> Preset:
-    """A preset from its file's text; what `about` leaves out is empty.
+    """Read a preset from its file's text; fields that `about` leaves out are empty.
 
     Args:
-        name: The file's name without its ending.
-        text: The file.
+        name: The file's name without its suffix.
+        text: The content of the file.
     """
     about = AboutSpec.model_validate((parse_yaml(text, f"preset {name}") or {}).get("about", {}))
     return Preset(name=name, **about.model_dump(), text=text)
 
 
 def find_preset(name: str) -> Preset:
-    """The preset of a name.
+    """Return the preset of a name.
 
     Raises:
-        SpecError: There is none; the message names the nearest.
+        SpecError: There is no such preset; the message names the nearest.
     """
     files = _preset_files()
     if name not in files:
@@ -82,7 +82,7 @@ def find_preset(name: str) -> Preset:
 
 
 def _preset_files() -> dict[str, Traversable]:
-    """The presets' files by their names, in order; reading all of them as YAML takes longer than to plan one."""
+    """Return the presets' files by name, in order, without reading them, which takes longer than planning one."""
     files = resources.files("tune_jobs.spec").joinpath("presets").iterdir()
     presets = {file.name.removesuffix(".yaml"): file for file in files if file.name.endswith(".yaml")}
     return dict(sorted(presets.items()))
@@ -101,7 +101,8 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
         The sweep, valid by itself.
 
     Raises:
-        SpecError: No such file or preset, no YAML, or a wrong sweep; the message lists every problem.
+        SpecError: There is no such file or preset, it is not YAML, or the sweep is wrong; the message lists every
+            problem.
     """
     label, data = _read(source)
     if overrides:
@@ -118,10 +119,10 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
 
 
 def stored_spec(record: SweepRecord) -> SweepSpec:
-    """The spec that a sweep was launched with.
+    """Return the spec that a sweep was launched with.
 
     Raises:
-        CheckpointError: The sweep's record holds none that this version accepts.
+        CheckpointError: The sweep's record has no spec that this version accepts.
     """
     try:
         # Another version may have fields that are null, and that this one doesn't know.
@@ -130,12 +131,12 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
         told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
         raise CheckpointError(
             f"{SWEEP_RECORD} of sweep {record.name} holds no spec that this tune-jobs accepts: {told[:1_000]}",
-            "Restore it from a backup, or use the version of tune-jobs that stands in it.",
+            "Restore it from a backup, or use the version of tune-jobs that it names.",
         ) from error
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON Schema of the sweep file, for editors: all fields, and the hyperparameters of each algorithm."""
+    """Return the JSON Schema of the sweep file, for editors: all fields and the hyperparameters of each algorithm."""
     schema = SweepSpec.model_json_schema(mode="validation")
     definitions: dict[str, Any] = schema["$defs"]
     domain_schema = TypeAdapter(Domain).json_schema(ref_template="#/$defs/{model}")
@@ -176,7 +177,7 @@ _LIMITS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "ex
 
 
 def _with_limits(schema: Any) -> Any:
-    """A schema with limits in JSON Schema's words: pydantic 2.14 leaves its own where a validator comes before them."""
+    """Return a schema with limits in JSON Schema's words; after a validator, pydantic 2.14 leaves its own words."""
     if isinstance(schema, list):
         return [_with_limits(item) for item in schema]
     if not isinstance(schema, dict):
@@ -185,7 +186,7 @@ def _with_limits(schema: Any) -> Any:
 
 
 def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """What a source is called in messages, and its content as plain JSON-like data."""
+    """Return a source's name for messages, and its content as plain JSON-like data."""
     if isinstance(source, Mapping):
         label, data = "sweep", source
     else:
@@ -220,7 +221,7 @@ def _read_text(source: str | Path) -> tuple[str, str]:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise SpecError(
-            f"{path}: can't be read: line {line} is no UTF-8, from byte {error.object[error.start]:#04x} on",
+            f"{path}: can't be read: line {line} is not UTF-8, from byte {error.object[error.start]:#04x} on",
             "Name a text file, and save it as UTF-8.",
         ) from error
     except OSError as error:
@@ -228,12 +229,12 @@ def _read_text(source: str | Path) -> tuple[str, str]:
 
 
 def _apply_override(data: dict[str, Any], override: str) -> str:
-    """Set one field in place; returns its dotted path."""
+    """Set one field in place, and return its dotted path."""
     path, equals, text = override.partition("=")
     path = path.strip()
     if not equals or not all(path.split(".")):
         raise SpecError(
-            f"--set {override}: this is no assignment",
+            f"--set {override}: this is not an assignment",
             "Write --set a.b=value, such as --set stop.num_env_steps=50000.",
         )
     *parents, last = path.split(".")
@@ -255,12 +256,12 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
     elif last in section or _is_known(path):
         section.pop(last, None)
     else:
-        section[last] = None  # there is no such field, which is told with all that is wrong
+        section[last] = None  # there is no such field, which is reported with all other problems
     return path
 
 
 def _is_known(path: str) -> bool:
-    """Whether a sweep file may have a field."""
+    """Whether a sweep file may have a field of this path."""
     section, *names = path.split(".")
     if section in ("hyperparams", "space") and names:
         return any(names[0] in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values())
@@ -270,5 +271,5 @@ def _is_known(path: str) -> bool:
 
 
 def _is_set(path: str, set_paths: Sequence[str]) -> bool:
-    """Whether a problem's path lies at or below a path that --set gave."""
+    """Whether a problem's path is at or below a path that --set gave."""
     return any(re.match(rf"{re.escape(given)}(?:$|[.\[])", path) for given in set_paths)

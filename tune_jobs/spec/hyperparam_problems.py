@@ -1,4 +1,4 @@
-"""What is wrong with fixed and searched hyperparameters, each looked at by itself."""
+"""Find what is wrong with fixed and searched hyperparameters, each checked by itself."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from tune_jobs.spec.problems import Problem
 def hyperparam_problems(
     algorithm: Algorithm, hyperparams: Mapping[str, Any], space: Mapping[str, Domain]
 ) -> list[Problem]:
-    """What is wrong with fixed and searched hyperparameters, each looked at by itself.
+    """Return what is wrong with fixed and searched hyperparameters, each checked by itself.
 
     Args:
-        algorithm: Whose hyperparameters they are.
+        algorithm: The algorithm that has the hyperparameters.
         hyperparams: Fixed values by name.
         space: Domains by name.
 
@@ -42,7 +42,7 @@ def hyperparam_problems(
         if name in fields:
             problems += _value_problems(algorithm, name, value, path=f"hyperparams.{name}")
         if name in space:
-            text = f"is fixed at {value!r} and searched in space.{name} at once: take it out of one of them"
+            text = f"is fixed at {value!r} but also searched in space.{name}: take it out of one of them"
             problems.append(Problem(f"hyperparams.{name}", text))
     for name, domain in space.items():
         if name in fields:
@@ -56,7 +56,7 @@ def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     have = "have" if len(others) > 1 else "has"
     suggestion = f" ({' and '.join(others)} {have} it.)" if others else did_you_mean(name, known)
     if name == "learning_rate":
-        suggestion = " Did you mean 'lr'?"  # its letters are nearer to DQN's learning_starts
+        suggestion = " Did you mean 'lr'?"  # by its letters, DQN's learning_starts would be nearer
     listed = "" if suggestion else f" It has {', '.join(sorted(known))}."
     return f"{algorithm} has no hyperparameter {name!r}.{suggestion}{listed}"
 
@@ -71,7 +71,7 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
             found = [Problem(path, text)]
         problems += found
         if found and domain.kind not in ("grid", "choice"):
-            break  # both ends of a range are mostly wrong for the same reason
+            break  # both ends of a range are usually wrong for the same reason
     return problems
 
 
@@ -87,16 +87,16 @@ def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -
 
 
 def _same_kind(raw: Any, checked: Any) -> bool:
-    """Whether pydantic left the kind of a value alone: it would read true as 1, 1 as true and "5" as 5."""
+    """Whether pydantic kept the type of a value, as it would read true as 1, 1 as true and "5" as 5."""
     if isinstance(checked, tuple):
-        # One number may stand for a list of one.
+        # A single number may stand for a list of one.
         return all(map(_same_kind, raw if isinstance(raw, list | tuple) else [raw], checked))
     return isinstance(raw, str) == isinstance(checked, str) and isinstance(raw, bool) == isinstance(checked, bool)
 
 
 @functools.cache
 def _alone(algorithm: Algorithm, name: str) -> type[BaseModel]:
-    """A hyperparameter without the checks across several: the plan makes these for each point."""
+    """Return a model of one hyperparameter; the plan makes the checks across several of them, for each point."""
     field = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields[name]
     model: type[BaseModel] = create_model("Alone", **{name: (field.annotation, field)})  # type: ignore[call-overload]
     return model

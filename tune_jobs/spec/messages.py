@@ -1,4 +1,4 @@
-"""What pydantic finds wrong with a sweep, told by the sweep file's own fields: where they are, what they take."""
+"""Explain what pydantic finds wrong with a sweep, in terms of the sweep file's fields."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from tune_jobs.spec.sections import NAME_RULE, SweepFields
 
 
 def problems_of(error: ValidationError, data: Any) -> list[Problem]:
-    """What is wrong with a sweep, given what pydantic says of it and what it was made from."""
+    """Return what is wrong with a sweep, from pydantic's error and the data that it was made from."""
     problems = [_from_detail(detail) for detail in details_of(error)]
-    # A wrong field kept pydantic from the checks that look at the whole: they are made on what is right.
+    # After a wrong field, pydantic skips the checks of the whole sweep, so the correct fields are checked here.
     return problems + (_hyperparam_problems(data) if isinstance(data, Mapping) else [])
 
 
@@ -34,7 +34,7 @@ def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
         try:
             domains[name] = adapter.validate_python(value)
         except ValidationError:
-            continue  # already among the problems; only its name is left to check
+            continue  # it is among the problems already; only its name is left to check
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     unknown = {name: None for name in space if name not in known} if isinstance(space, Mapping) else {}
     problems = hyperparam_problems(algorithm, fixed if isinstance(fixed, Mapping) else {}, domains)
@@ -50,7 +50,7 @@ _FORMS = {
     "search": "give random or tpe, or a mapping of its fields",
     "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
 }
-"""How fields are written that may have several forms, or one that no type describes."""
+"""How to write fields that have several forms, or a form that no type describes."""
 
 
 def _from_detail(detail: Detail) -> Problem:
@@ -70,7 +70,7 @@ def _from_detail(detail: Detail) -> Problem:
 
 
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:
-    """Pydantic names the kind of a domain twice, as the union's member and as its field."""
+    """Drop the second of pydantic's two names for the kind of a domain, as the union's member and as its field."""
     parts: list[int | str] = []
     for part in location:
         if not (parts and part == parts[-1] and parts[0] == "space" and len(parts) == 3):
@@ -80,7 +80,7 @@ def _without_tags(location: Iterable[int | str]) -> list[int | str]:
 
 def _unknown_key(location: Sequence[int | str]) -> str:
     name, model = str(location[-1]), _section(location[:-1])
-    # A field that exists elsewhere under just this name is meant more likely than a similar one here.
+    # A field of exactly this name in another section is more likely meant than a similar one here.
     suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
     listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
     return f"there is no field {name!r} here.{suggestion}{listed}"
@@ -95,11 +95,11 @@ def _section(location: Sequence[int | str]) -> type[BaseModel]:
 
 
 def _other_place(name: str) -> str:
-    """A hint for a field that exists, but in another section."""
+    """Return a hint for a field that exists in another section."""
     places = [
         f"{section}.{name}"
         for section, field in SweepFields.model_fields.items()
-        if section != "about"  # its texts are no settings
+        if section != "about"  # its strings are not settings
         and isinstance(field.annotation, type)
         and issubclass(field.annotation, BaseModel)
         and name in field.annotation.model_fields

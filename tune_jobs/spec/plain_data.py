@@ -1,4 +1,4 @@
-"""A sweep's fields as plain JSON-like data, copied within limits: what a sweep folder can hold, and nothing else."""
+"""Copy a sweep's fields as plain JSON-like data, which a sweep folder can hold, within limits of size."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from policies.errors import SpecError, shortened
 MAX_CHARACTERS = 262_144
 MAX_VALUES = 50_000
 MAX_DEPTH = 64
-"""Levels of lists and mappings."""
+"""The most levels of nested lists and mappings."""
 MAX_DIGITS = 40
-"""Of a whole number: seeds may have 128 bits."""
+"""The most digits of a whole number; seeds may have 128 bits."""
 
-_SMALLER = "Give less: a sweep's fields are settings, not data."
+_SMALLER = "Make it smaller: a sweep's fields hold settings, not data."
 
 
 def to_plain(value: Any, label: str) -> Any:
-    """A copy that holds dicts with texts as keys, lists, texts, finite numbers, booleans and None alone.
+    """Return a copy with only dicts with strings as keys, lists, strings, finite numbers, booleans and None.
 
-    NumPy's numbers, booleans, texts and arrays become Python's, paths texts, pydantic models dicts.
+    NumPy's numbers, booleans, strings and arrays become Python's; paths become strings, and pydantic models dicts.
 
     Args:
-        value: What a sweep file or a Python call gave.
-        label: What messages call it.
+        value: The data of a sweep file or a Python call.
+        label: Its name in messages.
 
     Raises:
-        SpecError: Something in it is of another kind, or it is larger than the limits; the message says where.
+        SpecError: It has a value of another kind, or is larger than the limits; the message says where.
     """
     return _Copy(label).of(value, "")
 
@@ -52,7 +52,7 @@ class _Copy:
         if isinstance(value, str):
             self._count(path, characters=len(value))
             self._check_text(value, path)
-            # Not a subclass of str, such as an enum's member.
+            # Only str itself, not a subclass such as an enum's member.
             return str.__str__(value)
         if isinstance(value, int | float) and not isinstance(value, bool):
             return self._number(value, path)
@@ -65,9 +65,9 @@ class _Copy:
         )  # fmt: skip
 
     def _of_python(self, value: Any, path: str) -> Any:
-        """NumPy's values, paths and models as Python's own."""
+        """Return NumPy's values, paths and models as Python's own types."""
         if isinstance(value, BaseModel):
-            # Its fields alone: model_dump would copy them before they are counted.
+            # Field by field, because model_dump would copy everything before it is counted.
             return dict(value)
         if isinstance(value, np.ndarray | np.generic):
             if value.size > MAX_VALUES:
@@ -81,12 +81,12 @@ class _Copy:
                 raise self._error(path, f"has a whole number of more than {MAX_DIGITS} digits", "Give a smaller one.")
             return int(value)
         if not math.isfinite(value):
-            raise self._error(path, f"{float(value)!r} is not a finite number", "Give a number.")
+            raise self._error(path, f"{float(value)!r} is not a finite number", "Give a finite number.")
         return float(value)
 
     def _container(self, value: Mapping[Any, Any] | list[Any] | tuple[Any, ...], path: str) -> Any:
         if id(value) in self._above:
-            raise self._error(path, "contains itself", "Take the inner one out.")
+            raise self._error(path, "contains itself", "Take out the part that is the same object as the whole.")
         if len(self._above) >= MAX_DEPTH:
             raise self._error(path, f"is nested more than {MAX_DEPTH} deep", _SMALLER)
         self._above.add(id(value))
@@ -103,19 +103,19 @@ class _Copy:
 
     def _key(self, key: Any, path: str) -> str:
         if isinstance(key, bool) or not isinstance(key, str | int | np.integer):
-            raise self._error(path, f"has the key {shortened(key)}, which is no text", "Name fields by texts.")
+            raise self._error(path, f"has the key {shortened(key)}, which is not a text", "Use texts as keys.")
         self._count(path, characters=len(name := str(key)))
         self._check_text(name, path)
         return name
 
     def _check_text(self, text: str, path: str) -> None:
-        """Refuse half a character: no file could hold it."""
+        """Refuse half of a surrogate pair, which no file could hold."""
         try:
             text.encode()
         except UnicodeEncodeError as error:
             half = ascii(text[error.start])
             raise self._error(
-                path, f"{shortened(text)} has {half}, which is half a character", "Take it out."
+                path, f"{shortened(text)} has {half}, which is half a character", "Take that character out."
             ) from None
 
     def _count(self, path: str, *, values: int = 0, characters: int = 0) -> None:

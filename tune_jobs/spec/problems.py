@@ -1,4 +1,4 @@
-"""What is wrong with a sweep, in the words of its writer: pydantic finds it, and is not quoted."""
+"""The problems of a sweep, in words of the sweep file in place of pydantic's messages."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ class Problem(NamedTuple):
     """One thing that is wrong with a sweep."""
 
     path: str
-    """Dotted path in the sweep file."""
+    """Its dotted path in the sweep file."""
     text: str
     """What is wrong there."""
 
 
 class WrongSpecError(SpecError):
-    """A sweep is wrong; `problems` are all that is, the message tells them."""
+    """A sweep is wrong; `problems` are all that was found, and the message lists them."""
 
     problems: tuple[Problem, ...] = ()
 
     @classmethod
     def of(cls, label: str, problems: Iterable[Problem]) -> Self:
-        """The error for a sweep.
+        """Return the error for a sweep.
 
         Args:
-            label: What the message calls the sweep.
-            problems: What is wrong, and where; what stands there twice is told once.
+            label: The sweep's name in the message.
+            problems: What is wrong, and where; a problem that occurs twice is listed once.
         """
         found = tuple(dict.fromkeys(problems))
         lines = [f"{path}: {text}" if path else text for path, text in found]

@@ -1,4 +1,4 @@
-"""Settings of a sweep that don't go with each other, and why an engine can train none of its trials."""
+"""Find settings of a sweep that contradict each other, and why an engine can train none of its trials."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sections import SweepFields
 
 Found = list[tuple[str, str]]
-"""(dotted path in the sweep file, what is wrong there)."""
+"""Pairs of a dotted path in the sweep file and what is wrong there."""
 
 
 FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
     {
-        # Another network, or other running statistics, than the ones that are copied.
+        # The network, or its running statistics, would differ from those that are copied.
         "hidden_sizes", "activation", "initializer", "conv_filters", "normalize_observations", "vf_share_layers",
         "dueling", "target_network",
-        # Another optimizer state than the one that is copied.
+        # The optimizer's state would differ from the one that is copied.
         "optimizer", "rmsprop_momentum",
-        # Other sub-environments; a trial's seeds are counted by them.
+        # There would be other sub-environments, by which a trial's seeds are counted.
         "num_envs",
-        # They act at a trial's start alone.
+        # They act only at a trial's start.
         "kl_coeff", "learning_starts",
     }
 )  # fmt: skip
-"""Hyperparameters that can't change within a trial, or would do nothing."""
+"""Hyperparameters that can't change within a trial, or would have no effect."""
 
 
 def search_problems(spec: SweepFields) -> Found:
-    """What is wrong with a sweep's search method and scheduler."""
+    """Return what is wrong with a sweep's search method and scheduler."""
     found: Found = []
     if spec.search.type == "tpe":
         found += _tpe_problems(spec)
     if spec.scheduler.type in ("pbt", "hyperband") and spec.resources.max_concurrent is not None:
         text = (
-            f"{spec.resources.max_concurrent} does not go with scheduler.type {spec.scheduler.type}, which pauses "
+            f"{spec.resources.max_concurrent} cannot be used with scheduler.type {spec.scheduler.type}, which pauses "
             "trials until others have come as far: limit how many run by resources.num_cpus"
         )
         found.append(("resources.max_concurrent", text))
     if spec.scheduler.type == "pbt":
         found += _population_problems(spec)
     elif spec.scheduler.perturb_every_env_steps is not None:
-        text = f"is for pbt alone, and scheduler.type is {spec.scheduler.type}: take out one, or set the other"
+        text = f"is only for pbt, but scheduler.type is {spec.scheduler.type}: leave it out, or set the type to pbt"
         found.append(("scheduler.perturb_every_env_steps", text))
     return found
 
@@ -63,11 +63,11 @@ _USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "search": {"num_startup_trials": ("tpe",)},
 }
-"""Which types of search and scheduler a field is for; `perturb_every_env_steps` is refused with others than pbt."""
+"""The types of search and scheduler that a field is for; `perturb_every_env_steps` is refused without pbt."""
 
 
 def idle_settings(spec: SweepFields) -> list[str]:
-    """What to say of settings of search and scheduler that were changed and can't act, for the plan."""
+    """Return the plan's notes on settings of search and scheduler that were changed but can't act."""
     notes = []
     for section, fields in _USED_BY.items():
         given = getattr(spec, section)
@@ -78,14 +78,14 @@ def idle_settings(spec: SweepFields) -> list[str]:
 
 
 def check_extendable(spec: SweepFields) -> None:
-    """Check that more samples are other points than those there are.
+    """Check that more samples would be new points.
 
     Raises:
         SpecError: The space has nothing random to draw, and no search method or scheduler chooses values.
     """
     chosen = spec.search.type != "random" or spec.scheduler.type == "pbt"
     if not chosen and not any(domain.is_random for domain in spec.space.values()):
-        why = "its space has grids alone" if spec.space else "it has no space"
+        why = "its space has only grids" if spec.space else "it has no space"
         raise SpecError(
             f"The sweep cannot be extended: {why}, so more samples would be the same points again.",
             "Launch a new sweep: with a larger seeds_per_point for more seeds, with more grid values for more points.",
@@ -103,11 +103,11 @@ def _tpe_problems(spec: SweepFields) -> Found:
             "pbt": "pbt changes the values that tpe would learn from: use search.type random",
             "hyperband": "hyperband waits for whole groups of trials, tpe starts one after another: use asha",
         }
-        found.append(("search.type", f"tpe does not go with scheduler.type {why[spec.scheduler.type]}"))
+        found.append(("search.type", f"tpe cannot be used with scheduler.type {why[spec.scheduler.type]}"))
     if spec.space and spec.num_samples <= spec.search.num_startup_trials:
         text = (
             f"{spec.num_samples} is not more than search.num_startup_trials, {spec.search.num_startup_trials}: all "
-            "points would be random. With tpe it is the number of points, grids are lists to choose from"
+            "points would be random. With tpe, num_samples is the number of points, and grids are lists to choose from"
         )
         found.append(("num_samples", text))
     return found
@@ -132,7 +132,7 @@ def _population_problems(spec: SweepFields) -> Found:
         found.append((name, f"gives {size} trial, and pbt (scheduler.type) compares at least 2"))
     if spec.seeds_per_point > 1:
         text = (
-            f"{spec.seeds_per_point} does not go with pbt, which gives each trial values of its own: raise num_samples"
+            f"{spec.seeds_per_point} cannot be used with pbt, which gives each trial its own values: raise num_samples"
         )
         found.append(("seeds_per_point", text))
     if spec.perturb_every_env_steps >= spec.stop.num_env_steps:
@@ -145,7 +145,7 @@ def _population_problems(spec: SweepFields) -> Found:
 
 
 def needs_of(spec: SweepFields) -> dict[Need, str]:
-    """What a sweep needs of its engine, as far as its file tells, each with the setting that needs it."""
+    """Return what a sweep needs from its engine, as far as its file tells, each with the setting that needs it."""
     runners = spec.resources.num_env_runners
     found: dict[Need, tuple[bool, str]] = {
         "rl_module": (spec.rl_module is not None, f"rl_module is {spec.rl_module}"),
@@ -158,7 +158,7 @@ def needs_of(spec: SweepFields) -> dict[Need, str]:
 
 
 def why_none(engine: Engine, spec: SweepFields) -> str | None:
-    """Why an engine can train no trial of a sweep, as far as its file tells, or None."""
+    """Return why an engine can train no trial of a sweep, as far as its file tells, or None."""
     if spec.algorithm not in engine.algorithms:
         which = ", which does not learn" if is_baseline(spec) else ""
         return f"algorithm is {spec.algorithm}{which}"
@@ -167,5 +167,5 @@ def why_none(engine: Engine, spec: SweepFields) -> str | None:
 
 
 def is_baseline(spec: SweepFields) -> bool:
-    """Whether its algorithm is one that does not learn."""
+    """Whether a sweep's algorithm is a baseline, which does not learn."""
     return issubclass(HYPERPARAMS_BY_ALGORITHM[spec.algorithm], RandomHyperparams)

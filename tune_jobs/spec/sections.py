@@ -1,6 +1,6 @@
-"""The sections of a sweep file, and all fields of a sweep: types and ranges alone.
+"""The sections of a sweep file, and all fields of a sweep, with their types and ranges.
 
-What has to be true of several fields together stands in `tune_jobs.spec.rules`.
+Rules for several fields together are in `tune_jobs.spec.rules`.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
 NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
 _LARGEST_REWARD = 3.4e38
-"""Beyond it a number is infinite in 32 bits, in which learners compute."""
+"""The largest number of 32 bits; training computes in 32 bits, where anything larger is infinite."""
 NAME_RULE = "up to 100 letters, digits, '_', '-' and '.', beginning with none of the last two"
 
 Flag = Annotated[bool, Field(strict=True)]
-"""true or false; no text and no number stands for them."""
+"""true or false, but no string or number in their place."""
 PositiveWhole = Annotated[WholeNumber, Field(ge=1)]
 NonNegativeWhole = Annotated[WholeNumber, Field(ge=0)]
 PositiveNumber = Annotated[Number, Field(gt=0)]
 
 
 class Section(BaseModel):
-    """A part of a sweep: frozen, and without fields that it does not know."""
+    """A part of a sweep: it cannot be changed, and refuses unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -58,7 +58,7 @@ class EnvSpec(Section):
     id: str = Field(description="Gymnasium id, such as CartPole-v1.", min_length=1)
     args: dict[str, Any] = Field(default_factory=dict, description="Keyword arguments of gymnasium.make.")
     frame_stack: Annotated[WholeNumber, Field(ge=1, le=64)] = Field(
-        1, description="Observe the last so many observations at once."
+        1, description="How many of the last observations are observed at once."
     )
     pixels: Flag = Field(
         default=False, description="Observe small grey images of what the env renders, not its numbers."
@@ -71,15 +71,15 @@ class EnvSpec(Section):
 
     @property
     def wrapped_args(self) -> dict[str, Any]:
-        """`args` and the wrappers of observations: what everybody who makes this environment needs."""
-        # Not above: the command line reads and prints sweep files without Gymnasium.
+        """`args` with the wrappers of observations, as needed wherever this environment is made."""
+        # Imported here because the command line reads and prints sweep files without Gymnasium.
         from policies.envs.wrappers import with_wrappers
 
         return with_wrappers(self.args, frame_stack=self.frame_stack, pixels=self.pixels)
 
 
 class StopSpec(Section):
-    """When a trial ends: at whichever comes first. The three caps always hold, so nothing runs for ever."""
+    """When a trial ends: at whichever limit it reaches first. Three caps always apply, so nothing runs forever."""
 
     training_return: Number | None = Field(
         None, description="End when the mean return of the last 100 whole training episodes reaches this."
@@ -104,23 +104,23 @@ class SearchSpec(Section):
         "proposes the next points (Bergstra et al. 2011; install tune-jobs[tpe]).",
     )
     num_startup_trials: PositiveWhole = Field(
-        10, description="tpe: points are random until so many have been tried to their end; the model's follow."
+        10, description="tpe: how many points have to end before the model proposes points; until then they are random."
     )
 
 
 class SchedulerSpec(Section):
-    """Whether trials that do worse than others, after as many env steps, are ended early, or take over from them."""
+    """Whether trials that do worse than others after the same env steps are ended early, or continue from copies."""
 
     type: SchedulerType = Field(
         "none",
         description="none, asha (successive halving), hyperband, median (worse than the median) or pbt (population "
-        "based training: the worst go on from copies of the best, with mutated hyperparameters).",
+        "based training: the worst continue from copies of the best, with mutated hyperparameters).",
     )
     grace_env_steps: PositiveWhole | None = Field(
         None, description="No trial is ended before this many env steps; null: 1/20 of stop.num_env_steps."
     )
     reduction_factor: Annotated[Number, Field(gt=1)] = Field(
-        3.0, description="asha, hyperband: one trial in this many goes on at each rung."
+        3.0, description="asha, hyperband: one trial in this many continues at each rung."
     )
     perturb_every_env_steps: PositiveWhole | None = Field(
         None, description="pbt: env steps between two comparisons of a trial; null: 1/10 of stop.num_env_steps."
@@ -129,7 +129,7 @@ class SchedulerSpec(Section):
         0.25, description="pbt: the worst share of the trials, which copies the best share."
     )
     resample_probability: Annotated[Number, Field(ge=0, le=1)] = Field(
-        0.25, description="pbt: how often a mutation draws a new value; else it moves to a neighbouring one."
+        0.25, description="pbt: share of mutations that draw a new value; the others move to a neighbouring one."
     )
 
 
@@ -138,7 +138,7 @@ class EvaluationSpec(Section):
 
     every_iterations: PositiveWhole = Field(5, description="Evaluate at each multiple of this, and at the end.")
     num_episodes: Annotated[WholeNumber, Field(ge=1, le=MAX_EPISODES)] = Field(
-        10, description="Episodes of an evaluation."
+        10, description="Episodes per evaluation."
     )
 
 
@@ -146,22 +146,22 @@ class CheckpointSpec(Section):
     """Which checkpoints are kept. The best and the latest always are."""
 
     every_iterations: PositiveWhole = Field(10, description="Save at each multiple of this, and at the end.")
-    keep: NonNegativeWhole = Field(2, description="How many of the newest to keep beside best and latest.")
+    keep: NonNegativeWhole = Field(2, description="How many of the newest to keep besides the best and the latest.")
 
 
 class ResourcesSpec(Section):
     """What one trial may use, and how many run at once."""
 
-    num_cpus: PositiveWhole | None = Field(None, description="CPUs a trial; null: 1 and 1 for each env runner.")
-    num_gpus: Annotated[Number, Field(ge=0)] = Field(0.0, description="GPUs a trial, fractions allowed.")
+    num_cpus: PositiveWhole | None = Field(None, description="CPUs per trial; null: 1, and 1 for each env runner.")
+    num_gpus: Annotated[Number, Field(ge=0)] = Field(0.0, description="GPUs per trial, fractions allowed.")
     num_env_runners: Annotated[WholeNumber, Field(ge=0, le=SEEDS_PER_TRIAL)] = Field(
-        0, description="Processes that sample for one trial; 0: the trial's own process does."
+        0, description="Processes that sample for one trial; 0: the trial's own process samples."
     )
     max_concurrent: PositiveWhole | None = Field(None, description="Trials at once; null: as many as fit.")
 
 
 def _from_text(key: str) -> BeforeValidator:
-    """Let a section be written as one text: `env: CartPole-v1`, `scheduler: asha`."""
+    """Let a section be written as one string: `env: CartPole-v1`, `scheduler: asha`."""
 
     def expand(value: Any) -> Any:
         return {key: value} if isinstance(value, str) else value
@@ -181,7 +181,7 @@ else:
 
 
 class SweepFields(Section):
-    """The fields of a sweep, each right by itself."""
+    """The fields of a sweep, each valid by itself."""
 
     name: str | None = Field(
         None,
@@ -203,7 +203,7 @@ class SweepFields(Section):
     num_samples: PositiveWhole = Field(
         1, description="Random draws for each combination of the grids' values; with tpe: points."
     )
-    seeds_per_point: PositiveWhole = Field(1, description="Trials a point, each with its own seed.")
+    seeds_per_point: PositiveWhole = Field(1, description="Trials per point, each with its own seed.")
     seed: Annotated[WholeNumber, Field(ge=0)] = Field(0, description="Sweep seed: fixes points and all other seeds.")
     stop: StopSpec = Field(default_factory=StopSpec, description="When a trial ends.")
     search: Annotated[SearchSpec, _from_text("type")] = Field(
@@ -213,10 +213,12 @@ class SweepFields(Section):
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
     )
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
-    checkpoints: CheckpointSpec = Field(default_factory=CheckpointSpec, description="What is kept of a trial.")
+    checkpoints: CheckpointSpec = Field(
+        default_factory=CheckpointSpec, description="Which checkpoints of a trial are kept."
+    )
     resources: ResourcesSpec = Field(default_factory=ResourcesSpec, description="CPUs, GPUs, env runners.")
     engine: EngineWish = Field("auto", description=_ENGINE_WISHES)
-    max_retries: NonNegativeWhole = Field(2, description="How often a failed trial is tried again.")
+    max_retries: NonNegativeWhole = Field(2, description="How often a failed trial is retried.")
     iteration_timeout_s: PositiveNumber = Field(
         600.0, description="An iteration that takes longer counts as a failure of its trial."
     )
@@ -228,19 +230,19 @@ class SweepFields(Section):
 
     @property
     def grace_env_steps(self) -> int:
-        """Env steps before which the scheduler ends no trial."""
+        """The env steps before which the scheduler ends no trial."""
         if self.scheduler.grace_env_steps is not None:
             return self.scheduler.grace_env_steps
         return max(1, self.stop.num_env_steps // 20)
 
     @property
     def perturb_every_env_steps(self) -> int:
-        """pbt: env steps between two comparisons of a trial."""
+        """pbt: the env steps between two comparisons of a trial."""
         return self.scheduler.perturb_every_env_steps or max(1, self.stop.num_env_steps // 10)
 
     @property
     def cpus_per_trial(self) -> int:
-        """CPUs one trial takes: its own process and its env runners."""
+        """The CPUs of one trial: for its own process and its env runners."""
         if self.resources.num_cpus is not None:
             return self.resources.num_cpus
         return 1 + self.resources.num_env_runners

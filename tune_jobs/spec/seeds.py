@@ -2,7 +2,7 @@
 
     [0, 2**19)       evaluation: the greedy episodes by which trials are compared
     [2**19, 2**20)   confirmation: the greedy episodes on which the winner is measured again
-    [2**20, 2**31)   training: a block of 1,024 a trial
+    [2**20, 2**31)   training: a block of 1,024 per trial
 
 A trial gets a block because RLlib adds small numbers to its seed (env runner index, sub-environment index):
 trials seeded 0, 1, 2 would share streams of environments.
@@ -28,13 +28,13 @@ def trial_seeds(sweep_seed: int, num_trials: int) -> list[int]:
 
     Args:
         sweep_seed: Seed of the sweep, at least 0.
-        num_trials: How many are wanted.
+        num_trials: How many seeds are wanted.
 
     Returns:
         Distinct multiples of 1,024 in [2**20, 2**31): a trial may use its seed and the 1,023 after it.
 
     Raises:
-        ValueError: More trials than there are blocks.
+        ValueError: There are more trials than blocks.
     """
     first, end = _TRAINING_START // SEEDS_PER_TRIAL, _SEED_END // SEEDS_PER_TRIAL
     if num_trials > (end - first) // 2:

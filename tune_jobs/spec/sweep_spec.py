@@ -1,9 +1,8 @@
 """The sweep file as a typed, frozen model: everything about a sweep that a person decides.
 
 A `SweepSpec` is valid by itself: its hyperparameters exist for its algorithm and accept every value their
-domains can give. Whether the environment exists and the machine is large enough is found by
-`tune_jobs.plan.sweep_plan`.
-Files, presets and `--set` are read by `tune_jobs.spec.file`.
+domains can give. `tune_jobs.plan.sweep_plan` finds out whether the environment
+exists and the machine is large enough. `tune_jobs.spec.file` reads files, presets and `--set`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
 
 
 class SweepSpec(SweepFields):
-    """One sweep: what is searched, how long, with which resources."""
+    """One sweep: what is searched, for how long, and with which resources."""
 
     @model_validator(mode="before")
     @classmethod
@@ -42,7 +41,7 @@ class SweepSpec(SweepFields):
     @model_validator(mode="wrap")
     @classmethod
     def _is_right(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        """Look at the whole too, and tell what is wrong in the sweep file's words; SpecErrors pass through pydantic."""
+        """Check the whole sweep too, and report problems in the sweep file's words; SpecErrors pass unchanged."""
         try:
             spec = handler(data)
         except ValidationError as error:
@@ -54,10 +53,10 @@ class SweepSpec(SweepFields):
 
 
 def check_sweep_name(name: str) -> str:
-    """Return a sweep's name if a folder may be called so.
+    """Return a sweep's name if it is allowed as a folder's name.
 
     Raises:
-        SpecError: It may not.
+        SpecError: It is not allowed.
     """
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise SpecError(f"The sweep name {name!r} is not allowed.", f"Use {NAME_RULE}.")
@@ -65,7 +64,7 @@ def check_sweep_name(name: str) -> str:
 
 
 def _section_problems(spec: SweepFields) -> list[Problem]:
-    """Settings that contradict each other."""
+    """Return the settings that contradict each other."""
     problems = [Problem(path, text) for path, text in search_problems(spec)]
     grace, cap, resources = spec.scheduler.grace_env_steps, spec.stop.num_env_steps, spec.resources
     if spec.scheduler.type != "none" and grace is not None and grace >= cap:
@@ -83,6 +82,6 @@ def _section_problems(spec: SweepFields) -> list[Problem]:
         problems.append(Problem("resources.num_gpus", text))
     wished = find_engine(spec.engine)
     if wished is not None and (reason := why_none(wished, spec)) is not None and not wished.gives_way:
-        text = f"{wished.name} cannot train any of the trials: {reason}. Set auto, which takes what can"
+        text = f"{wished.name} cannot train any of the trials: {reason}. Set engine: auto, which takes one that can"
         problems.append(Problem("engine", text))
     return problems

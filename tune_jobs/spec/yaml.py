@@ -1,9 +1,9 @@
-"""YAML as the writer of a sweep file means it, and never more of it than a sweep file can need.
+"""Read YAML as the writer of a sweep file means it, within the limits of what a sweep file can need.
 
-Words and numbers are those of YAML 1.2, with `_` between digits; whatever YAML 1.1 and 1.2 read differently (`010`,
-`1:30`, `yes`) is refused with what it could mean. Dates are texts, keys are texts and stand once. An alias repeats
-what it names, so a few lines can stand for gigabytes: what a text stands for is counted before it is built. All else is
-PyYAML's; decision 26 says why no other library reads it.
+Words and numbers are those of YAML 1.2, with `_` between digits. Values that YAML 1.1 and 1.2 read differently (`010`,
+`1:30`, `yes`) are refused, and the message says what they may mean. Dates are strings; keys are strings and must not
+occur twice. An alias repeats what it names, so a few lines can stand for gigabytes: the size is counted before the data
+are built. Everything else is PyYAML's; decision 26 says why no other library reads it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _TWO_MEANINGS = "two meanings"
 _CORRECT = "Correct the YAML there."
 _SMALLER = "Write it shorter: a sweep file holds settings, not data."
 _DIGITS = "[0-9]+(?:_[0-9]+)*"
-# What YAML 1.1 takes for a number or a truth value, and YAML 1.2 for something else.
+# Words that YAML 1.1 reads as a number or a truth value, and YAML 1.2 as something else.
 _TRUTH = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 _OCTAL = re.compile(r"[-+]?0[0-9_]+\Z")
 _BINARY = re.compile(r"[-+]?0b[01_]+\Z")
@@ -40,28 +40,28 @@ _PLAIN_WORDS = (
     (_FLOAT, re.compile(rf"[-+]?(?:\.{_DIGITS}|{_DIGITS}(?:\.(?:{_DIGITS})?)?)(?:[eE][-+]?{_DIGITS})?\Z")),
     (_FLOAT, re.compile(r"(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))\Z")),
 )
-"""What a word is that is not in quotes: the first that matches; all others are texts."""
+"""The kinds of words that are not in quotes: the first that matches counts; all other words are strings."""
 
 
 def parse_yaml(text: str, label: str) -> Any:
-    """What a YAML text stands for: mappings with texts as keys, lists, texts, numbers, true, false and null.
+    """Return the data of a YAML text: mappings with strings as keys, lists, strings, numbers, true, false and null.
 
     Args:
         text: One YAML document.
-        label: What messages call it.
+        label: Its name in messages.
 
     Raises:
-        SpecError: It is no YAML, says something twice or in two senses, or stands for more than the limits.
+        SpecError: It is not YAML, has a key twice or a value with two meanings, or is larger than the limits.
     """
     if len(text) > MAX_CHARACTERS:
         raise SpecError(f"{label}: has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read.", _SMALLER)
     try:
         return _Loader(text).get_single_data()
     except yaml.MarkedYAMLError as error:
-        # Some say half of it in each: "expected a single document in the stream", "but found another document".
+        # Some errors have one half in each: "expected a single document in the stream", "but found another document".
         told = ", ".join(filter(None, (error.context, error.problem)))
         if "'\\t'" in told:
-            told = "a tab stands where YAML takes spaces alone"
+            told = "there is a tab where YAML takes only spaces"
         mark = error.problem_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         raise SpecError(f"{label}{place}: {told}", error.note or _CORRECT) from error
@@ -72,11 +72,11 @@ def parse_yaml(text: str, label: str) -> Any:
             "Take it out, or write it as an escape in double quotes.",
         ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise SpecError(f"{label}: this is no YAML: {error}", "Correct the YAML.") from error
+        raise SpecError(f"{label}: this is not YAML: {error}", "Correct the YAML.") from error
 
 
 class _Extent(NamedTuple):
-    """What a node stands for, with all that its aliases repeat."""
+    """The size of a node's data, including all that its aliases repeat."""
 
     values: int
     characters: int
@@ -84,7 +84,7 @@ class _Extent(NamedTuple):
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's loader with the words above, within the limits."""
+    """PyYAML's loader with the words above and within the limits."""
 
     yaml_implicit_resolvers = {None: list(_PLAIN_WORDS)}  # noqa: RUF012
 
@@ -96,7 +96,7 @@ class _Loader(yaml.SafeLoader):
 
     @override
     def get_single_node(self) -> yaml.Node | None:
-        """The document, if what it stands for is within the limits."""
+        """Return the document, if its data are within the limits."""
         root: yaml.Node | None = super().get_single_node()
         if root is not None:
             _check_extent(self._extents[root])
@@ -104,7 +104,7 @@ class _Loader(yaml.SafeLoader):
 
     @override
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Stop at the limits, so that what lies beyond is not even read; note what each node stands for."""
+        """Compose a node and note its size; stop at the limits, so that the rest is not even read."""
         self._depth += 1
         self._num_nodes += 1
         if self._depth > MAX_DEPTH:
@@ -122,7 +122,7 @@ class _Loader(yaml.SafeLoader):
 
     @override
     def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
-        """`!!int "5"`: the tag asks for what the bare word means."""
+        """Compose a scalar; the tag of `!!int "5"` asks for the meaning of the word without quotes."""
         node: yaml.ScalarNode = super().compose_scalar_node(anchor)
         if node.tag in (_NULL, _BOOL, _INT, _FLOAT):
             meant = self.resolve(yaml.ScalarNode, node.value, (True, False))  # type: ignore[no-untyped-call]
@@ -133,16 +133,16 @@ class _Loader(yaml.SafeLoader):
 
     @override
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """Keys are texts as they are written, and stand once."""
+        """Compose a mapping; its keys are strings as they are written, and must not occur twice."""
         node: yaml.MappingNode = super().compose_mapping_node(anchor)
         seen: set[str] = set()
         for index, (key, value) in enumerate(node.value):
             if not isinstance(key, yaml.ScalarNode):
-                raise _error(key, "a list or a mapping stands as a key", "Use a text as the key.")
+                raise _error(key, "a list or a mapping is used as a key", "Use a text as the key.")
             is_merge = key.tag == _MERGE
             if key.value in seen:
                 several = " (several mappings are merged by `<<: [*a, *b]`)" if is_merge else ""
-                raise _error(key, f"the key {key.value!r} stands twice{several}", "Keep one of them.")
+                raise _error(key, f"the key {key.value!r} occurs twice{several}", "Keep one of them.")
             seen.add(key.value)
             if not is_merge:
                 named = yaml.ScalarNode(_STR, key.value, key.start_mark, key.end_mark)
@@ -166,10 +166,10 @@ def _check_extent(extent: _Extent) -> None:
     for number, limit, what in (
         (extent.values, 2 * MAX_VALUES, "values and keys"),
         (extent.characters, MAX_CHARACTERS, "characters"),
-        (extent.depth, MAX_DEPTH, "levels, one in the other"),
+        (extent.depth, MAX_DEPTH, "nested levels"),
     ):
         if number > limit:
-            # Of the number itself, Python may refuse to print more than 4,300 digits.
+            # Python may refuse to print a number of more than 4,300 digits.
             shown = f"{number:,}" if number < 10**18 else "more than 10^18"
             problem = f"with its aliases it stands for {shown} {what}; at most {limit:,} are read."
             raise yaml.MarkedYAMLError(problem=problem, note=_SMALLER)

@@ -1,1 +1,1 @@
-"""The sweep folder: who writes what, and how it is read back."""
+"""The store of sweeps: who writes what, and how it is read back."""

@@ -1,8 +1,8 @@
-"""Which checkpoints of a sweep may be chosen as its best: those that are what was written, and scored what they say.
+"""Find the checkpoints that may be chosen as a sweep's best: those that were not changed since they were written.
 
-A checkpoint's score is in its manifest, which is sealed, and in the line of its iteration in `results.jsonl`. One whose
-manifest was changed, or which contradicts its line, is left out with a warning; the others still compete. What tells
-points and seeds apart is not taken from `trial.json` but follows from the trial's number.
+A checkpoint's score is in its manifest, which is sealed, and in the line of its iteration in `results.jsonl`. A
+checkpoint whose manifest was changed, or contradicts that line, is left out with a warning; the others still compete.
+The point and the seed of a trial follow from its number, and are not taken from `trial.json`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _LOG = logging.getLogger(__name__)
 
 
 def read_trials(store: Sweep) -> list[TrialRecord]:
-    """The trials, by index, with those checkpoints on disk that may be chosen.
+    """Read the trials, by index, with those checkpoints on disk that may be chosen.
 
-    What the records say of checkpoints is not asked: a killed driver's may lag behind what is on disk.
+    The checkpoints in the records are not used, because those of a killed driver may be older than what is on disk.
 
     Raises:
         CheckpointError: The record of the sweep or of a trial is damaged.
@@ -42,13 +42,13 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
 
 
 def candidates(trial: Trial) -> list[CheckpointRecord]:
-    """A trial's checkpoints that may be chosen, oldest first; a warning names each of the others."""
+    """Return a trial's checkpoints that may be chosen, oldest first; a warning names each of the others."""
     known: list[CheckpointRecord] = []
     for iteration in trial.checkpoint_iterations():
         try:
             known.append(trial.checkpoint(iteration))
         except NotFoundError as error:
-            # Gone since, if its trial runs on.
+            # Deleted meanwhile, if its trial still runs.
             if trial.checkpoint_folder(iteration).exists():
                 leave_out(error)
     recorded: Mapping[int, Sequence[Scored]] = {}
@@ -60,11 +60,11 @@ def candidates(trial: Trial) -> list[CheckpointRecord]:
 
 
 def choose(store: Sweep, trials: Sequence[TrialRecord]) -> tuple[Selection, PortablePolicy]:
-    """The best whose checkpoint is whole, and its policy; a warning names what would have come before it.
+    """Return the best selection whose checkpoint is whole, and its policy; a warning names better but damaged ones.
 
     Args:
         store: The sweep.
-        trials: As `read_trials` gives them.
+        trials: The result of `read_trials`.
 
     Raises:
         NoUsableTrialError: No trial can win; the message says why.
@@ -81,13 +81,13 @@ def choose(store: Sweep, trials: Sequence[TrialRecord]) -> tuple[Selection, Port
 
 
 def leave_out(error: TuneJobsError) -> None:
-    """Warn that something is as if it were not there."""
+    """Warn that something is left out because of an error."""
     _warn(error.message)
 
 
 @functools.lru_cache(maxsize=1024)
 def _warn(message: str) -> None:
-    # Once: a sweep that ends is read several times.
+    # Only once, because a sweep is read several times at its end.
     _LOG.warning("Left out: %s", message)
 
 
@@ -96,7 +96,7 @@ def _without(record: TrialRecord, checkpoint: CheckpointRecord) -> TrialRecord:
 
 
 def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:
-    """Which trial it is of which point, as the plan numbers them."""
+    """Return a trial's index, and the indices of its point and seed, as the plan numbers them."""
     seeds = sweep.spec.get("seeds_per_point")
     if type(seeds) is not int or seeds < 1:
         return {}
@@ -105,8 +105,8 @@ def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:
 
 
 def _agrees(trial: Trial, checkpoint: CheckpointRecord, lines: Sequence[Scored]) -> bool:
-    """Whether a checkpoint says the same as the results of its iteration, if there are any."""
-    # A line may be lost; two are there where two processes wrote at once.
+    """Whether a checkpoint's manifest agrees with the results of its iteration, if there are any."""
+    # A line may be missing; there are two if two processes wrote at once.
     if checkpoint.evaluation_return is None or not lines:
         return True
     if (checkpoint.num_env_steps, checkpoint.evaluation_return) in lines:

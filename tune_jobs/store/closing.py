@@ -1,4 +1,4 @@
-"""How a run's end is written down; also from a thread that ends the process at once."""
+"""Write the end of a run into the sweep's record, also from a thread that ends the process at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tune_jobs.store.contract import Sweep
 
 
 def end_process(store: Sweep, error: CannotRunError) -> NoReturn:
-    """Write down how the run ended, say why, and end this process as it stands; from any thread."""
+    """Write how the run ended, print the error, and end this process at once; any thread may call this."""
     from tune_jobs.process.streams import say_at_last
 
     with contextlib.suppress(TuneJobsError):
@@ -24,7 +24,7 @@ def end_process(store: Sweep, error: CannotRunError) -> NoReturn:
 
 
 def close_run(store: Sweep, started: float | None = None) -> None:
-    """Write down how the run that began then ended; None: it had not begun."""
+    """Write how the run ended that began at `started`; None: it had not begun."""
     interrupted = False
     for trial in store.read_trials():
         if trial.status not in FINISHED:

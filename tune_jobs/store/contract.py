@@ -1,33 +1,32 @@
-"""What a store of sweeps promises: who may write what and when, what each call raises, and what is atomic.
+"""The contract of a store of sweeps: who may write what and when, what each call raises, and what is atomic.
 
     Storage     where sweeps are kept, by name
       Sweep     one sweep: its record, locks, owner, requests to stop, winner and report
         Trial   one training run: its record, results, checkpoints, log and tally
-        Pack    one process that trains many trials: whom it is to train, and its log
+        Pack    one process that trains many trials: the trials it has to train, and its log
 
-What holds for all of it:
+These rules hold for all of it:
 
 - **Who writes.** The process that holds a sweep's lock (its *driver*) writes the sweep's record, its winner and report,
-  every trial's record and the packs' assignments; what it writes during a run, within `held` of the run's owner. The
-  process that has taken a trial writes the rest of that trial. Who has taken a pack appends to its log. Anybody may ask
-  a driver to stop, and may read at any time, without a lock.
-- **What is atomic.** A record, an assignment and a checkpoint are there whole or not at all, also when their writer is
-  killed or the machine loses power: who reads sees the one before or the one after. Results and logs are appended to;
-  of what a killed writer was appending, a reader sees no half line.
-- **Epochs.** Of several processes that took something up one after the other, the last one owns it. Every write of one
-  that lost it raises `OwnershipLostError` and changes nothing.
-- **What is believed.** Nothing that was read names a place: parts are found by names, ids and numbers alone, and what
-  cannot be an id is a `NotFoundError`. Nothing outside the sweep is read, written or deleted by any of these calls, nor
-  through a symbolic link, which is a `CheckpointError`.
-- **What calls raise.** `NotFoundError`: it is not there. `CheckpointError`, a kind of it: it is there, and damaged, of
-  a newer format, or not the one that belongs there; the message names it. `CannotRunError`: it cannot be written or
-  locked, or another process has it.
-- **Folders that are handed out.** A few calls give a `Path`. It is a file or folder of this machine, good for what the
-  call says and for as long as it says; what a later store keeps elsewhere, it fetches before and sends off after.
-  Nobody puts another path of the sweep together from it: what a checkpoint or a report consists of is known to who
-  writes it, not here.
+  every trial's record and the packs' assignments; during a run, it writes within `held` of the run's owner.
+  The process that has taken a trial writes the rest of that trial, and the process that has taken a pack appends to its
+  log. Any process may ask a driver to stop, and may read at any time, without a lock.
+- **What is atomic.** A record, an assignment and a checkpoint exist whole or not at all, even if their writer is killed
+  or the machine loses power: a reader sees either the old one or the new one. Results and logs are appended to; a
+  reader never sees half a line that a killed writer was appending.
+- **Epochs.** If several processes take something one after the other, the last one owns it. Every write of a process
+  that has lost it raises `OwnershipLostError` and changes nothing.
+- **What is trusted.** No path is taken from a file: parts are found only by names, ids and numbers, and anything that
+  cannot be an id is a `NotFoundError`. These calls read, write and delete nothing outside the sweep, nor through a
+  symbolic link, which is a `CheckpointError`.
+- **What calls raise.** `NotFoundError`: it does not exist. `CheckpointError`, a subclass: it exists, but it is damaged,
+  has a newer format, or does not belong there; the message names it. `CannotRunError`: it cannot be written or locked,
+  or another process has it.
+- **Paths.** A few calls return a `Path`. It is a file or folder of this machine, for the use and the time that the call
+  describes; a store that keeps files elsewhere fetches them before and uploads them afterwards. Callers do not build
+  other paths of the sweep from it: the contents of a checkpoint or a report are known to the code that writes them.
 
-One suite of tests, `test_store_contract`, holds every store to this.
+The tests in `test_store_contract` check that every store keeps this contract.
 """
 
 from __future__ import annotations
@@ -46,11 +45,11 @@ __all__ = ["Assignment", "Ownership", "Pack", "Storage", "Sweep", "Trial"]
 
 
 class Sweep(Protocol):
-    """One sweep. All that is written here is written by its driver, but for requests to stop."""
+    """One sweep. Only its driver writes here, except for requests to stop."""
 
     @property
     def folder(self) -> Path:
-        """Where it is: what a user and other processes are told, and `open_sweep` takes. Nothing is added to it."""
+        """The place of the sweep, for users, other processes and `open_sweep`. Callers append nothing to it."""
         ...
 
     @property
@@ -58,27 +57,27 @@ class Sweep(Protocol):
         """The sweep's name."""
         ...
 
-    # -- that there is one
+    # -- its existence
 
     def exists(self) -> bool:
-        """Whether there is a sweep: from the first `write_record` on. One that may not be looked at exists."""
+        """Whether the sweep exists: from the first `write_record` on. One that may not be read exists too."""
         ...
 
     def create(self) -> None:
-        """Take the name; of several that want it at once, one gets it.
+        """Take the name; of several processes that want it at once, one gets it.
 
         Raises:
-            SpecError: It is taken.
+            SpecError: The name is taken.
             CannotRunError: The storage cannot be written; nothing was made.
         """
         ...
 
     def discard(self) -> None:
-        """Undo `create`, with whatever was written since."""
+        """Undo `create`, including everything that was written since."""
         ...
 
     def rehearsal(self) -> AbstractContextManager[Sweep]:
-        """A sweep beside this one that is created, hidden, and discarded after the block.
+        """Return a hidden sweep beside this one, which is created for the block and discarded after it.
 
         Raises:
             CannotRunError: The storage cannot be written.
@@ -88,10 +87,10 @@ class Sweep(Protocol):
     # -- its record and its parts
 
     def read_record(self) -> SweepRecord:
-        """What the driver wrote last.
+        """Read the record that the driver wrote last.
 
         Raises:
-            NotFoundError: There is none.
+            NotFoundError: There is no record.
             CheckpointError: It is damaged or of a newer format.
         """
         ...
@@ -105,15 +104,15 @@ class Sweep(Protocol):
         ...
 
     def trial(self, trial_id: str) -> Trial:
-        """A trial, whether there is one yet or not.
+        """Return a trial, which need not exist yet.
 
         Raises:
-            NotFoundError: No trial can be called so.
+            NotFoundError: This cannot be a trial's id.
         """
         ...
 
     def read_trials(self) -> list[TrialRecord]:
-        """The records of all trials that have one, by index.
+        """Read the records of all trials that have one, by index.
 
         Raises:
             CheckpointError: One is damaged, of a newer format, or another trial's.
@@ -121,21 +120,21 @@ class Sweep(Protocol):
         ...
 
     def pack(self, pack_id: str) -> Pack:
-        """A pack, whether there is one yet or not.
+        """Return a pack, which need not exist yet.
 
         Raises:
-            NotFoundError: No pack can be called so.
+            NotFoundError: This cannot be a pack's id.
         """
         ...
 
     def checkpoint_folder(self, record: CheckpointRecord) -> Path:
-        """See `Trial.checkpoint_folder`."""
+        """Return a local folder with a checkpoint's files; see `Trial.checkpoint_folder`."""
         ...
 
     # -- who drives it
 
     def lock(self) -> AbstractContextManager[None]:
-        """Be its driver in the block; freed when the process ends, however it ends.
+        """Be the sweep's driver in the block; the lock is freed when the process ends, however it ends.
 
         Raises:
             CannotRunError: Another process holds it, or drives the sweep on a cluster.
@@ -151,15 +150,15 @@ class Sweep(Protocol):
         ...
 
     def is_driven(self) -> bool:
-        """Whether somebody holds one of the locks; nobody is kept from it by this question.
+        """Whether a process holds one of the locks; asking keeps no process from getting it.
 
         Raises:
-            CannotRunError: It cannot be seen.
+            CannotRunError: This cannot be found out.
         """
         ...
 
     def take(self) -> Ownership:
-        """Become its run: no process of an earlier run can take up a trial or a pack any more.
+        """Become the sweep's run: no process of an earlier run can take a trial or a pack any more.
 
         Raises:
             CannotRunError: The sweep cannot be written or locked.
@@ -167,13 +166,13 @@ class Sweep(Protocol):
         ...
 
     def owner(self, token: str) -> Ownership:
-        """The run whose token another process has passed on."""
+        """Return the run whose token another process has passed on."""
         ...
 
     def remove_leftovers(self) -> None:
-        """Remove what processes that were killed left half made, of ended trials too; for who holds its lock.
+        """Remove incomplete files of killed processes, also those of ended trials; the caller has to hold the lock.
 
-        What somebody still writes, here or on another machine, stays.
+        Files that a process still writes, here or on another machine, stay.
 
         Raises:
             CheckpointError: The record of a trial is damaged.
@@ -181,9 +180,9 @@ class Sweep(Protocol):
         ...
 
     def probing(self) -> AbstractContextManager[Probe]:
-        """Ask, in the block, whether other machines see this very sweep; for who holds its lock, before they run it.
+        """Find out in the block whether other machines see the same sweep; the caller has to hold the lock.
 
-        Each is told the probe's `place` and calls `probe.answer` with it; nothing of it is left after the block.
+        Each machine gets the probe's `place` and calls `probe.answer` with it; nothing is left after the block.
 
         Raises:
             CannotRunError: The sweep cannot be written.
@@ -191,38 +190,38 @@ class Sweep(Protocol):
         ...
 
     def request_stop(self) -> None:
-        """Ask the driver to stop; anybody may."""
+        """Ask the driver to stop; any process may."""
         ...
 
     def stop_requested(self) -> bool:
-        """Whether somebody asked since `clear_stop_request`."""
+        """Whether a stop was requested since `clear_stop_request`."""
         ...
 
     def clear_stop_request(self) -> None:
         """Forget the request."""
         ...
 
-    # -- what comes of it
+    # -- its results
 
     def has_best(self) -> bool:
         """Whether a winner has been written."""
         ...
 
     def read_best(self) -> BestRecord:
-        """The winner.
+        """Read the winner's record.
 
         Raises:
-            NotFoundError: None has been chosen.
-            CheckpointError: What was written is damaged, was changed, or is of a newer format.
+            NotFoundError: No winner has been chosen.
+            CheckpointError: The record is damaged, was changed, or has a newer format.
         """
         ...
 
     def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
-        """Replace the winner; the record, which is sealed, comes after the policy, so who sees it finds a policy.
+        """Replace the winner; the sealed record is written after the policy, so that a record always has a policy.
 
         Args:
             record: The winner.
-            policy: Its policy; None: the one that is there.
+            policy: Its policy; None: the present policy is kept.
 
         Raises:
             CannotRunError: It cannot be written.
@@ -244,22 +243,22 @@ class Sweep(Protocol):
         ...
 
     def films(self) -> Mapping[str, Path]:
-        """The films that there are, of before_mp4, after_mp4, after_gif and before_after_mp4, to read only."""
+        """Return the films that exist, of before_mp4, after_mp4, after_gif and before_after_mp4, to read only."""
         ...
 
     def writing_films(self) -> AbstractContextManager[Mapping[str, Path]]:
-        """Where to write each of the films in the block; each file is to appear whole."""
+        """Yield the path for each of the films, to be written in the block; each file has to appear whole."""
         ...
 
     def writing_report(self) -> AbstractContextManager[Path]:
-        """A local folder to write the report into in the block, over the one that is there; each file appears whole.
+        """Yield a local folder to write the report into, over the present one; each file has to appear whole.
 
         Raises:
             CheckpointError: There is a symbolic link in it.
         """
         ...
 
-    # -- what is of this machine and this run alone
+    # -- files of this machine and this run only
 
     @property
     def driver_log(self) -> Path:
@@ -268,7 +267,7 @@ class Sweep(Protocol):
 
     @property
     def tune_folder(self) -> Path:
-        """A local folder for Ray Tune's own state: a cache, which nobody reads in a later run."""
+        """A local folder for Ray Tune's own state, a cache that no later run reads."""
         ...
 
     def clear_tune_folder(self) -> None:
@@ -277,33 +276,33 @@ class Sweep(Protocol):
 
 
 class Storage(Protocol):
-    """Where sweeps are kept."""
+    """A place that stores sweeps by name."""
 
     def sweep(self, name: str) -> Sweep:
-        """The sweep of a name, whether there is one yet or not.
+        """Return the sweep of a name, which need not exist yet.
 
         Raises:
-            NotFoundError: No sweep can be called so.
+            NotFoundError: This cannot be a sweep's name.
         """
         ...
 
     def new_sweep(self, name: str) -> Sweep:
-        """The sweep of a name that is likely free; `Sweep.create` decides.
+        """Return a new sweep of a name that seems to be free; `Sweep.create` decides whether it is.
 
         Raises:
-            NotFoundError: No sweep can be called so.
-            SpecError: It is taken; the message says what to do with what is there.
+            NotFoundError: This cannot be a sweep's name.
+            SpecError: The name is taken; the message says what to do with the present sweep or folder.
         """
         ...
 
     def is_taken(self, name: str) -> bool:
-        """Whether `create` would find the name taken, by a sweep or by what a killed process left of one."""
+        """Whether `create` would find the name taken, by a sweep or by the remains of one."""
         ...
 
     def sweeps(self) -> Sequence[Sweep]:
-        """Those that exist, by name; none where there is no such storage.
+        """Return the sweeps that exist, by name; none if the storage does not exist.
 
         Raises:
-            CheckpointError: It cannot be looked into.
+            CheckpointError: The storage cannot be read.
         """
         ...

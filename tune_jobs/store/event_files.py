@@ -1,4 +1,4 @@
-"""TensorBoard event files, one a trial: `tensorboard --logdir <sweep>/trials`."""
+"""Write TensorBoard event files, one per trial: `tensorboard --logdir <sweep>/trials`."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ class ScalarWriter:
     """Writes a trial's returns and speed against its env steps.
 
     Args:
-        sweep: Whose trials they are.
+        sweep: The sweep that has the trials.
     """
 
     def __init__(self, sweep: Sweep) -> None:
         self._sweep = sweep
-        # Of this run: one that goes on with a trial writes a further file beside the earlier ones.
+        # The files of this run: a run that continues a trial writes one more file beside the earlier ones.
         self._name = f"events.out.tfevents.{int(time.time()):010d}.{time.time_ns() % 10**9:09d}.{socket.gethostname()}"
         self._begun: set[str] = set()
         self._unwritten: defaultdict[str, io.BytesIO] = defaultdict(io.BytesIO)
 
     def write(self, record: TrialRecord, *, evaluated: bool) -> None:
         """Add the trial's current numbers, the evaluation return only where it is new; `flush` writes them to disk."""
-        # Not above: it takes 40 ms beside Ray, which nobody needs before the first result.
+        # Imported here because it takes 40 ms beside Ray, and is not needed before the first result.
         from tensorboard.compat.proto.event_pb2 import Event
         from tensorboard.compat.proto.summary_pb2 import Summary
         from tensorboard.summary.writer.record_writer import RecordWriter

@@ -1,7 +1,7 @@
-"""What a process that was killed leaves half made in a sweep's folder, and who removes it.
+"""Remove the incomplete files that killed processes left in a sweep's folder.
 
-Files appear under a temporary name that tells who writes them (`policies.files`): that of a process that is gone is
-nobody's. Only who holds the sweep's lock removes them.
+Files are written under a temporary name that tells which process writes them (`policies.files`). If that process has
+ended, the file is abandoned. Only the process that holds the sweep's lock removes such files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tune_jobs.store.places import remove_folder
 
 
 def remove_abandoned(sweep_folder: Path, trial_ids: Iterable[str]) -> None:
-    """Remove the files that nobody finishes any more, and a probe; what trials left in checkpoints is theirs."""
+    """Remove abandoned files, and a probe; trials themselves remove what was left in their checkpoints."""
     report = sweep_folder / names.REPORT_FOLDER
     parts = (sweep_folder / names.BEST_FOLDER, sweep_folder / names.PACKS_FOLDER, report, report / names.FIGURES_FOLDER)
     of_trials = (sweep_folder / names.TRIALS_FOLDER / trial_id for trial_id in trial_ids)
@@ -26,7 +26,7 @@ def remove_abandoned(sweep_folder: Path, trial_ids: Iterable[str]) -> None:
                 if is_abandoned(path):
                     with contextlib.suppress(OSError):
                         path.unlink()
-    # The nodes of a cluster are asked about the storage under the lock: nobody is asking now.
+    # A probe is only used under the lock, so none is in use now.
     probe = sweep_folder / names.PROBE_FOLDER
     if probe.is_dir() and not probe.is_symlink():
         remove_folder(probe)

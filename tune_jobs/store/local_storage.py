@@ -1,4 +1,4 @@
-"""Sweeps in the folders of this machine, or of a network file system: the one store there is. See `contract`."""
+"""The local store: sweeps in folders of this machine or of a network file system. See `contract`."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores, name_take
 
 
 def open_storage(folder: Path) -> Storage:
-    """Where sweeps are kept, by its place."""
+    """Return the storage in a folder."""
     return LocalStorage(folder)
 
 
 def open_sweep(folder: Path) -> Sweep:
-    """A sweep by its place, whether there is one yet or not."""
+    """Return the sweep in a folder, which need not exist yet."""
     return SweepStore(folder)
 
 
 class LocalStorage:
-    """A folder with one folder a sweep.
+    """A folder with one folder per sweep; implements `Storage`.
 
     Args:
-        folder: The folder; need not be there.
+        folder: The folder, which need not exist.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def sweep(self, name: str) -> SweepStore:
-        """See `Storage.sweep`."""
+        """Return the sweep of a name, which need not exist yet."""
         if "\0" in name or name in ("", ".", "..") or PurePath(name).name != name:
-            raise NotFoundError(f"{name[:80]!r} is no sweep's name.", "List the sweeps with `tune-jobs list`.")
+            raise NotFoundError(f"{name[:80]!r} cannot be a sweep's name.", "List the sweeps with `tune-jobs list`.")
         return SweepStore(self._folder / name)
 
     def new_sweep(self, name: str) -> SweepStore:
-        """See `Storage.new_sweep`."""
+        """Return a new sweep of a name that seems to be free."""
         if self.is_taken(name):
             raise name_taken(self.sweep(name).folder)
         return self.sweep(name)
 
     def is_taken(self, name: str) -> bool:
-        """See `Storage.is_taken`."""
+        """Whether a folder of this name exists."""
         return self.sweep(name).folder.exists()
 
     def sweeps(self) -> list[SweepStore]:
-        """See `Storage.sweeps`."""
+        """Return the sweeps in the folder, by name."""
         return list_sweep_stores(self._folder)

@@ -1,7 +1,7 @@
-"""Locks between processes, by files; the system frees them when their process ends, however it ends.
+"""Locks between processes, made of files; the system frees them when their process ends, however it ends.
 
-Who holds a lock has it alone (exclusive); who asks whether it is held takes it for a moment, together with others who
-ask (shared). So whoever wants the lock and meets only those who ask knows that it is free, and tries again.
+The holder of a lock has it exclusively. A process that asks whether the lock is held takes it for a moment, shared with
+others that ask. So a process that wants the lock and meets only those that ask knows that it is free, and tries again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from policies.files import refuse_others
 
 _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 _PATIENCE_S = 60.0
-"""Each that asks does so for microseconds, if it is not stopped just then."""
+"""Seconds to try; asking takes only microseconds, unless that process is stopped just then."""
 
 
 @contextlib.contextmanager
@@ -29,8 +29,8 @@ def held(path: Path, message: str, hint: str) -> Iterator[None]:
 
     Args:
         path: The file.
-        message: What to say if another process holds it.
-        hint: What to do then.
+        message: The error's message if another process holds it.
+        hint: The error's hint if another process holds it.
 
     Raises:
         CannotRunError: Another process holds it, or it cannot be written or locked.
@@ -51,13 +51,13 @@ def held(path: Path, message: str, hint: str) -> Iterator[None]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process holds the lock of a file; nobody who wants it is kept from it by this question.
+    """Whether a process holds the lock of a file; asking keeps no process from getting it.
 
     Raises:
         CannotRunError: The file cannot be read.
     """
     try:
-        # Read only: of a sweep of somebody else's, too, one may know whether it runs.
+        # Opened for reading, so that this works for sweeps of other users too.
         descriptor = _opened(path, os.O_RDONLY)
     except FileNotFoundError:
         return False
@@ -69,14 +69,14 @@ def is_held(path: Path) -> bool:
     try:
         return not _try(descriptor, fcntl.LOCK_SH)
     except OSError:
-        # Where nothing can be locked, nothing is.
+        # If the file system has no locks, nothing is locked.
         return False
     finally:
         os.close(descriptor)
 
 
 def _opened(path: Path, flags: int) -> int:
-    # Not through a symbolic link: the file it points to is none of ours. Nor does it wait for a pipe's other end.
+    # A symbolic link is not followed, as its target is not part of the sweep; and a named pipe is not waited for.
     descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
     try:
         refuse_others(os.fstat(descriptor), path)
@@ -87,23 +87,23 @@ def _opened(path: Path, flags: int) -> int:
 
 
 def _take(path: Path, descriptor: int) -> bool:
-    """Lock a file for oneself alone; False: another process holds it."""
+    """Lock a file exclusively; return False if another process holds it."""
     deadline = time.monotonic() + _PATIENCE_S
     try:
         while not _try(descriptor, fcntl.LOCK_EX):
-            # Who shares it with this process only asks; who does not, holds it.
+            # A process that shares the lock with this one only asks; otherwise it holds the lock.
             if not _try(descriptor, fcntl.LOCK_SH):
                 return False
             fcntl.flock(descriptor, fcntl.LOCK_UN)
             if time.monotonic() > deadline:
                 raise CannotRunError(
-                    f"Other processes ask for the lock {path} all the time.",
-                    "End what polls the sweep's status, or let it wait between its questions.",
+                    f"The lock {path} cannot be taken, because other processes ask for it all the time.",
+                    "End the program that polls the sweep's status, or let it wait between two calls.",
                 )
             time.sleep(random.uniform(0.0, 0.01))
     except OSError as error:
         raise CannotRunError(
-            f"{path} cannot be locked: {error.strerror}.", "Choose storage whose file system has locks."
+            f"{path} cannot be locked: {error.strerror}.", "Choose a storage folder whose file system has locks."
         ) from error
     return True
 

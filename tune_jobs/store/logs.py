@@ -1,7 +1,7 @@
-"""What the log of a process says of its end: its last lines, or where it hung.
+"""Find the lines of a process's log that tell how it ended: its last lines, or where it hung.
 
-One process after the other appends to a log. Each begins with a line of its own, by which the last one is found. One
-that hangs is ended by faulthandler, which writes the frames of all its threads: of dozens of lines those of one matter.
+One process after the other appends to a log. Each begins with a line of its own, by which the last process is found. A
+process that hangs is ended by faulthandler, which writes the frames of all threads, of which only one thread's matter.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from policies.files import open_regular
 _TAIL_BYTES = 200_000
 _TIMEOUT_MARK = "Timeout ("
 _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
-# Where a trial's own thread is, and where code of this package calls that of an environment.
+# Files with the loops of a trial's own thread, and files from which this package calls an environment's code.
 _LOOPS = (
     "/tune_jobs/ray_tune/trainable.py",
     "/tune_jobs/training/trial_loop.py",
@@ -32,22 +32,22 @@ _CALLERS = (
 
 
 def log_mark(what: str) -> str:
-    """How the first line of each process begins, in the log of something such as "trial t0003"."""
+    """Return the beginning of each process's first line, in the log of something such as "trial t0003"."""
     return f"-- {what}, process "
 
 
 def begin_log(what: str) -> None:
-    """Print what tells the output of this process, which goes to the log, from that of earlier ones."""
+    """Print the line that separates this process's output, which goes to the log, from that of earlier ones."""
     print(f"{log_mark(what)}{os.getpid()}", flush=True)
 
 
 def log_tail(path: Path, what: str = "", num_lines: int = 15) -> str:
-    """The lines that say how the last process of a log ended.
+    """Return the lines that say how the last process of a log ended.
 
     Args:
         path: The log.
-        what: Whose it is, as `begin_log` was told; empty: nobody's first line is looked for.
-        num_lines: At most so many lines, after one that says that the process was ended because it hung.
+        what: The argument of `begin_log`; empty: no first line is looked for.
+        num_lines: The most lines, after one that says that the process was ended because it hung.
 
     Returns:
         The frames of the thread that hung, or the last lines; empty if there is no log.
@@ -68,7 +68,7 @@ def log_tail(path: Path, what: str = "", num_lines: int = 15) -> str:
 
 
 def hang_in(tail: str) -> tuple[bool, Frame | None]:
-    """Whether a log's tail is of a process that hung, and the environment's frame, or else the innermost one."""
+    """Return whether the process of a log's tail hung, and the environment's frame or else the innermost one."""
     first, *lines = tail.splitlines() or [""]
     frames = [
         Frame(found["file"], int(found["line"]), found["name"]) for line in lines if (found := _FRAME.match(line))
@@ -77,10 +77,10 @@ def hang_in(tail: str) -> tuple[bool, Frame | None]:
 
 
 def died_by(tail: str, timeout_s: float) -> str:
-    """What ended a process that hung, in words; empty if it did not hang.
+    """Say why a process that hung was ended; empty if it did not hang.
 
     Args:
-        tail: As `log_tail` gives it.
+        tail: The result of `log_tail`.
         timeout_s: The sweep's `iteration_timeout_s`.
     """
     has_hung, frame = hang_in(tail)
@@ -91,7 +91,7 @@ def died_by(tail: str, timeout_s: float) -> str:
 
 
 def _hung_thread(lines: list[str]) -> list[str]:
-    """Of the frames of all threads those of the trial's own; faulthandler writes the main thread last."""
+    """Return the frames of the trial's own thread; faulthandler writes the main thread last."""
     threads: list[list[str]] = [[]]
     for line in lines:
         if line.startswith(("Thread 0x", "Current thread 0x")):
@@ -103,6 +103,6 @@ def _hung_thread(lines: list[str]) -> list[str]:
 
 
 def _frame_of_env(frames: list[Frame]) -> Frame:
-    """The env's own, if it was called; else the innermost."""
+    """Return the env's own frame if it was called, else the innermost one."""
     callers = [index for index, frame in enumerate(frames) if frame.file.endswith(_CALLERS)]
     return (frame_of_env(frames[: callers[0]]) if callers else None) or frames[0]

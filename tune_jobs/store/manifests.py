@@ -1,8 +1,8 @@
-"""Manifests: what a checkpoint folder holds, what it scored, and whether both are as they were written.
+"""Write and check manifests, which list the files of a checkpoint folder and its scores.
 
-A manifest names every file of the folder with its size and hash, and since format 2 carries the hash of itself, so that
-an edited score is found. It is no signature: who may write to the folder can write another manifest with its hash. The
-score is in `results.jsonl` too, and `tune_jobs.store.candidates` compares them.
+A manifest names every file of the folder with its size and hash. Since format 2 it includes a hash of itself, so that
+an edited score is noticed. This is not a signature: anyone who may write to the folder can write another manifest with
+its hash. The score is in `results.jsonl` too, and `tune_jobs.store.candidates` compares both.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _HINT = "Use another checkpoint of the trial, or restore the file from a backup.
 
 
 def write_manifest(folder: Path, record: CheckpointRecord, engine: str = "") -> None:
-    """Write the manifest of a checkpoint folder that is filled and not seen yet, and wait until all is on disk.
+    """Write the manifest of a filled checkpoint folder that is not visible yet, and wait until all is on disk.
 
     Args:
         folder: The folder.
-        record: What it scored.
-        engine: Name of the engine that wrote it; empty: it is not known, and the manifest does not say.
+        record: The checkpoint's record, with its scores.
+        engine: Name of the engine that wrote it; empty: not known, and left out.
     """
     files = {
         name: {"bytes": path.stat().st_size, "sha256": sha256_file(path)} for name, path in _files_in(folder).items()
@@ -41,12 +41,12 @@ def write_manifest(folder: Path, record: CheckpointRecord, engine: str = "") -> 
 
 
 def is_checkpoint(folder: Path) -> bool:
-    """Whether a folder is a checkpoint's, by its manifest; what it says is not looked at."""
+    """Whether a folder is a checkpoint's, judged by whether it has a manifest, which is not read."""
     return (folder / MANIFEST).is_file()
 
 
 def read_manifest(checkpoint: Path) -> CheckpointRecord:
-    """The record in a checkpoint's manifest.
+    """Read the record in a checkpoint's manifest.
 
     Raises:
         NotFoundError: The folder or its manifest is missing.
@@ -56,7 +56,7 @@ def read_manifest(checkpoint: Path) -> CheckpointRecord:
 
 
 def read_engine_name(checkpoint: Path) -> str | None:
-    """The engine that a checkpoint's manifest names; None: it is from before manifests named any.
+    """Read the engine's name in a checkpoint's manifest; None: the manifest is of a version without names.
 
     Raises:
         NotFoundError: The folder or its manifest is missing.
@@ -101,7 +101,7 @@ def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
     refuse_link(path)
     if not path.is_file():
         raise CheckpointError(
-            f"Checkpoint {checkpoint} has no {MANIFEST}: it is not one, or was not written whole.",
+            f"Checkpoint {checkpoint} has no {MANIFEST}: it is not a checkpoint, or was not completely written.",
             "Use another checkpoint of the trial, or delete this folder.",
         )
     data = read_json(path, "checkpoint manifest", is_sealed=True)
@@ -111,15 +111,15 @@ def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
 
 
 def _described_files(manifest: Path, files: Any) -> dict[str, tuple[int, str]]:
-    """Size and hash by name, once it is certain that they are that, and that what every checkpoint has is named."""
+    """Return size and hash by file name, after checking their form and that the files of every checkpoint are named."""
     if not isinstance(files, dict):
         raise CheckpointError(f"{manifest}: files is {_shown(files)}, not a mapping of names.", _HINT)
     described = {}
     for name, entry in files.items():
         path = PurePosixPath(name)
-        # As `write_manifest` writes them; so none can lead out of the folder, nor be another's second name.
+        # Only names as `write_manifest` writes them: these cannot lead out of the folder, nor name the same file twice.
         if path.is_absolute() or ".." in path.parts or str(path) != name or "\0" in name or not path.parts:
-            raise CheckpointError(f"{manifest}: files names {name[:80]!r}, which is no file in the folder.", _HINT)
+            raise CheckpointError(f"{manifest}: files names {name[:80]!r}, which is not a file in the folder.", _HINT)
         size, digest = (entry.get("bytes"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
         if type(size) is not int or not isinstance(digest, str) or _SHA256.fullmatch(digest) is None:
             raise CheckpointError(f"{manifest}: files.{name} is {_shown(entry)}, not a size and a SHA-256.", _HINT)
@@ -128,12 +128,12 @@ def _described_files(manifest: Path, files: Any) -> dict[str, tuple[int, str]]:
         if name not in described:
             raise CheckpointError(f"{manifest}: files does not name {name}, which every checkpoint has.", _HINT)
     if len(described) == len(_POLICY_FILES):
-        raise CheckpointError(f"{manifest}: files names nothing that training could go on from.", _HINT)
+        raise CheckpointError(f"{manifest}: files names no state from which training could continue.", _HINT)
     return described
 
 
 def _files_in(folder: Path) -> dict[str, Path]:
-    """The files of a checkpoint by name, without its manifest.
+    """Return the files of a checkpoint by name, without its manifest.
 
     Raises:
         CheckpointError: Something in it is a symbolic link, or neither a file nor a folder.

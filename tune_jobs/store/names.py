@@ -1,6 +1,6 @@
-"""What the parts of a sweep are called.
+"""The file names of the parts of a sweep.
 
-Nobody outside this package puts a path of a sweep together. Messages that have to name a file take its name from here.
+No code outside this package builds paths of a sweep. Messages that name a file take its name from here.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ FILMS = {
     "after_gif": "after.gif",
     "before_after_mp4": "before_after.mp4",
 }
-"""Of the winner and of a random policy, in the folder of the best."""
+"""The films of the winner and of a random policy, in the folder of the best."""
 REPORT_FOLDER = "report"
 FIGURES_FOLDER = "figures"
-"""In the report's folder."""
+"""The report's page, in the report's folder."""
 
 LOCK = ".lock"
 DRIVER_LOCK = ".driver-lock"

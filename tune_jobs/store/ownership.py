@@ -1,12 +1,12 @@
-"""Who may write: of several processes that took something up one after the other, the last one.
+"""Decide who may write: of several processes that took something one after the other, only the last one.
 
-A sweep that is run, a pack and a trial have an owner each: the process that took it up last. Its epoch, larger than all
-before, is in the file `.owner` of the sweep, of the trial, or of the pack. Who writes holds that file's lock and finds
-its own epoch there, so no other process can take it up between the check and the write; who finds another one has lost
-what it owned and leaves it alone. So a process that outlives its driver, or that everybody believes dead, can do no
-harm: it may still compute, but nothing of it is written.
+A running sweep, a pack and a trial each have an owner: the process that took it last. The owner's epoch, larger than
+all before, is in the file `.owner` of the sweep, the trial or the pack. A process that writes holds that file's lock
+and checks that the epoch is its own, so no other process can take it between the check and the write. If the epoch is
+another one, the process has lost its ownership and stops writing. So a process that outlives its driver can do no harm:
+it may still compute, but it writes nothing.
 
-A trial is taken up under its pack's or its sweep's owner: a process of an earlier run can't take it back.
+A trial is taken under its pack's or its sweep's owner, so that a process of an earlier run can't take it back.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from tune_jobs.store.names import OWNER
 from tune_jobs.store.places import within
 from tune_jobs.store.trial_contract import Ownership
 
-# One write of this many bytes replaces all that was there: a kill leaves the old content or the new.
+# A single write of this length replaces the whole content, so a kill leaves either the old content or the new.
 _LINE_BYTES = 128
 _PATIENCE_S = 60.0
 _BUSY = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
 class OwnershipLostError(CannotRunError):
-    """Another process has taken up what this one was working on: it must not write there any more."""
+    """Another process has taken over the work of this one, which must not write there any more."""
 
 
 class Owner:
@@ -44,21 +44,21 @@ class Owner:
 
     Args:
         path: The owner file.
-        token: What it holds as long as nobody else has taken it up: its line.
+        token: The owner's line, which the file contains until another process becomes the owner.
     """
 
     def __init__(self, path: Path, token: str) -> None:
         self.path = path
         self.token = token
         self._descriptor: int | None = None
-        # Locks of files are between processes; this one is between the threads of this process.
+        # File locks work between processes; this lock works between the threads of this process.
         self._lock = threading.Lock()
 
     def __del__(self) -> None:
         self._close()
 
     def release(self) -> None:
-        """Close its file, which is opened again if it is needed: who holds this object may be in no hurry to let go."""
+        """Close the owner file, which is opened again if it is needed."""
         with self._lock:
             self._close()
 
@@ -70,14 +70,14 @@ class Owner:
 
     @classmethod
     def take(cls, path: Path, under: Ownership | None = None) -> Owner:
-        """Become the owner; whoever was it before has lost it.
+        """Become the owner; the owner before has lost it.
 
         Args:
-            path: The owner file; made if it is missing.
-            under: Of what it is a part of: it is taken only as long as that is still owned.
+            path: The owner file; it is made if it is missing.
+            under: The ownership of what this is a part of; it has to be current.
 
         Raises:
-            OwnershipLostError: `under` has been taken by another process.
+            OwnershipLostError: Another process has taken `under`.
             CannotRunError: The file cannot be written or locked.
         """
         owner = cls(path, "")
@@ -85,7 +85,7 @@ class Owner:
             if under is not None:
                 under.check()
             number, _, _ = _read(descriptor).partition(" ")
-            # After a line that can't be read the epochs begin anew; the random part still tells them apart.
+            # If the line can't be read, epochs begin anew; the random part still distinguishes the owners.
             epoch = int(number) + 1 if number.isdecimal() else 1
             line = f"{epoch} {secrets.token_hex(8)} {os.getpid()} {socket.gethostname()}"
             owner.token = line.encode("ascii", "replace")[: _LINE_BYTES - 1].decode("ascii").strip()
@@ -94,10 +94,10 @@ class Owner:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Write in the block: nobody can take it up meanwhile. Not to be nested.
+        """Hold the lock in the block, so that no other process can become the owner meanwhile; not to be nested.
 
         Raises:
-            OwnershipLostError: Another process has taken it up.
+            OwnershipLostError: Another process has become the owner.
             CannotRunError: The file cannot be locked.
         """
         with self._locked() as descriptor:
@@ -106,10 +106,10 @@ class Owner:
             yield
 
     def is_current(self) -> bool:
-        """Whether nobody else has taken it up, as far as can be seen without the lock.
+        """Whether no other process has become the owner, as far as can be seen without the lock.
 
         Raises:
-            OSError: The file is there and cannot be read.
+            OSError: The file exists but cannot be read.
         """
         try:
             return _line(self.path) == self.token
@@ -117,10 +117,10 @@ class Owner:
             return False
 
     def check(self) -> None:
-        """Raise if another process has taken it up.
+        """Raise an error if another process has become the owner.
 
         Raises:
-            OwnershipLostError: It has.
+            OwnershipLostError: Another process has.
         """
         if not self.is_current():
             raise self._lost()
@@ -146,7 +146,7 @@ class Owner:
                 fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
     def _wait(self, descriptor: int) -> None:
-        """Lock the file; others hold it for milliseconds."""
+        """Lock the file, which other processes hold only for milliseconds."""
         deadline, pause_s = time.monotonic() + _PATIENCE_S, 0.001
         while True:
             try:
@@ -159,8 +159,8 @@ class Owner:
             if time.monotonic() > deadline:
                 raise CannotRunError(
                     f"{self.path} has been locked for {_PATIENCE_S:.0f} s by {_read(descriptor) or 'nobody'!r} "
-                    "(epoch, key, process, machine), which may be stopped or wait for its disk.",
-                    "End that process, then go on with the sweep.",
+                    "(epoch, key, process, machine). That process may be stopped, or may wait for its disk.",
+                    "End that process, then resume the sweep.",
                 )
             time.sleep(pause_s)
             pause_s = min(0.05, 2 * pause_s)
@@ -170,13 +170,13 @@ class Owner:
         with contextlib.suppress(OSError):
             by = " ".join(_line(self.path).split()[2:])
         return OwnershipLostError(
-            f"{self.path.parent} has been taken up by another process" + (f" ({by})." if by else "."),
-            "Leave it to that one; this one writes nothing there any more.",
+            f"{self.path.parent} has been taken over by another process" + (f" ({by})." if by else "."),
+            "Leave it to that process; this one writes nothing there any more.",
         )
 
 
 class OwnedFolder:
-    """A folder that one process at a time writes to: the one that took it last."""
+    """A folder that only one process at a time writes to: the one that took it last."""
 
     _owner: Owner | None = None
 
@@ -189,12 +189,12 @@ class OwnedFolder:
         """Become the process that writes here; see `Owner.take`.
 
         Raises:
-            OwnershipLostError: `under` is another's by now.
+            OwnershipLostError: Another process has taken `under`.
         """
         self._owner = Owner.take(within(self.folder, OWNER), under)
 
     def owned(self) -> AbstractContextManager[None]:
-        """What is entered around each write; nothing to who only reads, and has not taken the folder.
+        """Return the context manager for each write; it does nothing in a process that has not taken the folder.
 
         Raises:
             OwnershipLostError: Another process has taken it.
@@ -202,7 +202,7 @@ class OwnedFolder:
         return contextlib.nullcontext() if self._owner is None else self._owner.held()
 
     def is_lost(self) -> bool:
-        """Whether this process has taken the folder, and another one after it."""
+        """Whether this process has taken the folder, and another one has taken it since."""
         return self._owner is not None and not self._owner.is_current()
 
 

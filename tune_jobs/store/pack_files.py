@@ -1,4 +1,4 @@
-"""What lies in a sweep's `packs` folder: whom each pack is to train, and what its process printed.
+"""The files in a sweep's `packs` folder: which trials each pack has to train, and the logs of the packs.
 
 The process that drives the sweep writes `<pack>.json`, the pack reads it before every step and writes `<pack>.log`.
 """
@@ -20,14 +20,14 @@ __all__ = ["Assignment", "PackFiles"]
 
 
 class PackFiles:
-    """The files of one pack.
+    """The files of one pack; implements `Pack`.
 
     Args:
         sweep_folder: The sweep's folder.
         pack_id: `p00` and so on.
 
     Raises:
-        NotFoundError: No pack is called so.
+        NotFoundError: This cannot be a pack's id.
     """
 
     def __init__(self, sweep_folder: Path, pack_id: str) -> None:
@@ -36,24 +36,24 @@ class PackFiles:
 
     @property
     def assignment_path(self) -> Path:
-        """Of `<pack>.json`."""
+        """The path of `<pack>.json`."""
         return within(self._sweep_folder, names.PACKS_FOLDER, f"{self.pack_id}.json")
 
     @property
     def log_path(self) -> Path:
-        """Of `<pack>.log`."""
+        """The path of `<pack>.log`."""
         return within(self._sweep_folder, names.PACKS_FOLDER, f"{self.pack_id}.log")
 
     @property
     def owner_path(self) -> Path:
-        """Of what says which process is the pack."""
+        """The path of the file that says which process runs the pack."""
         return within(self._sweep_folder, names.PACKS_FOLDER, f".{self.pack_id}{names.OWNER}")
 
     def take(self, under: Ownership | None = None) -> Owner:
-        """Become the process that is this pack; see `Owner.take`.
+        """Become the process that runs this pack; see `Owner.take`.
 
         Raises:
-            OwnershipLostError: `under` is another's by now.
+            OwnershipLostError: Another process has taken `under`.
         """
         return Owner.take(self.owner_path, under)
 
@@ -63,10 +63,10 @@ class PackFiles:
         write_atomic(self.assignment_path, json.dumps(data) + "\n")
 
     def read(self) -> Assignment:
-        """The assignment.
+        """Read the assignment.
 
         Raises:
-            CheckpointError: It is not there, or cannot be read.
+            CheckpointError: It does not exist, or cannot be read.
         """
         try:
             data = json.loads(read_regular(self.assignment_path))
@@ -75,16 +75,16 @@ class PackFiles:
             return Assignment(trial_ids, failures)
         except (OSError, NotFoundError, *MALFORMED) as error:
             raise CheckpointError(
-                f"{self.assignment_path} does not tell whom pack {self.pack_id} is to train: {repr(error)[:400]}.",
+                f"{self.assignment_path} does not say which trials pack {self.pack_id} trains: {repr(error)[:400]}.",
                 "Check that all nodes see the sweep folder, and resume the sweep.",
             ) from error
 
     def begin_log(self) -> None:
-        """See `logs.begin_log`."""
+        """Print the line that separates this process's output from that of earlier ones."""
         begin_log(self._what)
 
     def log_tail(self, num_lines: int = 15) -> str:
-        """See `logs.log_tail`: of the pack's last process."""
+        """Return the lines that say how the pack's last process ended."""
         return log_tail(self.log_path, self._what, num_lines)
 
     @property

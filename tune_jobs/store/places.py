@@ -1,9 +1,8 @@
-"""What the parts of a sweep folder may be called, and that none of them leads out of it.
+"""Check the names of the parts of a sweep folder, so that no path leads out of it.
 
-A sweep folder may have been edited, or come from somebody else. So nothing that is read from its files names a place:
-trials, checkpoints and packs are found by their numbers. And no symbolic link in it is followed: what is read, written
-or deleted through one lies elsewhere. (The sweep folder itself, and what it lies in, may be links: these are named by
-whoever runs the command.)
+A sweep folder may have been edited, or come from somebody else. So no path is taken from its files: trials, checkpoints
+and packs are found by their numbers. And no symbolic link in it is followed, because its target is elsewhere. (The
+sweep folder itself, and the folders above it, may be links, because the user who runs the command has named them.)
 """
 
 from __future__ import annotations
@@ -21,45 +20,45 @@ _PACK_ID = re.compile(r"p[0-9]{2,9}")
 
 
 def is_trial_id(name: str) -> bool:
-    """Whether a trial can be called so."""
+    """Whether this can be a trial's id."""
     return _TRIAL_ID.fullmatch(name) is not None
 
 
 def check_trial_id(name: str) -> str:
-    """Return a trial's id if a trial can be called so.
+    """Return a trial's id if it can be one.
 
     Raises:
-        NotFoundError: It cannot.
+        NotFoundError: It cannot be a trial's id.
     """
     if not is_trial_id(name):
         raise NotFoundError(
-            f"{name[:80]!r} is no trial's id; they are t0000, t0001 and so on.", "List them with `tune-jobs trials`."
+            f"{name[:80]!r} is not a trial's id; they are t0000, t0001 and so on.", "List them with `tune-jobs trials`."
         )
     return name
 
 
 def check_pack_id(name: str) -> str:
-    """Return a pack's id if a pack can be called so.
+    """Return a pack's id if it can be one.
 
     Raises:
-        NotFoundError: It cannot.
+        NotFoundError: It cannot be a pack's id.
     """
     if _PACK_ID.fullmatch(name) is None:
-        raise NotFoundError(f"{name[:80]!r} is no pack's id; they are p00, p01 and so on.")
+        raise NotFoundError(f"{name[:80]!r} is not a pack's id; they are p00, p01 and so on.")
     return name
 
 
 def checkpoint_iteration(name: str) -> int | None:
-    """The iteration that a checkpoint folder is called by, or None if a checkpoint is not called so."""
+    """Return the iteration in the name of a checkpoint folder, or None if this is not such a name."""
     return int(name) if _CHECKPOINT_NAME.fullmatch(name) is not None else None
 
 
 def within(folder: Path, *parts: str) -> Path:
-    """A place in a folder, once it is certain that no link on the way leads elsewhere.
+    """Return a path in a folder, after checking that no part of it is a link.
 
     Args:
-        folder: Of the sweep, or in it; not looked at itself.
-        parts: Names below each other, each of one part.
+        folder: The sweep's folder or one in it, which is not checked itself.
+        parts: The names of the path below the folder, one part each.
 
     Raises:
         CheckpointError: One of them is a symbolic link.
@@ -72,10 +71,10 @@ def within(folder: Path, *parts: str) -> Path:
 
 
 def refuse_link(path: Path) -> None:
-    """Check that a part of a sweep folder is no symbolic link.
+    """Check that a part of a sweep folder is not a symbolic link.
 
     Raises:
-        CheckpointError: It is one, or cannot be looked at.
+        CheckpointError: It is one, or this cannot be found out.
     """
     try:
         is_link = path.is_symlink()
@@ -84,15 +83,15 @@ def refuse_link(path: Path) -> None:
     if is_link:
         raise CheckpointError(
             f"{path} is a symbolic link; links in a sweep folder are not followed.",
-            "Remove the link, or replace it with what it points to.",
+            "Remove the link, or replace it with the file or folder that it points to.",
         )
 
 
 def refuse_links_in(folder: Path) -> Path:
-    """Return a folder, which need not be there, if neither it nor anything in it is a symbolic link.
+    """Return a folder, which need not exist, if neither it nor anything in it is a symbolic link.
 
     Raises:
-        CheckpointError: Something is.
+        CheckpointError: There is a symbolic link.
     """
     refuse_link(folder)
     for path in folder.rglob("*"):
@@ -101,10 +100,10 @@ def refuse_links_in(folder: Path) -> Path:
 
 
 def parts_of(folder: Path) -> list[Path]:
-    """What lies in a folder; nothing if it is none.
+    """Return the contents of a folder; none if it is not a folder.
 
     Raises:
-        CheckpointError: It cannot be looked into.
+        CheckpointError: It cannot be read.
     """
     try:
         return list(folder.iterdir()) if folder.is_dir() else []
@@ -114,44 +113,44 @@ def parts_of(folder: Path) -> list[Path]:
 
 def _unseen(path: Path, error: OSError) -> CheckpointError:
     return CheckpointError(
-        f"{path} cannot be looked at: {error.strerror or error}.", "Check the permissions of the folders it lies in."
+        f"{path} cannot be read: {error.strerror or error}.", "Check the permissions of the folders above it."
     )
 
 
 def remove_folder(folder: Path) -> None:
-    """Delete a folder with all that is in it, if it is there; of links the names alone, never what they point to.
+    """Delete a folder and its contents, if it exists; links in it are removed, but never what they point to.
 
     Args:
-        folder: As `within` gave it.
+        folder: A result of `within`.
 
     Raises:
         CheckpointError: It is a symbolic link.
     """
     refuse_link(folder)
-    # It leaves links in the folder unfollowed by itself.
+    # rmtree does not follow links in the folder.
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder that is not there yet, and those above it.
+    """Make a folder, if it does not exist, and those above it.
 
     Raises:
-        CannotRunError: It cannot be made: something else is in its place, say.
+        CannotRunError: It cannot be made, for example because there is a file of that name.
     """
     try:
         folder.mkdir(parents=True)
     except OSError as error:
         raise CannotRunError(
             f"The folder {folder} cannot be made: {error.strerror or error}.",
-            "Check that what it lies in is a folder, is writable and has free space.",
+            "Check that the path above it is a folder, is writable and has free space.",
         ) from error
 
 
 def remove_file(path: Path) -> None:
-    """Delete a file, if it is there.
+    """Delete a file, if it exists.
 
     Raises:
-        CannotRunError: It cannot be deleted: it is a folder, say.
+        CannotRunError: It cannot be deleted, for example because it is a folder.
     """
     try:
         path.unlink(missing_ok=True)

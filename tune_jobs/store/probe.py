@@ -1,6 +1,6 @@
-"""Whether other machines see the very folder of a sweep that is seen here: asked before the sweep runs on them.
+"""Find out whether other machines see the same sweep folder as this one, before the sweep runs on them.
 
-Who holds the sweep's lock asks; each machine reads the question and leaves an answer beside it.
+The process that holds the sweep's lock asks; each machine reads the question and leaves an answer beside it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _QUESTION = "question"
 
 
 class Probe:
-    """A question that was asked in a sweep's folder.
+    """A question in a sweep's folder.
 
     Args:
-        folder: Where question and answers lie.
-        token: The question: chance.
+        folder: The folder of the question and the answers.
+        token: The question, a random text.
     """
 
     def __init__(self, folder: Path, token: str) -> None:
@@ -30,15 +30,15 @@ class Probe:
 
     @property
     def place(self) -> str:
-        """What a machine is told, for `answer`."""
+        """The text that a machine has to pass to `answer`."""
         return str(self._folder)
 
     def is_same(self, question: str, machine: str) -> bool:
-        """Whether a machine has read the question that was asked, and its answer is seen here.
+        """Whether a machine has read this question, and its answer can be seen here.
 
         Args:
-            question: As `answer` returned it there.
-            machine: As `answer` was told.
+            question: The result of `answer` on that machine.
+            machine: The machine's name, as passed to `answer`.
         """
         try:
             return question == self._token == (self._folder / machine).read_text(encoding="utf-8")
@@ -48,7 +48,7 @@ class Probe:
 
 @contextlib.contextmanager
 def probing(sweep_folder: Path) -> Iterator[Probe]:
-    """Ask in a sweep's folder, and leave nothing of it behind.
+    """Ask a question in a sweep's folder, and remove it with its answers after the block.
 
     Raises:
         CannotRunError: The folder cannot be written.
@@ -66,14 +66,14 @@ def probing(sweep_folder: Path) -> Iterator[Probe]:
 
 
 def answer(place: str, machine: str) -> str:
-    """On another machine: read the question, and leave an answer.
+    """Read the question on another machine, and leave an answer.
 
     Args:
-        place: Of the probe.
-        machine: Which one this is.
+        place: The probe's place.
+        machine: A name of this machine.
 
     Raises:
-        FileNotFoundError: The folder is not seen here.
+        FileNotFoundError: The folder cannot be seen here.
     """
     question = Path(place, _QUESTION).read_text(encoding="utf-8")
     write_atomic(Path(place, machine), question)

@@ -1,7 +1,7 @@
-"""The files of a sweep folder that are one record each, as JSON.
+"""Read and write the files of a sweep folder that hold one record each, as JSON.
 
-What others are chosen by is *sealed*: it carries the SHA-256 of everything else in it, as JSON with sorted keys and
-without spaces. Format 1 had no seals.
+Records by which a winner is chosen are *sealed*: they include the SHA-256 of everything else in them, as JSON with
+sorted keys and without spaces. Format 1 had no seals.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ _MAX_DEPTH = 256
 
 
 def dump(record: BaseModel, indent: int | None = 1) -> str:
-    """A record as it is written, with the end of its last line."""
+    """Return a record as it is written, with a newline at the end."""
     return record.model_dump_json(indent=indent) + "\n"
 
 
 def dump_sealed(record: BaseModel, **more: Any) -> str:
-    """A record as it is written, with further fields and a seal."""
+    """Return a record as it is written, with more fields and a seal."""
     data = json.loads(record.model_dump_json()) | more | {"format_version": FORMAT_VERSION}
     return json.dumps({**data, _SEAL: seal(data)}, indent=1) + "\n"
 
 
 def seal(data: dict[str, Any]) -> str:
-    """The hash of everything in a file but the hash itself."""
+    """Return the hash of everything in a file except the hash itself."""
     content = {name: value for name, value in data.items() if name != _SEAL}
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
@@ -49,9 +49,9 @@ def read_record(path: Path, kind: type[_RecordT], what: str, *, is_sealed: bool 
 
     Args:
         path: Its file.
-        kind: What it must be.
-        what: What to call it in messages.
-        is_sealed: Whether it has to carry its seal.
+        kind: Its class.
+        what: Its name in messages.
+        is_sealed: Whether it has to have a seal.
 
     Raises:
         NotFoundError: There is no such file.
@@ -64,7 +64,7 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
     """Read the fields of a record; see `read_record`."""
     try:
         data = json.loads(read_regular(path), object_pairs_hook=_once_each, parse_constant=_refuse_constant)
-        # Half a pair of surrogates is JSON, but no text that could be shown or written again.
+        # Half a pair of surrogates is valid JSON, but cannot be printed or written again.
         json.dumps(data, ensure_ascii=False).encode()
         _refuse_depth(data)
     except FileNotFoundError as error:
@@ -75,7 +75,7 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
             "Restore the file from a backup, or delete the folder.",
         ) from error
     if not isinstance(data, dict):
-        raise CheckpointError(f"{path} is not a valid {what}: it is no JSON object.", _BACKUP)
+        raise CheckpointError(f"{path} is not a valid {what}: it is not a JSON object.", _BACKUP)
     version = data.get("format_version", FORMAT_VERSION)
     if type(version) is not int or version < 1:
         raise CheckpointError(f"{path} is not a valid {what}: format_version is {version!r:.80}.", _BACKUP)
@@ -87,18 +87,18 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
     if is_sealed and (version >= _FIRST_SEALED_VERSION or _SEAL in data) and data.get(_SEAL) != _seal_of(data):
         raise CheckpointError(
             f"{path} is not the {what} that was written (its SHA-256 differs).",
-            "Restore the file from a backup: what it says now is not used.",
+            "Restore the file from a backup: its present content is not used.",
         )
     return data
 
 
 def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object whose names differ: of two values readers would not take the same one."""
+    """Return an object, or refuse it if a name occurs twice, as different readers would use different values."""
     data = dict(pairs)
     if len(data) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in data if names.count(name) > 1)
-        raise ValueError(f"{twice[:80]!r} is there twice")
+        raise ValueError(f"{twice[:80]!r} occurs twice")
     return data
 
 
@@ -126,10 +126,10 @@ def _seal_of(data: dict[str, Any]) -> str | None:
 
 
 def parse_record(data: dict[str, Any], path: Path, kind: type[_RecordT], what: str) -> _RecordT:
-    """The record that was read from a file.
+    """Return the record that was read from a file.
 
     Raises:
-        CheckpointError: It is none; the message names the file and the field.
+        CheckpointError: It is not valid; the message names the file and the field.
     """
     try:
         return kind.model_validate(data)
@@ -140,7 +140,7 @@ def parse_record(data: dict[str, Any], path: Path, kind: type[_RecordT], what: s
 
 
 def problems_in(error: ValidationError) -> str:
-    """The first field that is wrong, why, and how many more there are."""
+    """Return the first field that is wrong, why it is, and how many more there are."""
     first, *others = details_of(error)
     text = f"{dotted(first['loc'])} {explain(first)}."
     return text.strip()[:300] + (f" (and {len(others)} more)" if others else "")

@@ -1,4 +1,4 @@
-"""The records of a run's trials: kept in memory, told to a listener at once, written to disk when it is worth it."""
+"""Keep the records of a run's trials in memory, pass changes to a listener, and write them to disk when due."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from tune_jobs.store.progress import Progress
 
 Listener = Callable[[TrialRecord], None]
 Change = Callable[[TrialRecord], TrialRecord]
-"""What becomes of a trial's record; see `transitions`."""
+"""A function that changes a trial's record; see `transitions`."""
 
-# A record is synced to disk, which takes about a millisecond: those of running trials are not written more often.
+# Syncing a record to disk takes about a millisecond, so those of running trials are not written more often.
 _WRITES_PER_S = 20.0
 
 
 class RecordKeeper:
-    """Turns what becomes of trials into their records.
+    """Updates the records of trials by what happens to them.
 
-    That a trial runs no more is written by the next `flush`; of those that run it writes as many as it has time for.
+    The next `flush` writes the records of all trials that have stopped running, and as many others as it has time for.
 
     Args:
         store: The sweep.
         trial_ids: The trials of this run.
         listener: Called with a trial's record whenever it changes.
-        clock: Seconds, monotonic.
-        run: The run whose trials they are; what a run writes that has been taken up by another is an
-            `OwnershipLostError`. None: nobody else can run the sweep.
+        clock: A monotonic clock, in seconds.
+        run: The ownership of the run; if another run has taken over, writes raise `OwnershipLostError`. None: no
+            other process can run the sweep.
     """
 
     def __init__(
@@ -53,19 +53,19 @@ class RecordKeeper:
         self._listener = listener
         self._clock = clock
         self._scalars = ScalarWriter(store)
-        # Trials whose record on disk is not the newest, and when it was written.
+        # Trials whose record on disk is not the newest, and when it was last written.
         self._changed: set[str] = set()
         self._written_at: dict[str, float] = {}
         self._num_writes_due, self._flushed_at = _WRITES_PER_S, clock()
         self.running: set[str] = set()
-        """Trials that a process has."""
+        """The trials that a process runs."""
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tune pickles who drives it into a file that is never read back here; listeners and open files can't be.
+        # Tune pickles this object into a file that is never read back; listeners and open files can't be pickled.
         return {}
 
     def owned(self) -> AbstractContextManager[None]:
-        """What is entered around each write of the process that drives the sweep.
+        """Return the context manager for each write of the process that drives the sweep.
 
         Raises:
             OwnershipLostError: Another process runs the sweep by now.
@@ -73,25 +73,25 @@ class RecordKeeper:
         return contextlib.nullcontext() if self._run is None else self._run.held()
 
     def record(self, trial_id: str) -> TrialRecord:
-        """A trial's newest record."""
+        """Return a trial's newest record."""
         return self._records[trial_id]
 
     def all_records(self) -> list[TrialRecord]:
-        """The newest record of every trial of the sweep, those of earlier runs too."""
+        """Return the newest record of every trial of the sweep, including those of earlier runs."""
         return sorted([*self._others, *self._records.values()], key=lambda record: record.index)
 
     def change(self, trial_id: str, change: Change) -> None:
-        """Change a trial's record, on disk at once: for what its process reads."""
+        """Change a trial's record, and write it at once, because the trial's process reads it."""
         self._update(trial_id, change(self._records[trial_id]))
         self._write(trial_id)
 
     def started(self, trial_id: str) -> None:
-        """A process took the trial."""
+        """Note that a process has begun a trial."""
         self.running.add(trial_id)
         self._update(trial_id, transitions.begun(self._records[trial_id], time.time()))
 
     def progressed(self, trial_id: str, progress: Progress, *, node: str, pid: int) -> None:
-        """A trial told where it stands."""
+        """Take a trial's progress."""
         if progress.status != "running":
             self.running.discard(trial_id)
         record = transitions.told(self._records[trial_id], progress, node=node, pid=pid)
@@ -99,16 +99,16 @@ class RecordKeeper:
         self._scalars.write(record, evaluated=progress.evaluated)
 
     def paused(self, trial_id: str) -> None:
-        """A trial was paused that did not tell so itself; it goes on from its latest checkpoint."""
+        """Note that a trial was paused without a report; it will continue from its latest checkpoint."""
         self.running.discard(trial_id)
         self._update(trial_id, transitions.paused(self._records[trial_id]))
 
     def lost(self, trial_id: str) -> None:
-        """A trial's process ended because another one has the trial, which waits to be continued."""
+        """Note that a trial's process ended because another one has taken the trial, which waits to be continued."""
         self.paused(trial_id)
 
     def ended(self, trial_id: str) -> None:
-        """A trial runs no more: by itself, as it has told, or it was paused or stopped."""
+        """Note that a trial runs no more: it has ended by itself, or it was paused or stopped."""
         self.running.discard(trial_id)
         self._forget_tally(trial_id)
         record = self._records[trial_id]
@@ -120,13 +120,13 @@ class RecordKeeper:
             self._update(trial_id, transitions.stopped(record, time.time()))
 
     def failed(self, trial_id: str, error: str, *, retried: bool, reached: Reached | None = None) -> None:
-        """A trial failed, for good or to be tried again.
+        """Note that a trial failed, finally or to be retried.
 
         Args:
             trial_id: The trial.
-            error: Why; of a long one the middle is left out.
-            retried: Whether it is tried again.
-            reached: How far it was; None: what its process has left behind says so.
+            error: Why it failed; the middle of a long text is left out.
+            retried: Whether it is retried.
+            reached: How far it had come; None: this is read from what its process has left behind.
         """
         self.running.discard(trial_id)
         if reached is None:
@@ -137,11 +137,11 @@ class RecordKeeper:
             self._forget_tally(trial_id)
 
     def _forget_tally(self, trial_id: str) -> None:
-        """What is in a process's tally is in the record now, or its trial is over."""
+        """Delete a trial's tally, because its numbers are in the record now, or the trial is over."""
         self._store.trial(trial_id).forget_tally()
 
     def flush(self) -> None:
-        """Write what is due: first what was written longest ago."""
+        """Write the records that are due, beginning with those that were written longest ago."""
         self._write_scalars()
         now = self._clock()
         self._num_writes_due = min(_WRITES_PER_S, self._num_writes_due + (now - self._flushed_at) * _WRITES_PER_S)
@@ -154,7 +154,7 @@ class RecordKeeper:
                 self._write(trial_id)
 
     def close(self) -> None:
-        """Write everything; nothing becomes of any trial any more."""
+        """Write everything; nothing may be noted afterwards."""
         for trial_id in sorted(self._changed):
             self._write(trial_id)
         self._write_scalars()

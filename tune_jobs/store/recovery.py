@@ -1,6 +1,7 @@
-"""What of a trial's folder training can continue from; what is damaged is set aside, never deleted, and never silently.
+"""Find what training can continue from in a trial's folder; damaged parts are set aside with a note, never deleted.
 
-Results that can't be read go to `results.damaged`, checkpoints and copies to `damaged/`; only the owner does it.
+Results that can't be read are moved to `results.damaged`, checkpoints and copies to `damaged/`; only the owner does
+this.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from tune_jobs.store.results_file import ResultsFile
 
 
 def take_up_results(trial: Trial) -> tuple[ResultsFile, list[str]]:
-    """Read a trial's results, and set aside what of them cannot be read.
+    """Read a trial's results, and set aside the lines that cannot be read.
 
-    The lines stay in results.jsonl until the trial writes what it goes on with.
+    The lines stay in results.jsonl until the trial writes the results that it continues with.
 
     Returns:
-        What can be read, and what to tell of the rest.
+        What can be read, and notes on the rest.
 
     Raises:
-        CheckpointError: They cannot be read now.
+        CheckpointError: The results cannot be read now.
     """
     try:
         found = trial.read_results()
@@ -42,21 +43,21 @@ def take_up_results(trial: Trial) -> tuple[ResultsFile, list[str]]:
     if unreadable:
         trial.keep_damaged_results(unreadable)
     if found.tail:
-        # What every kill may leave, and no damage: it is done again.
+        # Half a line after a kill is not damage: the iteration is repeated.
         trial.write_log(f"{trial.trial_id}: {RESULTS} ended within a line; it is kept in {DAMAGED_RESULTS}")
     return found, [f"{RESULTS}: {bad}; it is kept in {DAMAGED_RESULTS}" for bad in found.bad]
 
 
 def take_up_checkpoints(trial: Trial) -> tuple[list[CheckpointRecord], list[str]]:
-    """The checkpoints a trial goes on with, the last of them verified; damaged ones are set aside.
+    """Return the checkpoints that a trial continues with, the last of them verified; damaged ones are set aside.
 
-    Of the older ones only the manifests are read: the files are checked before they are used.
+    Only the manifests of the older ones are read: their files are checked before they are used.
 
     Returns:
-        The checkpoints, oldest first, and what to tell of those that were set aside.
+        The checkpoints, oldest first, and notes on those that were set aside.
 
     Raises:
-        CheckpointError: One is of a newer format, or cannot be read now: nothing says that it is damaged.
+        CheckpointError: One has a newer format, or cannot be read now, so it may not be damaged.
     """
     known: list[CheckpointRecord] = []
     damaged: list[tuple[Path, NotFoundError]] = []
@@ -83,7 +84,7 @@ def take_up_checkpoints(trial: Trial) -> tuple[list[CheckpointRecord], list[str]
 
 
 def take_up_copy(trial: Trial, folder: Path) -> tuple[Path | None, list[str]]:
-    """Another trial's checkpoint that this one goes on from, verified; None, and set aside, if it is damaged."""
+    """Verify the copied checkpoint that a trial continues from; return None if it is damaged and set aside."""
     try:
         verify_checkpoint(folder)
     except NotFoundError as error:
@@ -97,16 +98,16 @@ def take_up_copy(trial: Trial, folder: Path) -> tuple[Path | None, list[str]]:
 
 
 def _damaged(folder: Path, error: NotFoundError) -> Path:
-    """The checkpoint's folder, if what is wrong with it is damage.
+    """Return the checkpoint's folder, if the error means damage.
 
     Raises:
-        NotFoundError: It is not, or may pass.
+        NotFoundError: The error does not mean damage, or may be temporary.
     """
     if isinstance(error.__cause__, OSError) and not isinstance(error.__cause__, FileNotFoundError | RefusedFileError):
         raise error
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
         manifest = json.loads(read_regular(within(folder, MANIFEST)))
-        # A version beyond ours is no flipped bit if the seal holds.
+        # If the seal is right, a newer version number is not a damaged byte.
         if manifest["format_version"] > FORMAT_VERSION and manifest["sha256"] == seal(manifest):
             raise error
     return folder

@@ -1,11 +1,11 @@
-"""What can be read of a `results.jsonl`, and what can't.
+"""Read the lines of a `results.jsonl` that can be read, and report the others.
 
-A process that is killed while it writes leaves half a line at the end. Elsewhere a line that can't be read is damage:
-of the disk, an editor, or two processes that wrote at once. One such line must not cost the others: who reads leaves it
-out and says so; who goes on with the trial moves it to a file of its own, `results.damaged`.
+A process that is killed while it writes leaves half a line at the end. Elsewhere, a line that can't be read is damage,
+done by the disk, an editor, or two processes that wrote at once. One such line must not make the others unusable:
+readers leave it out with a warning, and a process that continues the trial moves it to a file `results.damaged`.
 
-Iterations rise and env steps don't fall, so lines that can be read contradict each other where they do otherwise. The
-fewest are left out that let the others agree: one number that is far too large must not cost all lines after it.
+Iterations rise and env steps don't fall; lines that differ from this contradict others. As few lines as possible are
+left out so that the others agree: one number that is far too large must not cost all lines after it.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from policies.errors import CheckpointError
 from policies.files import read_regular
 
 _BEGINNING = re.compile(rb'\{"iteration":\s*(\d{1,18}),')
-"""Of a line as it is written; others are read whole to know of which iteration they are."""
+"""Matches the iteration in a line as it is written; other lines are parsed to find their iteration."""
 _SHOWN_BYTES = 60
 _MAX_BYTES = 2**30
-"""Of a trial of a million iterations."""
+"""The most bytes that are read, enough for a million iterations."""
 
 Scored = tuple[object, object]
-"""Env steps and evaluation return."""
+"""Env steps and evaluation return of an iteration."""
 
 
 @dataclass(frozen=True)
 class BadLine:
-    """A line that is no result."""
+    """A line that is not a valid result."""
 
     number: int
     content: bytes
     reason: str
 
     def __str__(self) -> str:
-        """Which line it is, why it is left out, and how it begins."""
+        """Say which line it is, why it is left out, and how it begins."""
         return f"line {self.number} {self.reason}: {self.content[:_SHOWN_BYTES]!r}"
 
 
@@ -52,17 +52,17 @@ class ResultsFile:
     """The content of a results.jsonl."""
 
     records: list[IterationRecord] = field(default_factory=list)
-    """The lines that can be read, iterations rising."""
+    """The lines that can be read, with rising iterations."""
     bad: list[BadLine] = field(default_factory=list)
     tail: bytes = b""
-    """After the last line's end: of a line that is being written, or was when its process was killed."""
+    """The bytes after the last newline: part of a line that is being written, or was when its process was killed."""
 
 
 def read_results(path: Path) -> ResultsFile:
-    """Read what can be read; an empty one if there is no file.
+    """Read the lines that can be read; the result is empty if there is no file.
 
     Raises:
-        CheckpointError: It is there and cannot be read at all.
+        CheckpointError: The file exists but cannot be read at all.
     """
     try:
         *lines, tail = read_regular(path, _MAX_BYTES).split(b"\n")
@@ -71,7 +71,7 @@ def read_results(path: Path) -> ResultsFile:
     except OSError as error:
         raise CheckpointError(
             f"{path} cannot be read: {error.strerror or error}.",
-            "Move it away; the trial goes on from its latest checkpoint, without this part of its curve.",
+            "Move it away; the trial continues from its latest checkpoint, without this part of its curve.",
         ) from error
     bad: list[BadLine] = []
     read: list[tuple[int, bytes, IterationRecord]] = []
@@ -87,10 +87,10 @@ def read_results(path: Path) -> ResultsFile:
 
 
 def read_scores(path: Path, wanted: Collection[int]) -> dict[int, list[Scored]]:
-    """What a trial's results say of some iterations; lines that cannot be read say nothing.
+    """Return the scores of some iterations in a trial's results; lines that cannot be read are left out.
 
     Raises:
-        CheckpointError: The file is there and cannot be read at all.
+        CheckpointError: The file exists but cannot be read at all.
     """
     found: defaultdict[int, list[Scored]] = defaultdict(list)
     try:
@@ -113,7 +113,7 @@ def read_scores(path: Path, wanted: Collection[int]) -> dict[int, list[Scored]]:
 
 
 def _contradictions(read: Sequence[tuple[int, bytes, IterationRecord]], kept: set[int]) -> list[BadLine]:
-    """Lines that can be read but are not kept, each with what it contradicts."""
+    """Return the lines that can be read but are not kept, each with what it contradicts."""
     found = []
     last: IterationRecord | None = None
     for number, line, record in read:
@@ -127,8 +127,8 @@ def _contradictions(read: Sequence[tuple[int, bytes, IterationRecord]], kept: se
 
 
 def _rising(values: Sequence[int], *, strictly: bool) -> list[int]:
-    """Where to find the most values that rise (or, not strictly, don't fall); of several such choices the first."""
-    # From the end: how many values, it included, can be taken from each on. Of those with k + 1 the largest is enough.
+    """Return the indices of the longest rising (or, if not strictly, not falling) subsequence; the first of several."""
+    # From the end: the length of the longest such run from each value on. For each length, the largest value is enough.
     largest: list[int] = []  # negated, so that they are sorted
     counts = []
     for value in reversed(values):

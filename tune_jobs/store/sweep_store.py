@@ -1,6 +1,6 @@
-"""A sweep in a folder: the local store. See `contract.Sweep` for who may write what and when.
+"""A sweep in a folder of the local store. See `contract.Sweep` for who may write what and when.
 
-Layout: see `docs/design.md`, "On disk"; what the parts are called is in `names`.
+The layout is in `docs/design.md`, "On disk"; the names of the parts are in `names`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tune_jobs.store.trial_store import TrialStore
 
 
 class SweepStore:
-    """One sweep's folder."""
+    """One sweep's folder; implements `Sweep`."""
 
     def __init__(self, folder: Path) -> None:
         # Ray takes only absolute paths for storage ("URI has empty scheme" otherwise).
@@ -50,17 +50,17 @@ class SweepStore:
 
     @property
     def best_folder(self) -> Path:
-        """The winner's policy, its evaluation and films; without links."""
+        """The folder with the winner's policy, its evaluation and films; it has no links in it."""
         return refuse_links_in(self.folder / names.BEST_FOLDER)
 
     @property
     def report_folder(self) -> Path:
-        """The report."""
+        """The report's folder."""
         return within(self.folder, names.REPORT_FOLDER)
 
     @property
     def tune_folder(self) -> Path:
-        """Ray Tune's own state."""
+        """The folder of Ray Tune's own state."""
         return within(self.folder, names.RAY_TUNE_FOLDER)
 
     def clear_tune_folder(self) -> None:
@@ -69,16 +69,16 @@ class SweepStore:
 
     @property
     def driver_log(self) -> Path:
-        """What Ray and RLlib print in the process that drives the sweep."""
+        """The log of what Ray and RLlib print in the process that drives the sweep."""
         return within(self.folder, names.DRIVER_LOG)
 
     @property
     def name(self) -> str:
-        """The sweep's name: its folder's."""
+        """The sweep's name, which is its folder's."""
         return self.folder.name
 
     def exists(self) -> bool:
-        """Whether a sweep lies here; one that this user may not look at does, and is refused when it is read."""
+        """Whether there is a sweep here; one that this user may not read counts, and is refused when it is read."""
         try:
             return self.record_path.is_file()
         except PermissionError:
@@ -88,7 +88,7 @@ class SweepStore:
         """Make the folder; of several processes that want the same name, one gets it.
 
         Raises:
-            SpecError: It is there already.
+            SpecError: The folder exists already.
             CannotRunError: The storage folder cannot be written.
         """
         root = self.folder.parent
@@ -116,7 +116,7 @@ class SweepStore:
 
     @contextlib.contextmanager
     def rehearsal(self) -> Iterator[SweepStore]:
-        """A sweep's folder beside this one, made and removed, with a hidden name so that nobody finds this one taken.
+        """Yield a sweep in a hidden folder beside this one, which is removed after the block.
 
         Raises:
             CannotRunError: The storage folder cannot be written.
@@ -129,10 +129,10 @@ class SweepStore:
             other.discard()
 
     def read_record(self) -> SweepRecord:
-        """sweep.json.
+        """Read sweep.json.
 
         Raises:
-            NotFoundError: There is none.
+            NotFoundError: There is no such file.
             CheckpointError: It is damaged or of a newer format.
         """
         refuse_link(self.record_path)
@@ -143,23 +143,23 @@ class SweepStore:
         write_atomic(self.record_path, dump(record))
 
     def trial(self, trial_id: str) -> TrialStore:
-        """The folder of one trial.
+        """Return the folder of one trial.
 
         Raises:
-            NotFoundError: No trial is called so.
+            NotFoundError: This cannot be a trial's id.
         """
         return TrialStore(self.folder, trial_id)
 
     def pack(self, pack_id: str) -> PackFiles:
-        """The files of one pack.
+        """Return the files of one pack.
 
         Raises:
-            NotFoundError: No pack is called so.
+            NotFoundError: This cannot be a pack's id.
         """
         return PackFiles(self.folder, pack_id)
 
     def checkpoint_folder(self, record: CheckpointRecord) -> Path:
-        """Where a checkpoint lies.
+        """Return the folder of a checkpoint.
 
         Raises:
             CheckpointError: A symbolic link is in the way.
@@ -167,14 +167,14 @@ class SweepStore:
         return self.trial(record.trial_id).checkpoint_folder(record.iteration)
 
     def read_trials(self) -> list[TrialRecord]:
-        """Every trial's record, by index."""
+        """Read every trial's record, by index."""
         folders = parts_of(within(self.folder, names.TRIALS_FOLDER))
         stores = [self.trial(path.name) for path in folders if is_trial_id(path.name)]
         records = [store.read_record() for store in stores if store.record_path.is_file()]
         return sorted(records, key=lambda record: record.index)
 
     def read_best(self) -> BestRecord:
-        """best/evaluation.json.
+        """Read best/evaluation.json.
 
         Raises:
             NotFoundError: No best policy has been chosen yet.
@@ -191,11 +191,11 @@ class SweepStore:
         return (self.best_folder / names.BEST_RECORD).is_file()
 
     def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
-        """Replace what is known of the winner, and its policy; who sees the record finds the policy.
+        """Replace the winner's record and its policy; the policy is written first.
 
         Args:
-            record: best/evaluation.json.
-            policy: The winner; None: the one that is there.
+            record: The content of best/evaluation.json.
+            policy: The winner's policy; None: the present one is kept.
         """
         if policy is not None:
             save_policy(policy, self.best_folder)
@@ -203,23 +203,23 @@ class SweepStore:
 
     @property
     def best_policy_path(self) -> Path:
-        """Of the winner's policy."""
+        """The path of the winner's policy."""
         return self.best_folder / names.BEST_POLICY
 
     def films(self) -> dict[str, Path]:
-        """The films that there are: before_mp4, after_mp4, after_gif, before_after_mp4."""
+        """Return the films that exist, of before_mp4, after_mp4, after_gif and before_after_mp4."""
         folder = self.best_folder
         return {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
 
     @contextlib.contextmanager
     def writing_films(self) -> Iterator[Mapping[str, Path]]:
-        """Where to write films in the block, by the names that `films` has."""
+        """Yield the paths to write films to, by the names that `films` has."""
         folder = self.best_folder
         yield {key: folder / name for key, name in names.FILMS.items()}
 
     @contextlib.contextmanager
     def writing_report(self) -> Iterator[Path]:
-        """The folder to write the report into in the block; without links."""
+        """Yield the folder to write the report into; it has no links in it."""
         yield refuse_links_in(self.report_folder)
 
     def request_stop(self) -> None:
@@ -227,7 +227,7 @@ class SweepStore:
         write_atomic(self._stop_path, "stop\n")
 
     def stop_requested(self) -> bool:
-        """Whether somebody asked."""
+        """Whether a process asked to stop."""
         return self._stop_path.exists()
 
     def clear_stop_request(self) -> None:
@@ -235,7 +235,7 @@ class SweepStore:
         remove_file(self._stop_path)
 
     def take(self) -> Owner:
-        """Become the run of this sweep; whatever an earlier run has left can't write any more.
+        """Become the run of this sweep; processes of an earlier run can't write any more.
 
         Raises:
             CannotRunError: The folder cannot be written or locked.
@@ -243,7 +243,7 @@ class SweepStore:
         return Owner.take(self._owner_path)
 
     def owner(self, token: str) -> Owner:
-        """The run that another process has taken and passed the token of."""
+        """Return the run whose token another process has passed on."""
         return Owner(self._owner_path, token)
 
     @property
@@ -251,16 +251,16 @@ class SweepStore:
         return within(self.folder, names.OWNER)
 
     def remove_leftovers(self) -> None:
-        """Remove what processes that were killed left half made; see `Sweep.remove_leftovers`."""
+        """Remove incomplete files of killed processes; see `Sweep.remove_leftovers`."""
         trials = self.read_trials()
         remove_abandoned(self.folder, [trial.trial_id for trial in trials])
         for trial in trials:
-            # The others' are removed by the process that takes them up.
+            # The process that takes another trial removes its incomplete files.
             if trial.status in FINISHED:
                 self.trial(trial.trial_id).remove_leftovers()
 
     def probing(self) -> AbstractContextManager[Probe]:
-        """Ask whether other machines see this very folder; see `Sweep.probing`."""
+        """Find out whether other machines see the same folder; see `Sweep.probing`."""
         return probing(self.folder)
 
     def is_driven(self) -> bool:
@@ -282,7 +282,7 @@ class SweepStore:
 
     @contextlib.contextmanager
     def driver_lock(self) -> Iterator[None]:
-        """Hold the lock of the process on a cluster that drives the sweep for a client, which holds the sweep's lock.
+        """Hold the lock of a process that drives the sweep on a cluster, for a client that holds the sweep's lock.
 
         Raises:
             CannotRunError: Such a process still runs.
@@ -293,23 +293,23 @@ class SweepStore:
     @property
     def _still_driven(self) -> tuple[str, str]:
         return (
-            f"Sweep {self.name} is still being run on a cluster, for a process that is gone.",
-            "Try again in a minute: the cluster is ending it.",
+            f"A cluster still runs sweep {self.name}, for a process that has ended.",
+            "Try again in a minute: the cluster is ending the run.",
         )
 
 
 def name_taken(folder: Path) -> SpecError:
-    """The error for a new sweep whose folder is there already."""
-    go_on = f"go on with it: `tune-jobs resume {folder.name}`"
+    """Return the error for a new sweep whose folder exists already."""
+    go_on = f"continue it: `tune-jobs resume {folder.name}`"
     other = go_on if SweepStore(folder).exists() else f"remove that folder: it has no {names.SWEEP_RECORD}"
     hint = f"Choose another name with --name, or {other}."
     return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 
 
 def list_sweep_stores(storage: Path) -> list[SweepStore]:
-    """The sweeps in a storage folder, by name; empty if there is no such folder.
+    """Return the sweeps in a storage folder, by name; none if there is no such folder.
 
     Raises:
-        CheckpointError: It cannot be looked into.
+        CheckpointError: The folder cannot be read.
     """
     return [store for store in map(SweepStore, sorted(parts_of(storage))) if store.exists()]

@@ -1,4 +1,4 @@
-"""What a store promises of one trial and of one pack; what holds for all of it is in `contract`."""
+"""The contract of a store for one trial and for one pack; the rules for all of it are in `contract`."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from tune_jobs.store.results_file import ResultsFile, Scored
 
 @dataclass(frozen=True)
 class Assignment:
-    """Whom a pack is to train."""
+    """The trials that a pack has to train."""
 
     trial_ids: tuple[str, ...] = ()
-    """Its members, in the order in which they came; whom it trains and who is not named is to be ended."""
+    """The pack's members, in the order in which they were added; a member that is not named has to be ended."""
     num_failures: Mapping[str, int] = field(default_factory=dict)
-    """How often a member has failed by itself in this run; those that have not are not named."""
+    """How often each member has failed by itself in this run; those that have not failed are left out."""
 
 
 class Ownership(Protocol):
-    """That something was taken up, by this process or the one that passed its token on; see `contract`."""
+    """The ownership of a sweep's run, a pack or a trial, taken here or received by its token; see `contract`."""
 
     @property
     def token(self) -> str:
-        """What another process is told so that it works for the same owner; text, of this epoch alone."""
+        """The text by which another process works for the same owner; it is valid only for this epoch."""
         ...
 
     def held(self) -> AbstractContextManager[None]:
-        """Write in the block: nobody takes it up meanwhile. Not to be nested; others wait, so it is to be short.
+        """Keep other processes from becoming the owner in the block; it must be short, as they wait, and not nested.
 
         Raises:
-            OwnershipLostError: Another process has taken it up.
+            OwnershipLostError: Another process has become the owner.
             CannotRunError: It cannot be locked.
         """
         ...
 
     def is_current(self) -> bool:
-        """Whether nobody else has taken it up, as far as can be seen without waiting.
+        """Whether no other process has become the owner, as far as can be seen without waiting.
 
         Raises:
             OSError: It cannot be read just now.
@@ -48,42 +48,42 @@ class Ownership(Protocol):
         ...
 
     def check(self) -> None:
-        """Raise if another process has taken it up.
+        """Raise an error if another process has become the owner.
 
         Raises:
-            OwnershipLostError: It has.
+            OwnershipLostError: Another process has.
         """
         ...
 
     def release(self) -> None:
-        """Free what it has open; it still owns what it owned, and may be used again."""
+        """Close open files; the ownership stays, and may be used again."""
         ...
 
 
 class Trial(Protocol):
-    """One trial. Its record is the driver's; the rest belongs to the process that took the trial last."""
+    """One trial. The driver writes its record; the process that took the trial last writes the rest."""
 
     @property
     def trial_id(self) -> str:
-        """`t0000` and so on."""
+        """The trial's id: `t0000` and so on."""
         ...
 
     # -- who writes
 
     def take(self, under: Ownership | None = None) -> None:
-        """Become the process that writes here; whoever was it has lost it.
+        """Become the process that writes here; the process before has lost the trial.
 
         Args:
-            under: The run or the pack that this is done for: only as long as that is owned still.
+            under: The ownership of the run or the pack that this is done for; it has to be current.
 
         Raises:
-            OwnershipLostError: `under` is another's by now; the trial stays with whom it was.
+            OwnershipLostError: Another process has taken `under`; the trial keeps its owner.
             CannotRunError: The trial cannot be written or locked.
         """
         ...
 
     def owned(self) -> AbstractContextManager[None]:
-        """What is entered around a write that is none of the calls here; nothing to who has not taken the trial.
+        """Return the context manager for writes other than these calls; it does nothing without a `take` before.
 
         Raises:
             OwnershipLostError: Another process has taken it.
@@ -91,13 +91,13 @@ class Trial(Protocol):
         ...
 
     def is_lost(self) -> bool:
-        """Whether this process has taken the trial, and another one after it."""
+        """Whether this process has taken the trial, and another one has taken it since."""
         ...
 
     # -- its record
 
     def read_record(self) -> TrialRecord:
-        """What the driver wrote last.
+        """Read the record that the driver wrote last.
 
         Raises:
             NotFoundError: There is no such trial.
@@ -113,10 +113,10 @@ class Trial(Protocol):
         """
         ...
 
-    # -- its results: one record an iteration, appended
+    # -- its results: one record per iteration, appended
 
     def append_iterations(self, records: Sequence[IterationRecord]) -> None:
-        """Add results after those that are there.
+        """Append results.
 
         Raises:
             OwnershipLostError: Another process has taken the trial; nothing was added.
@@ -124,68 +124,68 @@ class Trial(Protocol):
         ...
 
     def read_results(self) -> ResultsFile:
-        """What can be read of the results, and apart from that what can't; empty if there are none.
+        """Read the results: the lines that can be read, and those that can't; empty if there are none.
 
         Raises:
-            CheckpointError: They are there and cannot be read at all.
+            CheckpointError: The results exist but cannot be read at all.
         """
         ...
 
     def read_iterations(self) -> list[IterationRecord]:
-        """The results that can be read, iterations rising; a warning names what is left out.
+        """Read the results that can be read, with rising iterations; a warning names what is left out.
 
         Raises:
-            CheckpointError: As `read_results`.
+            CheckpointError: In the same cases as `read_results`.
         """
         ...
 
     def scores_of(self, iterations: Collection[int]) -> Mapping[int, Sequence[Scored]]:
-        """What the results say of some iterations, once for each line of one that can be read.
+        """Return the scores of some iterations in the results, one for each line that can be read.
 
         Raises:
-            CheckpointError: As `read_results`.
+            CheckpointError: In the same cases as `read_results`.
         """
         ...
 
     def has_results(self) -> bool:
-        """Whether anything has been written as results, readable or not."""
+        """Whether any results have been written, readable or not."""
         ...
 
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
-        """Replace all results, atomically: by those up to the checkpoint that the trial goes on from.
+        """Replace all results, atomically, by those up to the checkpoint that the trial continues from.
 
         Raises:
-            OwnershipLostError: Another process has taken the trial; all is as it was.
+            OwnershipLostError: Another process has taken the trial; nothing was changed.
         """
         ...
 
     # -- its checkpoints: folders, committed whole, with a sealed manifest
 
     def checkpoint_iterations(self) -> list[int]:
-        """Those that have a checkpoint, damaged or not, in order; none that is being written or deleted."""
+        """Return the iterations that have a whole or damaged checkpoint, in order; not those written or deleted now."""
         ...
 
     def checkpoint(self, iteration: int) -> CheckpointRecord:
-        """What a checkpoint's manifest says; its files are not looked at.
+        """Read a checkpoint's manifest; its files are not checked.
 
         Raises:
-            NotFoundError: There is none.
+            NotFoundError: There is no such checkpoint.
             CheckpointError: The manifest is damaged, was changed, or is another checkpoint's.
         """
         ...
 
     def checkpoints(self) -> list[CheckpointRecord]:
-        """The manifests of all checkpoints, oldest first.
+        """Read the manifests of all checkpoints, oldest first.
 
         Raises:
-            CheckpointError: As `checkpoint`.
+            CheckpointError: In the same cases as `checkpoint`.
         """
         ...
 
     def checkpoint_folder(self, iteration: int) -> Path:
-        """A local folder with the checkpoint's files, to read only; gone when the checkpoint is deleted.
+        """Return a local folder with a checkpoint's files, to read only; it is removed with the checkpoint.
 
-        A checkpoint that there is none of has a folder that does not exist.
+        If there is no such checkpoint, the folder does not exist.
 
         Raises:
             CheckpointError: A symbolic link is in the way.
@@ -193,7 +193,7 @@ class Trial(Protocol):
         ...
 
     def verify_checkpoint(self, iteration: int) -> CheckpointRecord:
-        """Check every file against the manifest, before anything of it is read.
+        """Check every file against the manifest, before any file is read.
 
         Raises:
             NotFoundError: There is no such checkpoint.
@@ -202,13 +202,13 @@ class Trial(Protocol):
         ...
 
     def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
-        """Write a checkpoint, and show it when it is whole and on disk; one of the same iteration is replaced.
+        """Write a checkpoint, which appears when it is whole and on disk; one of the same iteration is replaced.
 
         Args:
-            record: Its iteration and scores, which its manifest gets.
-            write: Fills the empty local folder it is given. If it raises, nothing was written, and the error is let
-                through.
-            engine: Name of the engine that can go on from it, for its manifest; empty: not known.
+            record: Its iteration and scores, which are written to its manifest.
+            write: Fills the empty local folder that it is given. If it raises an error, nothing is written, and the
+                error is raised here.
+            engine: Name of the engine that can continue from it, for its manifest; empty: not known.
 
         Raises:
             OwnershipLostError: Another process has taken the trial; no checkpoint of it was changed.
@@ -217,34 +217,34 @@ class Trial(Protocol):
         ...
 
     def delete_checkpoint(self, record: CheckpointRecord) -> None:
-        """Remove a checkpoint; a reader sees all of it or none.
+        """Remove a checkpoint; a reader sees the whole checkpoint or nothing.
 
         Raises:
-            OwnershipLostError: Another process has taken the trial; the checkpoint is there.
+            OwnershipLostError: Another process has taken the trial; the checkpoint was not removed.
         """
         ...
 
-    # -- checkpoints of other trials that it goes on from, by the iteration of its own at which it took them over
+    # -- copies of other trials' checkpoints that it continues from, by its own iteration at that time
 
     def copy_checkpoint(self, folder: Path, iteration: int) -> CheckpointRecord:
-        """Copy a checkpoint whole, and verify the copy; the driver does it, between two iterations of the trial.
+        """Copy a whole checkpoint and verify the copy; the driver does this, between two iterations of the trial.
 
         Args:
-            folder: As `checkpoint_folder` of the other trial gave it.
-            iteration: Iterations that this trial has done; a copy of the same is replaced.
+            folder: The result of the other trial's `checkpoint_folder`.
+            iteration: The iterations that this trial has done; a copy of the same iteration is replaced.
 
         Raises:
-            OSError: Something of it is gone, as its trial has deleted it; nothing was copied.
-            NotFoundError: The same, or it is damaged.
+            OSError: A part of it is missing, because its trial has deleted it; nothing was copied.
+            NotFoundError: It is missing or damaged.
         """
         ...
 
     def copied_checkpoint(self, iteration: int) -> Path:
-        """A local folder with a copy, to read only; one that does not exist if there is none."""
+        """Return a local folder with a copy, to read only; it does not exist if there is no copy."""
         ...
 
     def remove_copies(self, keep: Collection[int] = ()) -> None:
-        """Delete all copies but those of some iterations.
+        """Delete all copies except those of some iterations.
 
         Raises:
             OwnershipLostError: This process had taken the trial, and another one has it now.
@@ -262,40 +262,40 @@ class Trial(Protocol):
         ...
 
     def set_aside_results(self) -> str:
-        """Move what is in the place of the results and can't be read at all; returns where it is, for a message.
+        """Move away results that can't be read at all, and return where they are now, for a message.
 
         Raises:
-            OwnershipLostError: Another process has taken the trial; it is where it was.
+            OwnershipLostError: Another process has taken the trial; nothing was moved.
         """
         ...
 
     def set_aside(self, path: Path, prefix: str = "") -> str:
-        """Move a checkpoint or a copy to where nobody takes it for one; several of one iteration are all kept.
+        """Move away a damaged checkpoint or copy, so that it is not used; all of several for one iteration are kept.
 
         Args:
-            path: As `checkpoint_folder` or `copied_checkpoint` gave it.
+            path: A result of `checkpoint_folder` or `copied_checkpoint`.
             prefix: Put before its name.
 
         Returns:
             Where it is now, for a message.
 
         Raises:
-            OwnershipLostError: Another process has taken the trial; it is where it was.
+            OwnershipLostError: Another process has taken the trial; nothing was moved.
         """
         ...
 
     def latest_damaged(self) -> int:
-        """The latest iteration of a checkpoint that was set aside; 0: there is none."""
+        """Return the latest iteration of a checkpoint that was set aside; 0 if there is none."""
         ...
 
     def remove_leftovers(self) -> None:
-        """Remove what a killed process had half written or half deleted; for who has taken the trial."""
+        """Remove what a killed process had written or deleted only in part; the caller has to have taken the trial."""
         ...
 
     # -- its curves, log and tally
 
     def append_events(self, name: str, data: bytes) -> None:
-        """Append to one of the trial's event files, which TensorBoard reads; the driver does it.
+        """Append to one of the trial's event files, which TensorBoard reads; the driver does this.
 
         Raises:
             CannotRunError: It cannot be written.
@@ -304,7 +304,7 @@ class Trial(Protocol):
 
     @property
     def log_path(self) -> Path:
-        """A local file that the trial's process prints to, by appending; readers use `log_tail`."""
+        """A local file that the trial's process appends its output to; readers use `log_tail`."""
         ...
 
     def write_log(self, text: str) -> None:
@@ -312,16 +312,16 @@ class Trial(Protocol):
         ...
 
     def log_tail(self, num_lines: int = 15) -> str:
-        """The lines that say how the trial's last process ended; empty without a log."""
+        """Return the lines that say how the trial's last process ended; empty without a log."""
         ...
 
     @property
     def tally_path(self) -> Path:
-        """A local file that says how far the trial is while a process trains it, or if that did not end by itself."""
+        """A local file that says how far the trial is while a process trains it, or after that process was killed."""
         ...
 
     def forget_tally(self) -> None:
-        """Delete the tally: what it says is in the record, or the trial is over.
+        """Delete the tally, because its numbers are in the record, or the trial is over.
 
         Raises:
             OwnershipLostError: This process had taken the trial, and another one has it now.
@@ -330,18 +330,18 @@ class Trial(Protocol):
 
 
 class Pack(Protocol):
-    """One pack. The driver writes whom it trains; the pack's process reads it, and prints to the log."""
+    """One pack. The driver writes its assignment; the pack's process reads it, and prints to the log."""
 
     @property
     def pack_id(self) -> str:
-        """`p00` and so on."""
+        """The pack's id: `p00` and so on."""
         ...
 
     def take(self, under: Ownership | None = None) -> Ownership:
-        """Become the process that is this pack.
+        """Become the process that runs this pack.
 
         Raises:
-            OwnershipLostError: `under` is another's by now.
+            OwnershipLostError: Another process has taken `under`.
         """
         ...
 
@@ -354,22 +354,22 @@ class Pack(Protocol):
         ...
 
     def read(self) -> Assignment:
-        """The assignment.
+        """Read the assignment.
 
         Raises:
-            CheckpointError: It is not there, or cannot be read.
+            CheckpointError: It does not exist, or cannot be read.
         """
         ...
 
     @property
     def log_path(self) -> Path:
-        """A local file that the pack's process prints to, by appending."""
+        """A local file that the pack's process appends its output to."""
         ...
 
     def begin_log(self) -> None:
-        """Print what tells this process's output, which goes to the log, from that of earlier ones."""
+        """Print the line that separates this process's output from that of earlier ones in the log."""
         ...
 
     def log_tail(self, num_lines: int = 15) -> str:
-        """The lines that say how the pack's last process ended; empty without a log."""
+        """Return the lines that say how the pack's last process ended; empty without a log."""
         ...

@@ -1,7 +1,7 @@
 """The folder of one trial: its record, results, checkpoints, log and tally.
 
-See `contract.Trial` for who may write what and when. Checkpoints of other trials that it goes on from are in
-`copies`, what was damaged in `recovery`.
+See `contract.Trial` for who may write what and when. `copies` has the checkpoints of other trials that it continues
+from, `recovery` handles damaged files.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _LOG = logging.getLogger(__name__)
 
 
 class TrialStore(OwnedFolder):
-    """One trial's folder; the process that trains the trial has taken it."""
+    """One trial's folder; implements `Trial`."""
 
     def __init__(self, sweep_folder: Path, trial_id: str) -> None:
         self.sweep_folder = sweep_folder
         self.trial_id = check_trial_id(trial_id)
 
-    # Looked at anew each time: what is no link now may be one when the trial goes on.
+    # Checked anew each time, because the folder may be replaced by a link at any time.
 
     @property
     def folder(self) -> Path:
@@ -45,44 +45,44 @@ class TrialStore(OwnedFolder):
 
     @property
     def record_path(self) -> Path:
-        """Of trial.json."""
+        """The path of trial.json."""
         return within(self.folder, names.TRIAL_RECORD)
 
     @property
     def results_path(self) -> Path:
-        """Of results.jsonl."""
+        """The path of results.jsonl."""
         return within(self.folder, names.RESULTS)
 
     @property
     def log_path(self) -> Path:
-        """Of log.txt."""
+        """The path of log.txt."""
         return within(self.folder, names.TRIAL_LOG)
 
     @property
     def tally_path(self) -> Path:
-        """Of the file that says how far a trial is whose process runs, or did not end by itself."""
+        """The path of the tally, which says how far a trial is whose process runs or was killed."""
         return within(self.folder, names.TALLY)
 
     @property
     def checkpoints_folder(self) -> Path:
-        """Where its checkpoints lie."""
+        """The folder of its checkpoints."""
         return within(self.folder, names.CHECKPOINTS_FOLDER)
 
     def checkpoint_folder(self, iteration: int) -> Path:
-        """Where the checkpoint of an iteration lies, or would."""
+        """Return the folder of an iteration's checkpoint, which need not exist."""
         return within(self.checkpoints_folder, f"{iteration:06d}")
 
     def read_record(self) -> TrialRecord:
-        """trial.json.
+        """Read trial.json.
 
         Raises:
-            NotFoundError: There is none.
+            NotFoundError: There is no such file.
             CheckpointError: It is damaged, of a newer format, or another trial's.
         """
         record = read_record(self.record_path, TrialRecord, "trial record")
         if record.trial_id != self.trial_id:
             raise CheckpointError(
-                f"{self.record_path} is of trial {record.trial_id}, but lies in the folder of {self.trial_id}.",
+                f"{self.record_path} is of trial {record.trial_id}, but it is in the folder of {self.trial_id}.",
                 "Restore the file from a backup.",
             )
         return record
@@ -92,7 +92,7 @@ class TrialStore(OwnedFolder):
         write_atomic(self.record_path, dump(record))
 
     def append_iterations(self, records: Sequence[IterationRecord]) -> None:
-        """Append lines to results.jsonl; a line torn by a kill is dropped when it is read."""
+        """Append lines to results.jsonl; a line that a kill has cut off is dropped when it is read."""
         if not records:
             return
         text = "".join(dump(record, indent=None) for record in records)
@@ -100,18 +100,18 @@ class TrialStore(OwnedFolder):
             file.write(text.encode())
 
     def read_results(self) -> ResultsFile:
-        """What can be read of results.jsonl, and what can't; see `Trial.read_results`."""
+        """Read results.jsonl; see `Trial.read_results`."""
         return read_results(self.results_path)
 
     def read_iterations(self) -> list[IterationRecord]:
-        """Every line of results.jsonl that can be read, in order, with a warning for others; empty without a file."""
+        """Read the lines of results.jsonl that can be read, with a warning for others; empty without a file."""
         found = self.read_results()
         for bad in found.bad:
             _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
         return found.records
 
     def scores_of(self, iterations: Collection[int]) -> dict[int, list[Scored]]:
-        """What results.jsonl says of some iterations; see `Trial.scores_of`."""
+        """Return the scores of some iterations in results.jsonl; see `Trial.scores_of`."""
         return read_scores(self.results_path, iterations)
 
     def keep_damaged_results(self, lines: Sequence[bytes]) -> None:
@@ -120,7 +120,7 @@ class TrialStore(OwnedFolder):
             file.write(b"".join(line + b"\n" for line in lines))
 
     def set_aside_results(self) -> str:
-        """Move what is in the place of results.jsonl; see `Trial.set_aside`."""
+        """Move away a results.jsonl that can't be read; see `Trial.set_aside_results`."""
         return self.set_aside(self.results_path)
 
     def has_results(self) -> bool:
@@ -128,37 +128,37 @@ class TrialStore(OwnedFolder):
         return self.results_path.exists()
 
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
-        """Replace results.jsonl by these lines: those up to the checkpoint a trial goes on from."""
+        """Replace results.jsonl by the lines up to the checkpoint that the trial continues from."""
         text = "".join(dump(record, indent=None) for record in records)
         with self.owned():
             write_atomic(self.results_path, text)
 
     def checkpoints(self) -> list[CheckpointRecord]:
-        """The complete checkpoints, oldest first (those being written have no final name yet).
+        """Read the complete checkpoints, oldest first (those being written have no final name yet).
 
         Raises:
-            CheckpointError: A manifest is damaged, or of another checkpoint than lies there.
+            CheckpointError: A manifest is damaged, or belongs to another checkpoint.
         """
         return [self.checkpoint(iteration) for iteration in self.checkpoint_iterations()]
 
     def checkpoint_iterations(self) -> list[int]:
-        """Those that have a checkpoint, damaged or not, in order."""
+        """Return the iterations that have a checkpoint, damaged or not, in order."""
         numbers = (checkpoint_iteration(path.name) for path in parts_of(self.checkpoints_folder))
         return sorted(number for number in numbers if number is not None)
 
     def checkpoint(self, iteration: int) -> CheckpointRecord:
-        """The manifest of an iteration's checkpoint.
+        """Read the manifest of an iteration's checkpoint.
 
         Raises:
-            NotFoundError: There is none.
-            CheckpointError: It is damaged, or of another checkpoint.
+            NotFoundError: There is no such checkpoint.
+            CheckpointError: It is damaged, or belongs to another checkpoint.
         """
         folder = self.checkpoint_folder(iteration)
         record = read_manifest(folder)
         if (record.trial_id, record.iteration) != (self.trial_id, iteration):
             raise CheckpointError(
                 f"The manifest of checkpoint {folder} is of trial {record.trial_id}, iteration {record.iteration}.",
-                "Delete this folder; the trial goes on from its other checkpoints.",
+                "Delete this folder; the trial continues from its other checkpoints.",
             )
         return record
 
@@ -167,15 +167,15 @@ class TrialStore(OwnedFolder):
         return verify_checkpoint(self.checkpoint_folder(iteration))
 
     def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
-        """Write a checkpoint folder whole: to a hidden name, hashed, synced, then renamed.
+        """Write a checkpoint folder atomically: under a hidden name, hashed, synced, then renamed.
 
         Args:
             record: Its scores and iteration.
-            write: Fills the folder it is given.
-            engine: Name of the engine that can go on from it; empty: the manifest names none.
+            write: Fills the folder that it is given.
+            engine: Name of the engine that can continue from it; empty: the manifest names none.
 
         Raises:
-            CheckpointError: Its place is a symbolic link.
+            CheckpointError: Its path is a symbolic link.
         """
         target = self.checkpoint_folder(record.iteration)
         temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
@@ -185,7 +185,7 @@ class TrialStore(OwnedFolder):
             write(temporary)
             write_manifest(temporary, record, engine)
             with self.owned():
-                # There is one if the trial went on from an earlier checkpoint and writes this iteration anew.
+                # It exists if the trial continued from an earlier checkpoint and writes this iteration anew.
                 remove_folder(target)
                 temporary.replace(target)
         except BaseException:
@@ -193,10 +193,10 @@ class TrialStore(OwnedFolder):
             raise
 
     def delete_checkpoint(self, record: CheckpointRecord) -> None:
-        """Remove a checkpoint: first from sight, then from disk.
+        """Remove a checkpoint: it is hidden first, then deleted.
 
         Raises:
-            CheckpointError: Its place is a symbolic link.
+            CheckpointError: Its path is a symbolic link.
         """
         folder = self.checkpoint_folder(record.iteration)
         hidden = folder.with_name(f".{folder.name}.deleted")
@@ -206,7 +206,7 @@ class TrialStore(OwnedFolder):
         remove_folder(hidden)
 
     def copied_checkpoint(self, iteration: int) -> Path:
-        """Where the copy of another trial's checkpoint lies that was taken over at an iteration, or would."""
+        """Return the folder of the copy that was made at an iteration, which need not exist."""
         return within(self._copies_folder, f"{iteration:06d}")
 
     @property
@@ -219,7 +219,7 @@ class TrialStore(OwnedFolder):
         temporary = final.with_name(f".{final.name}")
         try:
             remove_folder(temporary)
-            # Links stay links, which `verify_checkpoint` refuses: what they point to is not to get in here.
+            # Links are copied as links, which `verify_checkpoint` refuses, so that their targets are not copied.
             shutil.copytree(folder, temporary, symlinks=True)
             record = verify_checkpoint(temporary)
             remove_folder(final)
@@ -253,7 +253,7 @@ class TrialStore(OwnedFolder):
         return f"{names.DAMAGED_FOLDER}/{target.name}"
 
     def latest_damaged(self) -> int:
-        """Of the checkpoints that were set aside, the latest one's iteration; 0: there is none."""
+        """Return the latest iteration of the checkpoints that were set aside; 0 if there is none."""
         found = [path.name.partition("-")[0] for path in (self.folder / names.DAMAGED_FOLDER).glob("[0-9]*")]
         return max((int(name) for name in found if name.isdecimal()), default=0)
 
@@ -263,29 +263,29 @@ class TrialStore(OwnedFolder):
             file.write(data)
 
     def remove_leftovers(self) -> None:
-        """Delete half-written or half-deleted checkpoints of a process that was killed."""
+        """Delete checkpoints that a killed process had written or deleted only in part."""
         if self.checkpoints_folder.is_dir():
             for folder in self.checkpoints_folder.iterdir():
                 if folder.name.startswith(".") and not folder.is_symlink():
                     remove_folder(folder)
 
     def forget_tally(self) -> None:
-        """Delete the tally: what it says is in the record, or the trial is over.
+        """Delete the tally, because its numbers are in the record, or the trial is over.
 
         Raises:
             OwnershipLostError: This process had taken the trial, and another one has it now.
         """
-        # Where it is a folder, it is no tally, and read by nobody.
+        # A folder of this name is not a tally, and is never read.
         with self.owned(), contextlib.suppress(OSError):
             self.tally_path.unlink(missing_ok=True)
 
     def write_log(self, text: str) -> None:
-        """Append a line to the log: what concerns this trial, whatever its process prints elsewhere."""
+        """Append a line to the trial's log, wherever the output of its process goes."""
         line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
         with open_to_append(self.log_path) as file:
-            # What an env raised may be no text that UTF-8 has.
+            # The message of an env's error may contain what UTF-8 cannot encode.
             file.write(line.encode(errors="backslashreplace"))
 
     def log_tail(self, num_lines: int = 15) -> str:
-        """See `logs.log_tail`: of the trial's last process."""
+        """Return the lines that say how the trial's last process ended."""
         return log_tail(self.log_path, f"trial {self.trial_id}", num_lines)
