@@ -23,7 +23,11 @@ if __name__ == "__main__":
     for engine in sys.argv[1:]:
         # In processes of their own too.
         resources = {"num_env_runners": 1} if engine == "rllib" else {}
-        tune_jobs.launch({**SPEC, "engine": engine, "resources": resources}, name=engine, progress="none")
-        tune_jobs.report(engine)
-        tune_jobs.video(engine)
+        # The first is finished by its launch, the others are by the calls that do the same.
+        is_first = engine == sys.argv[1]
+        spec = {**SPEC, "engine": engine, "resources": resources}
+        tune_jobs.launch(spec, name=engine, progress="none", finish=is_first)
+        if not is_first:
+            tune_jobs.report(engine)
+            tune_jobs.video(engine)
         print(engine, *(trial.status for trial in tune_jobs.trials(engine)), analysis.rewards.reward_of(1))
