@@ -43,6 +43,7 @@ else:
 """
 ENV = """
 import faulthandler, sys, threading
+from typing import Any
 import gymnasium as gym, numpy as np
 
 class Env(gym.Env[Any, Any]):
@@ -79,10 +80,10 @@ def test_a_hang_is_told_by_the_env_s_frame(tmp_path: Path, kind: str) -> None:
     if kind == "elsewhere":
         assert present(frame).name == "<module>"
         return
-    assert str(frame) == f"{tmp_path / 'hanging.py'}:12 in simulate"
+    assert str(frame) == f"{tmp_path / 'hanging.py'}:13 in simulate"
     assert died_by(tail, 12.5) == (
         "an iteration took longer than iteration_timeout_s (12.5 s). It hung at "
-        f"{tmp_path / 'hanging.py'}:12 in simulate"
+        f"{tmp_path / 'hanging.py'}:13 in simulate"
     )
 
 

@@ -194,7 +194,7 @@ def test_idle_cpus_step_slow_environments(
         (1, {"num_samples": 1}, "no CPU is idle"),
         # Ten packs, and six CPUs beside them.
         (16, {}, "there is not an idle CPU for each of the 10 packs"),
-        (16, {"num_samples": 1, "hyperparams": {"num_envs": 1}}, "there is one sub-environment"),
+        (16, {"num_samples": 1, "hyperparams": {"num_envs": 1}}, "there is only one sub-environment"),
     ],
 )
 def test_no_idle_cpus_no_processes(slow_env, machine: int, fields: dict[str, Any], why: str) -> None:

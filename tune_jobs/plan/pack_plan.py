@@ -1,4 +1,4 @@
-"""How many packs there are, with how many trials at once in each: by CPUs, GPUs, the user's limit, and memory."""
+"""Decide how many packs there are and how many trials each trains at once, by CPUs, GPUs, limits and memory."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 MAX_SLOTS = 64
-"""Most trials of one pack at once."""
+"""The most trials that one pack trains at once."""
 
 MAX_AT_ONCE_TPE = 4
-"""Trials at once with search.type tpe, if there are not more CPUs.
+"""How many trials run at once with search.type tpe, if there are not more CPUs.
 
-The model learns from trials that ended: of those that run it knows only that they are tried. A pack that took dozens at
-once would draw most points of a sweep before the model knows anything of the ones beside them, which is random search.
-Few at once cost little: the sweep is as many times longer as its proposals are better informed.
+The model learns from trials that have ended; about running trials it knows only that they run. A pack that trains
+dozens at once would begin most points of a sweep before the model has any results, which would be random search. With
+few at once, the sweep takes longer, but its proposals are better informed.
 """
 
-# The other half is for the processes themselves, whatever else runs, and what the estimate leaves out.
+# The other half is for the processes themselves, for other programs, and for what the estimate leaves out.
 _SHARE_OF_MEMORY = 0.5
 
 _OTHERS = "other trials need the idle CPUs"
@@ -33,15 +33,15 @@ _OTHERS = "other trials need the idle CPUs"
 
 @dataclass(frozen=True)
 class TrialToPack:
-    """A trial that is to be packed."""
+    """A trial that will be packed."""
 
     trial_id: str
     key: tuple[Any, ...] | None
-    """See `engine_choice.pack_key`; None: its point is not known."""
+    """The result of `engine_choice.pack_key`; None: its point is not known."""
     num_bytes: float
-    """Memory it takes, as an estimate."""
+    """An estimate of the memory it takes, in bytes."""
     num_envs: int = 1
-    """Its sub-environments; where its point is not known, the fewest that it may have."""
+    """The number of its sub-environments; if its point is not known, the fewest that it may have."""
 
 
 def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack], *, may_spread: bool) -> PackPlan:
@@ -49,7 +49,7 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack]
 
     Args:
         spec: The sweep.
-        machine: What it runs on; one process of a trial fits on it.
+        machine: The machine that it runs on; at least one process of a trial fits on it.
         members: The trials to be packed that have not ended, by index; at least one.
         may_spread: Whether idle CPUs may step environments; false: other trials need them.
     """
@@ -60,7 +60,7 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack]
     from policies.packed.envs.make import choose_kind
 
     step = measure_step(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s)
-    # A pack's sub-environments are shared out over its processes: more of these than of those have nothing to do.
+    # A pack's sub-environments are distributed over its processes, so more processes than these would be idle.
     most = slots * min(member.num_envs for member in members)
     spare, why_none = _spare_cpus(machine, num_packs, cpus, gpus, most) if may_spread else (0, _OTHERS)
     choice = choose_kind(step, spare_cpus=spare, why_none=why_none)
@@ -80,13 +80,13 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack]
 
 
 def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, int]:
-    """Packs and slots as CPUs, GPUs and the limits on trials at once allow."""
+    """Return how many packs and slots CPUs, GPUs and the limits on trials at once allow."""
     limit = math.inf if spec.resources.max_concurrent is None else spec.resources.max_concurrent
     if spec.search.type == "tpe":
         limit = min(limit, max(MAX_AT_ONCE_TPE, fitting))
     num_packs = max(1, int(min(fitting, num_members, limit)))
     share = math.ceil(num_members / num_packs)
-    # As many after one another as it takes, and as many each time: the last are not left to one pack.
+    # Trials run in several rounds of equal size, so that the last ones are not left to one pack.
     slots = math.ceil(share / math.ceil(share / MAX_SLOTS))
     return num_packs, max(1, int(min(slots, limit / num_packs)))
 
@@ -94,10 +94,10 @@ def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, in
 def _by_memory(
     machine: Machine, members: Sequence[TrialToPack], num_packs: int, slots: int, cpus: float
 ) -> tuple[int, int, tuple[str, ...]]:
-    """As many packs and slots of those as memory allows, and the note that says so if they are fewer."""
+    """Return how many of the packs and slots memory allows, and a note if they are fewer."""
     largest = heapq.nlargest(slots, (member.num_bytes for member in members))
     wanted = num_packs, slots
-    # Whatever trials meet in a pack: they are not more than its largest.
+    # Whichever trials meet in a pack, they need at most as much memory as the largest ones.
     while (budget := _budget(machine, num_packs, cpus)) is not None and num_packs > 1 and largest[0] > budget:
         num_packs -= 1
     if budget is None:
@@ -126,9 +126,9 @@ def _budget(machine: Machine, num_packs: int, cpus: float) -> float | None:
 
 
 def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most: int) -> tuple[int, str]:
-    """CPUs that each pack may have beside its own, so that as many packs still fit; and why there are none, if so."""
+    """Return how many more CPUs each pack may use, so that as many packs still fit; and why, if there are none."""
     if most < 2:
-        return 0, "there is one sub-environment, which nothing can be shared out of"
+        return 0, "there is only one sub-environment, which cannot be distributed"
     spare = 0
     while spare < most and machine.fitting(cpus + spare + 1, gpus) >= num_packs:
         spare += 1
@@ -138,7 +138,7 @@ def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most
 
 
 def _in_stacks(members: Sequence[TrialToPack]) -> list[TrialToPack]:
-    """Those of one key together, in the order in which keys are first met; those that have none yet last."""
+    """Return the trials sorted by key, in the order of each key's first trial; those without a key come last."""
     stacks: dict[tuple[Any, ...] | None, list[TrialToPack]] = {}
     for member in members:
         stacks.setdefault(member.key, []).append(member)

@@ -60,7 +60,7 @@ class _Names:
     """Finds the two packages; it comes before all other finders."""
 
     def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
-        """See `importlib.abc.MetaPathFinder.find_spec`."""
+        """Return the module's spec, or None if it is not for this finder; called by the import system."""
         if fullname not in NAMES:
             return None
         folder, file = _folder(fullname), os.path.join(_folder(fullname), _INIT)  # noqa: PTH118
@@ -73,7 +73,7 @@ class _Loader(SourceFileLoader):
     """Loads one of the packages, and lets it fall back to the names of the user's own."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """See `importlib.abc.Loader.exec_module`."""
+        """Execute the package's `__init__.py`, and add the fallback to it; called by the import system."""
         super().exec_module(module)
         _add_fallback(module)
 
@@ -82,7 +82,7 @@ class _TheirSubmodules:
     """Finds submodules of the user's own package; it comes after all other finders, which look in ours."""
 
     def find_spec(self, fullname: str, *_: Any) -> ModuleSpec | None:
-        """See `importlib.abc.MetaPathFinder.find_spec`."""
+        """Return the module's spec, or None if it is not for this finder; called by the import system."""
         if fullname.count(".") != 1 or not fullname.startswith(tuple(f"{name}." for name in NAMES)):
             return None
         name = fullname.partition(".")[0]

@@ -6,7 +6,7 @@ to their end. A *band* has one bracket of each number of halvings. Trials fill o
 is the one that ends the most trials. Milestones are counted in grace periods: counted in env steps, brackets would need
 50,000 trials for 50,000 steps.
 
-The rule is Ray Tune's, except that no trial waits for ever. With Ray's, all trials of a bracket wait for ever if
+The rule is Ray Tune's, except that no trial waits forever. With Ray's, all trials of a bracket wait forever if
 evaluations are further apart than milestones, because those that are to continue have passed the next milestone
 already; and, after the first halving, if the last trial that others wait for fails or reaches a stop rule.
 """
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class _Bracket:
     num_places: int
     milestone: int
-    """Where its trials are compared next, in grace periods."""
+    """The next milestone, at which its trials are compared, in grace periods."""
     num_halvings: int
     """The halvings still to come."""
     total_work: int

@@ -20,6 +20,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from typing_extensions import override
 
 from policies import random_streams
 from policies.suggestions import did_you_mean
@@ -92,8 +93,8 @@ class Listed(_Domain):
         """
         return [json.dumps(known) for known in self.values].index(json.dumps(value))
 
+    @override
     def probes(self) -> list[tuple[int | None, Any]]:
-        """See `_Domain`."""
         return list(enumerate(self.values))
 
 
@@ -177,8 +178,8 @@ class Range(_Domain):
                 raise ValueError(f"has no multiple of {self.q:g} between {low!r} and {high!r}")
         return self
 
+    @override
     def probes(self) -> list[tuple[int | None, Any]]:
-        """See `_Domain`."""
         low, high = self.bounds
         if self.is_whole:
             return [(0, int(low)), (1, int(high))]

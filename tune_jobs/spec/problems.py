@@ -16,7 +16,7 @@ class Problem(NamedTuple):
     path: str
     """Its dotted path in the sweep file."""
     text: str
-    """What is wrong there."""
+    """The description of what is wrong there."""
 
 
 class WrongSpecError(SpecError):

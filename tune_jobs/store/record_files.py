@@ -24,7 +24,7 @@ _SEAL = "sha256"
 _FIRST_SEALED_VERSION = 2
 _BACKUP = "Restore the file from a backup."
 _MAX_DEPTH = 256
-"""Of lists and mappings in each other; of what a sweep file gives fewer are read, and no record adds many."""
+"""The most nested lists and mappings; sweep files may have fewer, and no record adds many."""
 
 
 def dump(record: BaseModel, indent: int | None = 1) -> str:

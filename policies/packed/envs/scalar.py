@@ -47,7 +47,7 @@ class ScalarEnvs:
 
     Args:
         env_id: Gymnasium id.
-        env_args: As `policies.envs.make.make_env` takes them.
+        env_args: The same as for `policies.envs.make.make_env`.
         num_envs: Sub-environments of each member.
         failure_penalty: Reward of steps that end by failure; None: the env's own reward.
         num_processes: Processes to step them in; 0: in this one.

@@ -73,7 +73,7 @@ class SubEnvs:
 
     Args:
         env_id: Gymnasium id.
-        env_args: As `policies.envs.make.make_env` takes them.
+        env_args: The same as for `policies.envs.make.make_env`.
     """
 
     def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
