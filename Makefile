@@ -45,16 +45,16 @@ $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
-# In three processes on two cores, as many of the tests wait for processes of their own: two halves of those in tests/ray,
-# each with a Ray of its own, and the others; with the types beside them. What the halves print, skipped tests with their
+# In three processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
+# each with a Ray of its own, and the others; with the types beside them. What the parts print, skipped tests with their
 # reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
 # the environment says.
 RAY := tests/ray
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
-	$(BIN)/python -m pytest $(RAY)/test_[a-o]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
-	$(BIN)/python -m pytest $(RAY)/test_[p-z]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
+	$(BIN)/python -m pytest $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
+	$(BIN)/python -m pytest $(RAY)/test_[p-s]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
 	$(BIN)/python -m pytest --ignore=$(RAY); others=$$?; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \
