@@ -351,5 +351,5 @@ def test_a_damaged_state_is_refused(checkpoint: Saved, engine: PackedEngine, tmp
 def test_a_checkpoint_of_another_engine_is_refused(checkpoint: Saved, engine: PackedEngine, tmp_path: Path) -> None:
     _, task, policy = checkpoint
     save_policy(policy, tmp_path / "000001")
-    with pytest.raises(CheckpointError, match="not of the packed engine"):
+    with pytest.raises(CheckpointError, match="the packed engine did not write it"):
         engine.add(task, tmp_path / "000001")
