@@ -15,9 +15,9 @@ from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 
-LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
-DQN = {"algorithm": "dqn"}
-TPE = {"search": "tpe", "space": LR, "num_samples": 30}
+LR: dict[str, Any] = {"lr": {"loguniform": [1e-4, 1e-2]}}
+DQN: dict[str, Any] = {"algorithm": "dqn"}
+TPE: dict[str, Any] = {"search": "tpe", "space": LR, "num_samples": 30}
 
 
 def plan(machine: Machine | float = 2, records: Sequence[TrialRecord] = (), **fields: Any) -> SweepPlan:

@@ -46,7 +46,11 @@ def named(path: str) -> list[ast.stmt]:
 def test_an_entry_names_what_is_there(engine: Engine) -> None:
     for path in filter(None, (engine.constructor, engine.restore)):
         assert len(named(path)) == 1, path
-    methods = {node.name for node in named(engine.constructor)[0].body if isinstance(node, ast.FunctionDef)}
+    methods = {
+        node.name
+        for node in cast("ast.ClassDef", named(engine.constructor)[0]).body
+        if isinstance(node, ast.FunctionDef)
+    }
     assert ("add" in methods, "build" in methods) == (engine.trains_many, not engine.trains_many)
 
 

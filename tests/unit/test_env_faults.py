@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -32,7 +32,7 @@ from policies.packed.evaluation import evaluate_many
 from tune_jobs.training.baseline import BaselineEngine
 
 if TYPE_CHECKING:
-    from policies.packed.envs.scalar import ScalarEnvs
+    from policies.packed.envs.vector import PackedEnvs
 
 __all__ = ["make", "own_modules"]
 
@@ -73,7 +73,7 @@ STEPS = (
 )
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")
 def test_a_faulty_env_fails_its_member_alone(
-    make: Callable[..., ScalarEnvs], kind: str, fault: dict[str, str], words: str
+    make: Callable[..., PackedEnvs], kind: str, fault: dict[str, str], words: str
 ) -> None:
     envs = make(FAULTY, kind, env_args={**fault, "action": 1}, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
     alone = make(FAULTY, "scalar", members={"a": 1, "c": 3})
@@ -99,7 +99,7 @@ def test_a_faulty_env_fails_its_member_alone(
     ],
 )
 def test_a_reset_that_goes_wrong_makes_no_member(
-    make: Callable[..., ScalarEnvs], kind: str, fault: dict[str, str], words: str
+    make: Callable[..., PackedEnvs], kind: str, fault: dict[str, str], words: str
 ) -> None:
     args = {"where": "reset", "seed": 13, **fault}
     envs = make(FAULTY, kind, num_envs=2, env_args=args, members={"a": 2}, num_processes=2)
@@ -114,7 +114,7 @@ def test_a_reset_that_goes_wrong_makes_no_member(
 
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
-def test_an_env_that_cannot_be_closed_harms_nobody(make: Callable[..., ScalarEnvs], kind: str) -> None:
+def test_an_env_that_cannot_be_closed_harms_nobody(make: Callable[..., PackedEnvs], kind: str) -> None:
     args = {"where": "close", "raises": "SystemExit"}
     envs = make(FAULTY, kind, env_args=args, members={"a": 1, "b": 2}, num_processes=2)
     go_on(envs)
@@ -126,14 +126,14 @@ def test_an_env_that_cannot_be_closed_harms_nobody(make: Callable[..., ScalarEnv
 
 @pytest.mark.parametrize("name", RAISED)
 def test_a_constructor_may_raise_anything(name: str) -> None:
-    makers: tuple[Callable[..., object], ...] = (make_env, lambda *args: make_vector_env(*args, 2))
+    makers: tuple[Callable[..., object], ...] = (make_env, lambda *args: cast("Any", make_vector_env)(*args, 2))
     for make_one in makers:
         with pytest.raises(EnvError, match=f"cannot be made.*{name}"):
             make_one(FAULTY, {"where": "init", "raises": name})
 
 
 def test_the_message_names_the_line_in_the_env_and_not_in_what_is_around_or_inside_it(
-    make: Callable[..., ScalarEnvs],
+    make: Callable[..., PackedEnvs],
 ) -> None:
     envs = make("odd_envs:Deep", "scalar", members={"a": 1})
     go_on(envs)
@@ -288,7 +288,7 @@ print("raised", *envs.step(np.zeros(1, int)).errors, flush=True)
 ENV = """
 import os, signal, sys
 import gymnasium as gym, numpy as np
-class Env(gym.Env[Any, Any]):
+class Env(gym.Env):
     observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
     def __init__(self, signal): self.signal = signal
     def reset(self, *, seed=None, options=None): return np.zeros(1, np.float32), {}

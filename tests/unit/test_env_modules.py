@@ -31,7 +31,7 @@ import gymnasium as gym
 import numpy as np
 
 
-class Walk(gym.Env[Any, Any]):
+class Walk(gym.Env):
     metadata = {"render_modes": []}
 
     def __init__(self, length=3):

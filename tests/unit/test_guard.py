@@ -40,7 +40,7 @@ def policy_for_hostile() -> RandomPolicy:
     return RandomPolicy(info.observation_space, info.action_space, env_id=info.env_id)
 
 
-def is_running(pid):
+def is_running(pid: int | None) -> bool:
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -48,7 +48,7 @@ def is_running(pid):
     return state not in "ZX"
 
 
-def until(condition, what: str, timeout_s=600.0):
+def until(condition: Callable[[], Any], what: str, timeout_s: float = 600.0) -> Any:
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {what}"
@@ -308,7 +308,7 @@ def test_a_child_is_ended_though_its_closing_is_interrupted(monkeypatch: pytest.
     process = present(guard._child).process
     wait = process.wait
 
-    def interrupt(timeout=None) -> None:
+    def interrupt(timeout: float | None = None) -> None:
         monkeypatch.setattr(process, "wait", wait)
         raise KeyboardInterrupt
 

@@ -51,7 +51,7 @@ def test_settings_that_cannot_act_are_told(section: dict[str, dict[str, Any]], t
 
 # -- searched, and idle in all points: refused
 
-NEVER = {
+NEVER: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "kl_target": (PPO, {"kl_target": {"loguniform": [1e-3, 1e-1]}}, "use_kl_loss is false"),
     "kl_coeff": ({**PPO, "hyperparams": {"use_kl_loss": False}}, grid(kl_coeff=[0.1, 1.0]), "use_kl_loss is false"),
     "prioritized_alpha": (DQN, {"prioritized_alpha": {"uniform": [0, 1]}}, "replay is not prioritized"),
@@ -74,13 +74,13 @@ NEVER = {
 @pytest.mark.parametrize("name", NEVER)
 def test_a_search_that_changes_nothing_is_refused(name: str) -> None:
     fields, space, why = NEVER[name]
-    fields: dict[str, Any] = {"num_samples": 1 if "grid" in space[name] else 6, **fields}
+    fields = {"num_samples": 1 if "grid" in space[name] else 6, **fields}
     with pytest.raises(SpecError, match=rf"space\.{name} is searched, but can't act.*{why}") as refused:
-        notes(**fields, space=space)  # type: ignore[arg-type]
+        notes(**fields, space=space)
     assert "Take it out of space" in refused.value.hint
     # Whatever else is searched, no trial differs by this one.
     with pytest.raises(SpecError, match=rf"space\.{name} is searched"):
-        notes(**fields, space={**space, **grid(activation=["relu", "tanh"])})  # type: ignore[arg-type]
+        notes(**fields, space={**space, **grid(activation=["relu", "tanh"])})
 
 
 def test_several_are_told_at_once() -> None:

@@ -46,7 +46,7 @@ import faulthandler, sys, threading
 from typing import Any
 import gymnasium as gym, numpy as np
 
-class Env(gym.Env[Any, Any]):
+class Env(gym.Env):
     observation_space, action_space = gym.spaces.Box(-1, 1, (4,)), gym.spaces.Discrete(2)
     def reset(self, *, seed=None, options=None): return np.zeros(4, np.float32), {}
     def step(self, action):

@@ -1,5 +1,6 @@
 """A manifest covers every file of its checkpoint, and itself."""
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -34,9 +35,7 @@ def old_checkpoint(tmp_path: Path) -> Path:
     return shutil.copytree(SAMPLE, tmp_path / "old")
 
 
-def edit(
-    checkpoint: Path, change: Callable[..., str | dict[str, dict[str, Any]] | None], *, sealed: bool = True
-) -> None:
+def edit(checkpoint: Path, change: Callable[[dict[str, Any]], object], *, sealed: bool = True) -> None:
     path = checkpoint / "manifest.json"
     data = json.loads(path.read_text())
     change(data)
@@ -46,7 +45,13 @@ def edit(
 
 
 ENTRY = {"bytes": 0, "sha256": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"}
-BAD_FILES = {
+
+
+def with_entry(name: str, data: dict[str, Any]) -> None:
+    data["files"].update({name: ENTRY})
+
+
+BAD_FILES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "none": (lambda data: data.pop("files"), "files is missing"),
     "null": (lambda data: data.update(files=None), "files is missing"),
     "a list": (lambda data: data.update(files=[]), r"files is \[\]"),
@@ -61,7 +66,7 @@ BAD_FILES = {
     "a truth as size": (lambda data: data["files"]["policy.json"].update(bytes=True), "files.policy.json"),
     "an entry of another type": (lambda data: data["files"].update({"policy.json": 7}), "files.policy.json is 7"),
     **{
-        f"the name {name!r}": (lambda data, name=name: data["files"].update({name: ENTRY}), "not a file in the folder")
+        f"the name {name!r}": (functools.partial(with_entry, name), "not a file in the folder")
         for name in ("../x", "/etc/passwd", "a/../../x", "", ".", "./policy.json", "a//b", "nul\0", "a/")
     },
 }

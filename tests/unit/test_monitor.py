@@ -15,11 +15,11 @@ def make_trial(
     steps: int = 0,
     score: float | None = None,
     time_s: float = 0.0,
-    point_index: None = None,
+    point_index: int | None = None,
 ) -> TrialRecord:
     """A trial whose best checkpoint has this score."""
     trial_id = f"t{index:04d}"
-    checkpoints = ()
+    checkpoints: tuple[CheckpointRecord, ...] = ()
     if score is not None:
         checkpoints = (CheckpointRecord(trial_id=trial_id, iteration=1, num_env_steps=steps, evaluation_return=score),)
     return TrialRecord(
@@ -96,7 +96,7 @@ def test_the_rate_is_of_the_last_seconds() -> None:
     assert monitor.estimate().env_steps_per_s == pytest.approx(1_000)
     # Nothing more comes: the rate falls.
     clock.now += 60.0
-    assert monitor.estimate().env_steps_per_s < 400
+    assert present(monitor.estimate().env_steps_per_s) < 400
 
 
 def test_the_start_of_ray_is_no_part_of_the_rate() -> None:
@@ -148,7 +148,7 @@ def test_before_a_trial_has_ended_time_left_is_what_the_caps_allow() -> None:
     monitor.update(make_trial(0, "running", steps=100))
     clock.now += 1.0
     monitor.update(make_trial(0, "running", steps=200))
-    rate = monitor.estimate().env_steps_per_s
+    rate = present(monitor.estimate().env_steps_per_s)
     assert rate == pytest.approx(100)
     assert monitor.estimate().time_left_s == pytest.approx((800 + 1_000 + 1_000) / rate)
 

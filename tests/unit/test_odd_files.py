@@ -18,7 +18,6 @@ from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
 from policies.packed.state import load_member
 from tune_jobs.spec.file import stored_spec
-from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import candidates
 from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.pack_files import PackFiles
@@ -66,8 +65,8 @@ READERS = {
 
 
 def problems(
-    folder: Path, template: Path, file: str, make: Callable[[Path], None], ask: Callable[[Path], SweepSpec]
-) -> Iterator[Any]:
+    folder: Path, template: Path, file: str, make: Callable[[Path], None], ask: Callable[[Path], object]
+) -> Iterator[str]:
     """Errors that are none of ours, where a file was made wrong; it is mended afterwards."""
     try:
         make(folder / file)
@@ -138,7 +137,8 @@ def test_a_sweep_with_anything_in_a_record_is_shown_and_resumed_or_refused(
     found: dict[str, Any] = {}
     for at in odd_files.places(data):
         name, value = next(values)
-        for ask in (sweeps.trials, sweeps.dataframe, resume):
+        readers: tuple[Callable[..., Any], ...] = (sweeps.trials, sweeps.dataframe, resume)
+        for ask in readers:
             changed = odd_files.put(data, at, value)
             for problem in problems(folder, template, file, lambda path: odd_files.write(path, changed), ask):  # noqa: B023
                 found.setdefault(problem, []).append((at, name, ask.__name__))
@@ -195,10 +195,10 @@ def test_a_sweep_is_called_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def damage_bytes(content: bytes, rng: np.random.Generator) -> bytes:
-    content = bytearray(content)
-    for index in rng.integers(len(content), size=4):
-        content[index] ^= 1 << int(rng.integers(8))
-    return bytes(content)
+    damaged = bytearray(content)
+    for index in rng.integers(len(damaged), size=4):
+        damaged[index] ^= 1 << int(rng.integers(8))
+    return bytes(damaged)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +32,12 @@ from tune_jobs.sweeps import verbs as sweeps
 class Watch:
     """What Python opens, lists, makes, moves and deletes in one folder, whoever asks for it in this process."""
 
-    folder = None
+    folder: Path | None = None
 
     def __init__(self) -> None:
         self.seen: list[Any] = []
 
-    def __call__(self, event: str, arguments: tuple[Callable[[pytest.TempPathFactory], Path], str]) -> None:
+    def __call__(self, event: str, arguments: tuple[Any, ...]) -> None:
         if self.folder is None or not event.startswith(("open", "os.", "shutil.")):
             return
         folder, self.folder = self.folder, None
@@ -51,7 +51,7 @@ class Watch:
             self.folder = folder
 
     @staticmethod
-    def _is_in(folder: Path, path: bytes | str | Path) -> bool:
+    def _is_in(folder: Path, path: bytes | str | os.PathLike[Any]) -> bool:
         try:
             return Path(os.path.realpath(os.fsdecode(path))).is_relative_to(folder)
         except (OSError, ValueError):

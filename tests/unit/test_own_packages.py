@@ -17,7 +17,7 @@ OURS = "import analysis.report, policies.acting.policy, policies.packed.dqn.repl
 
 
 @pytest.fixture
-def project(tmp_path: Path) -> Callable[[str, dict[str, str], bool], tuple[str, str]]:
+def project(tmp_path: Path) -> Callable[..., tuple[str, str]]:
     """Writes a script's folder and runs the script in it; returns its standard output and error."""
 
     def run(script: str, files: dict[str, str], *, fails: bool = False) -> tuple[str, str]:
@@ -49,9 +49,7 @@ USE = (
 
 @pytest.mark.parametrize("with_inits", [False, True], ids=["folders", "packages"])
 @pytest.mark.parametrize("first", ["tune_jobs", "theirs", "within"])
-def test_modules_of_both_are_found(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]], with_inits: bool, first: str
-) -> None:
+def test_modules_of_both_are_found(project: Callable[..., tuple[str, str]], with_inits: bool, first: str) -> None:
     files = {**HELPERS, **(INITS if with_inits else {})}
     script = {
         "tune_jobs": "import tune_jobs\n" + USE + OURS + USE,
@@ -67,9 +65,7 @@ def test_modules_of_both_are_found(
 
 
 @pytest.mark.parametrize("first", ["tune_jobs", "theirs"])
-def test_names_in_the_users_own_packages_are_found(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]], first: str
-) -> None:
+def test_names_in_the_users_own_packages_are_found(project: Callable[..., tuple[str, str]], first: str) -> None:
     names = "from analysis import LEVEL, plot_all\nimport analysis\nprint(LEVEL, plot_all(), analysis.LEVEL)\n"
     imports = ["import tune_jobs\n" + OURS, names]
     script = "".join(imports if first == "tune_jobs" else imports[::-1])
@@ -78,7 +74,7 @@ def test_names_in_the_users_own_packages_are_found(
 
 
 def test_plain_modules_of_these_names_are_found(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     files = {"analysis.py": "import statistics\nLEVEL = 3\nclass Kept: pass\n", "policies.py": "WIDTH = 7\n"}
     script = (
@@ -90,14 +86,14 @@ def test_plain_modules_of_these_names_are_found(
 
 
 def test_the_users_code_runs_only_when_it_is_asked_for(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     files = {"policies/__init__.py": "print('ran')\nWIDTH = 7\n", "policies/nets.py": ""}
     script = "import tune_jobs\n" + OURS + "from policies import errors\nimport policies.nets\n"
     assert project(script + "print('now')\nimport policies\npolicies.WIDTH", files)[0].splitlines() == ["now", "ran"]
 
 
-def test_what_neither_has_is_missing_as_ever(project: Callable[[str, dict[str, str], bool], tuple[str, str]]) -> None:
+def test_what_neither_has_is_missing_as_ever(project: Callable[..., tuple[str, str]]) -> None:
     script = (
         "import tune_jobs, analysis\nprint(hasattr(analysis, 'nothing'))\n"
         "for line in ('import analysis.nothing', 'from policies import nothing', 'import policies.packed.nothing'):\n"
@@ -108,14 +104,14 @@ def test_what_neither_has_is_missing_as_ever(project: Callable[[str, dict[str, s
 
 
 def test_an_error_in_the_users_package_reaches_them(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     attempt = "try:\n    from analysis import x\nexcept ZeroDivisionError:\n    print(0)\n"
     script = f"import tune_jobs\n{attempt}{attempt}"
     assert project(script, {"analysis/__init__.py": "x = 1 / 0\n"})[0].split() == ["0", "0"]
 
 
-def test_a_hidden_module_is_warned_of_once(project: Callable[[str, dict[str, str], bool], tuple[str, str]]) -> None:
+def test_a_hidden_module_is_warned_of_once(project: Callable[..., tuple[str, str]]) -> None:
     files = {
         "policies/__init__.py": "",
         "policies/networks.py": "",
@@ -139,7 +135,7 @@ def test_a_hidden_module_is_warned_of_once(project: Callable[[str, dict[str, str
 
 
 def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     files = {
         "policies/envs/cart.py": "",
@@ -154,7 +150,7 @@ def test_a_hidden_folder_of_code_is_warned_of_and_others_are_not(
 
 
 def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     files = {"policies/__init__.py": "", "policies/networks.py": ""}
     script = "import policies.networks\nimport tune_jobs\n"
@@ -165,7 +161,7 @@ def test_a_module_of_ours_that_is_theirs_already_is_one_clear_error(
 
 
 def test_a_spawned_process_of_environments_finds_ours(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     script = (
         "if __name__ == '__main__':\n"
@@ -184,7 +180,7 @@ ENV = "import gymnasium\n\n\nclass Walk(gymnasium.Env):\n    pass\n"
 
 
 def test_environments_in_the_users_packages_are_found_by_id_and_for_other_processes(
-    project: Callable[[str, dict[str, str], bool], tuple[str, str]],
+    project: Callable[..., tuple[str, str]],
 ) -> None:
     # As the command has it: without the current folder on the path.
     script = (

@@ -17,7 +17,7 @@ def slow_env(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guarded, "measure_step", lambda env_id, env_args, *, timeout_s: StepTime(5000.0))
 
 
-def packs(machine: int | Machine = 2, **fields: Any) -> tuple[int, int]:
+def packs(machine: float | Machine = 2, **fields: Any) -> tuple[int, int]:
     made = present(plan(machine, **fields).packs)
     return made.num_packs, made.slots
 
@@ -107,9 +107,9 @@ def test_a_few_large_trials_do_not_make_all_places_large() -> None:
     machine = Machine(1, memory_bytes=2.1 * (10 * MEMBER * 2))
     # Two of them, and six small ones: all fit at once.
     assert packs(machine, **{**DQN, "space": {"replay_capacity": {"grid": [1_000]}}}) == (1, 10)
-    made = plan(machine, **{**DQN, "space": space, "num_samples": 1, "seeds_per_point": 2})
+    made = plan(machine, **DQN, space=space, num_samples=1, seeds_per_point=2)
     assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 4)
-    made = plan(machine, **{**DQN, "space": space, "num_samples": 1, "seeds_per_point": 3})
+    made = plan(machine, **DQN, space=space, num_samples=1, seeds_per_point=3)
     assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 2)
 
 
@@ -171,7 +171,7 @@ FOUR_ENVS = {"hyperparams": {"num_envs": 4, "train_batch_size": 64, "minibatch_s
     ],
 )
 def test_idle_cpus_step_slow_environments(
-    slow_env, machine: int | Machine, fields: dict[str, Any], packs: int, processes: int
+    slow_env: None, machine: float | Machine, fields: dict[str, Any], packs: int, processes: int
 ) -> None:
     made = present(plan(machine, **fields).packs)
     assert (made.env_kind, made.num_packs, made.num_env_processes) == (
@@ -197,13 +197,13 @@ def test_idle_cpus_step_slow_environments(
         (16, {"num_samples": 1, "hyperparams": {"num_envs": 1}}, "there is only one sub-environment"),
     ],
 )
-def test_no_idle_cpus_no_processes(slow_env, machine: int, fields: dict[str, Any], why: str) -> None:
+def test_no_idle_cpus_no_processes(slow_env: None, machine: int, fields: dict[str, Any], why: str) -> None:
     made = present(plan(machine, **fields).packs)
     assert (made.env_kind, made.num_env_processes) == ("scalar", 0)
     assert made.why_env_kind.startswith(f"a step takes 5.0 ms, but {why}")
 
 
-def test_cpus_that_other_trials_need_are_not_idle(slow_env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cpus_that_other_trials_need_are_not_idle(slow_env: None, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_reasons(monkeypatch, [0.2])
     space: dict[str, Any] = {"space": {"lr": {"grid": [0.1, 0.2, 0.3]}}, "num_samples": 1, "resources": {"num_gpus": 1}}
     made = present(plan(Machine(8, 1), **space).packs)

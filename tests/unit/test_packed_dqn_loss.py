@@ -1,11 +1,14 @@
 """The gradient of DQN's loss is written out: it is that of the loss as torch's graph computes it."""
 
+from typing import Any, cast
+
 import pytest
 import torch
 from torch import nn
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn import loss as dqn
+from tests.narrowing import present
 from tests.rounding import close
 
 M, B = 3, 50
@@ -29,8 +32,8 @@ def by_autograd(
     function = nn.functional.huber_loss if hyperparams.td_loss == "huber" else nn.functional.mse_loss
     rows = function(selected, targets, reduction="none")
     losses = (rows if weights is None else rows * weights).mean(dim=1)
-    losses.sum().backward()
-    return outputs.grad, losses.detach(), selected.detach()
+    losses.sum().backward()  # type: ignore[no-untyped-call]
+    return present(outputs.grad), losses.detach(), selected.detach()
 
 
 @pytest.mark.usefixtures("in_double")
@@ -47,7 +50,7 @@ def test_the_gradient_by_hand_is_that_of_the_loss(
     actions = torch.randint(num_actions, (M, B), generator=rng)
     targets = torch.randn(M, B, generator=rng)
     weights = torch.rand(M, B, generator=rng) if has_weights else None
-    found = dqn.loss_gradient(outputs, actions, targets, weights, hyperparams)
+    found = dqn.loss_gradient(outputs, actions, targets, weights, cast("Any", hyperparams))
     gradient, losses, selected = by_autograd(outputs, actions, targets, weights, hyperparams)
     # Of both branches of Huber's loss, on both sides.
     assert all((mask.float().mean() > 0.1) for mask in (found.td_errors > 1, found.td_errors < -1))
@@ -55,7 +58,7 @@ def test_the_gradient_by_hand_is_that_of_the_loss(
     close(found.gradient, gradient)
     close(found.q_selected, selected)
     close(found.td_errors, selected - targets)
-    close(dqn.mean_loss(found.td_errors, weights, hyperparams), losses)
+    close(dqn.mean_loss(found.td_errors, weights, cast("Any", hyperparams)), losses)
 
 
 def test_the_best_next_action_is_the_target_networks_or_the_online_ones() -> None:

@@ -18,14 +18,12 @@ from policies.errors import EnvError
 from tests.narrowing import present
 
 if TYPE_CHECKING:
-    from policies.packed.envs.cartpole import CartPoleEnvs
-    from policies.packed.envs.scalar import ScalarEnvs
-    from policies.packed.envs.vector import Step
+    from policies.packed.envs.vector import PackedEnvs, Step
 
 __all__ = ["make", "own_modules"]
 
 
-def go_on(envs: ScalarEnvs, breaking: str | None = None, how: int = 0, place: int = 1) -> Step:
+def go_on(envs: PackedEnvs, breaking: str | None = None, how: int = 0, place: int = 1) -> Step:
     actions = np.zeros(len(envs.observations), dtype=np.int64)
     if breaking is not None:
         actions[rows_of(envs, breaking)][place] = how
@@ -35,7 +33,7 @@ def go_on(envs: ScalarEnvs, breaking: str | None = None, how: int = 0, place: in
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
 @pytest.mark.parametrize(("how", "words"), [(RAISE, "the motor broke"), (WRONG_SHAPE, r"shape \(5,\), not \(2,\)")])
 def test_an_env_that_raises_fails_its_member_alone(
-    make: Callable[..., CartPoleEnvs | ScalarEnvs], kind: str, how: int, words: str
+    make: Callable[..., PackedEnvs], kind: str, how: int, words: str
 ) -> None:
     envs = make("odd_envs:Fragile", kind, members={"a": 1, "b": 2, "c": 3}, num_processes=2)
     alone = make("odd_envs:Fragile", "scalar", members={"a": 1, "c": 3})
@@ -63,7 +61,7 @@ def test_an_env_that_raises_fails_its_member_alone(
 
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
-def test_a_member_that_cannot_be_reset_is_none(make: Callable[..., CartPoleEnvs | ScalarEnvs], kind: str) -> None:
+def test_a_member_that_cannot_be_reset_is_none(make: Callable[..., PackedEnvs], kind: str) -> None:
     envs = make("odd_envs:RefusesSeeds", kind, num_envs=2, members={"a": 2}, num_processes=2)
     with pytest.raises(EnvError, match=r"reset\(\): ValueError: 13 brings bad luck"):
         envs.add("b", 12)  # its second sub-environment, in another process than the first
@@ -77,7 +75,7 @@ def test_a_member_that_cannot_be_reset_is_none(make: Callable[..., CartPoleEnvs 
 
 
 def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_with_it_again(
-    make: Callable[..., CartPoleEnvs | ScalarEnvs],
+    make: Callable[..., PackedEnvs],
 ) -> None:
     envs = make("odd_envs:Fragile", "processes", members={"a": 1, "b": 2}, num_processes=2)
     go_on(envs)
@@ -102,7 +100,7 @@ def test_members_of_a_process_that_dies_fail_and_the_guilty_one_takes_no_others_
         assert_equal_bits([seen_by(envs, step, member_id)], [seen_by(alone, expected, member_id)])
 
 
-def test_a_process_that_is_killed_fails_its_members(make: Callable[..., CartPoleEnvs | ScalarEnvs]) -> None:
+def test_a_process_that_is_killed_fails_its_members(make: Callable[..., PackedEnvs]) -> None:
     envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
     os.kill(present(multiprocessing.active_children()[0].pid), signal.SIGKILL)
     go_on(envs)
@@ -113,7 +111,7 @@ def test_a_process_that_is_killed_fails_its_members(make: Callable[..., CartPole
     assert go_on(envs).rewards.all()
 
 
-def test_a_process_that_is_dead_when_a_member_comes_fails_both(make: Callable[..., CartPoleEnvs | ScalarEnvs]) -> None:
+def test_a_process_that_is_dead_when_a_member_comes_fails_both(make: Callable[..., PackedEnvs]) -> None:
     envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1}, num_processes=1)
     process = multiprocessing.active_children()[0]
     process.kill()

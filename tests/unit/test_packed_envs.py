@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -16,11 +17,10 @@ from policies.envs.make import make_env
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError
 from policies.packed.envs.make import make_packed_envs
+from policies.packed.envs.vector import EnvKind
 
 if TYPE_CHECKING:
-    from policies.packed.envs.cartpole import CartPoleEnvs
-    from policies.packed.envs.scalar import ScalarEnvs
-    from policies.packed.envs.vector import Step
+    from policies.packed.envs.vector import PackedEnvs, Step
 
 
 register_test_envs()
@@ -47,8 +47,13 @@ def make() -> Iterator[Any]:
     made = []
 
     def make_one(
-        env_id: str, kind: str, num_envs: int = N, env_args: Any = None, members: dict[str, int] = (), **kwargs: Any
-    ) -> CartPoleEnvs | ScalarEnvs:
+        env_id: str,
+        kind: EnvKind,
+        num_envs: int = N,
+        env_args: Any = None,
+        members: Mapping[str, int] = MappingProxyType({}),
+        **kwargs: Any,
+    ) -> PackedEnvs:
         envs = make_packed_envs(env_id, env_args, num_envs, kind=kind, **kwargs)
         made.append(envs)
         for member_id, seed in dict(members).items():
@@ -67,23 +72,23 @@ class Actor:
     def __init__(self, space: Any, seed: int, num_envs: int = N) -> None:
         self.space, self.rng, self.num_envs = space, np.random.default_rng(seed), num_envs
 
-    def __call__(self) -> NDArray[np.int64]:
+    def __call__(self) -> NDArray[Any]:
         if isinstance(self.space, gym.spaces.Discrete):
-            return self.rng.integers(0, self.space.n, self.num_envs)
+            return self.rng.integers(0, int(self.space.n), self.num_envs)
         size = (self.num_envs, *self.space.shape)
         return self.rng.uniform(self.space.low, self.space.high, size).astype(np.float32)
 
 
-def step_all(envs: CartPoleEnvs | ScalarEnvs, actors: dict[str, Actor]) -> Step:
+def step_all(envs: PackedEnvs, actors: dict[str, Actor]) -> Step:
     return envs.step(np.concatenate([actors[member_id]() for member_id in envs.member_ids]))
 
 
-def rows_of(envs: CartPoleEnvs | ScalarEnvs, member_id: str, num_envs: int = N) -> slice:
+def rows_of(envs: PackedEnvs, member_id: str, num_envs: int = N) -> slice:
     first = envs.member_ids.index(member_id) * num_envs
     return slice(first, first + num_envs)
 
 
-def seen_by(envs: CartPoleEnvs | ScalarEnvs, step: Step, member_id: str) -> dict[str, NDArray[Any]]:
+def seen_by(envs: PackedEnvs, step: Step, member_id: str) -> dict[str, NDArray[Any]]:
     rows = rows_of(envs, member_id)
     names = ("observations", "final_observations", "rewards", "own_rewards", "terminated", "truncated")
     return {name: getattr(step, name)[rows].copy() for name in names}
@@ -133,12 +138,12 @@ def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make: Any) -
     for _ in range(20):
         step = envs.step(np.zeros(100, dtype=np.int64))
         starts += [step.observations] if step.truncated.all() else []
-    starts = np.concatenate(starts)
-    assert len(starts) == 11 * 100
-    assert len(np.unique(starts, axis=0)) == len(starts)
-    assert np.abs(starts).max() <= 0.05
-    assert np.abs(starts).max() > 0.049
-    assert np.abs(cast("Any", starts).mean(axis=0)).max() < 0.004
+    every = np.concatenate(starts)
+    assert len(every) == 11 * 100
+    assert len(np.unique(every, axis=0)) == len(every)
+    assert np.abs(every).max() <= 0.05
+    assert np.abs(every).max() > 0.049
+    assert np.abs(every.mean(axis=0)).max() < 0.004
 
 
 def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make: Any) -> None:
@@ -195,7 +200,7 @@ def test_a_member_gets_the_same_beside_any_others(make: Any, env_id: str, kind: 
     alone = {"a": trace_alone("a", 11, 0), "z": trace_alone("z", 7, 1)}
     envs = make(env_id, kind, env_args={"max_episode_steps": 15}, members={"x": 5, "a": 11, "y": 6}, num_processes=2)
     actors = {name: Actor(envs.action_space, seed) for seed, name in enumerate(("a", "z", "x", "y"))}
-    beside = {"a": [], "z": []}
+    beside: dict[str, list[Any]] = {"a": [], "z": []}
     for index in range(77):
         # In the middle of episodes, and of a stretch of steps.
         if index == 8:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from policy_factory import balancing_policy, make_policy, make_portable, registe
 
 import policies.packed.evaluation
 from policies.acting.evaluate import Episodes, Evaluator
-from policies.acting.policy import NetworkPolicy, RandomPolicy
+from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
 from policies.activations import ACTIVATIONS
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
@@ -32,7 +32,7 @@ def own_modules(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def assert_as_alone(
-    policies: Sequence[NetworkPolicy | RandomPolicy],
+    policies: Sequence[Policy],
     *,
     env_id: str = "CartPole-v1",
     env_args: dict[str, Any] | None = None,
@@ -120,7 +120,7 @@ def test_policies_of_many_shapes_and_kinds_side_by_side() -> None:
 
 def test_a_class_of_somebody_s_own_acts_as_it_does() -> None:
     class Contrary(NetworkPolicy):
-        def act(self, observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        def act(self, observations: Any) -> int | NDArray[Any]:
             return 1 - super().act(observations)
 
     policies = [Contrary(deep("good").portable), deep("good")]
@@ -169,7 +169,7 @@ def test_a_policy_for_another_env_comes_back_as_the_error() -> None:
         wrong, right = evaluate_many(evaluator, [make_policy("Acrobot-v1"), deep("poor")])
         assert right == evaluator.run(deep("poor"))
     with pytest.raises(EnvError, match="is for Acrobot-v1, whose observations"):
-        raise wrong
+        raise cast("Exception", wrong)
 
 
 def test_other_envs_are_played_one_policy_after_the_other() -> None:

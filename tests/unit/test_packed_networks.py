@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 
 from policies.activations import ACTIVATIONS
+from policies.hyperparams import PPOHyperparams
 from policies.packed.member import MAX_GROUP, group_members, network_layouts, size_class
 from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm
@@ -27,11 +28,15 @@ if TYPE_CHECKING:
     from policies.packed.member import Member
 
 # Of the members of one stack, by the number of layers: the second is padded in every layer, the third in one.
-SIZES = {1: [(12,), (7,), (9,)], 2: [(12, 9), (5, 4), (11, 9)], 3: [(8, 12, 6), (7, 5, 4), (8, 12, 3)]}
+SIZES: dict[int, list[tuple[int, ...]]] = {
+    1: [(12,), (7,), (9,)],
+    2: [(12, 9), (5, 4), (11, 9)],
+    3: [(8, 12, 6), (7, 5, 4), (8, 12, 3)],
+}
 ROWS = 10
 
 
-def make_stack(num_layers: int, activation: str, *, shares: bool) -> tuple[list[Member], StackedRows]:
+def make_stack(num_layers: int, activation: str, *, shares: bool) -> tuple[list[Member[PPOHyperparams]], StackedRows]:
     members = [
         random_member(f"m{index}", index, hidden_sizes=sizes, activation=activation, vf_share_layers=shares)
         for index, sizes in enumerate(SIZES[num_layers])
@@ -71,7 +76,7 @@ def backward(rows: StackedRows, gradient: torch.Tensor) -> None:
 
 
 def by_name(
-    rows: StackedRows, flat: torch.Tensor, members: Sequence[Member], index: int
+    rows: StackedRows, flat: torch.Tensor, members: Sequence[Member[PPOHyperparams]], index: int
 ) -> dict[str, NDArray[np.float64]]:
     """A member's part of a tensor over all weights, (K, P)."""
     found: dict[str, Any] = {}
@@ -81,7 +86,7 @@ def by_name(
     return found
 
 
-def is_padding(rows: StackedRows, members: Sequence[Member]) -> torch.Tensor:
+def is_padding(rows: StackedRows, members: Sequence[Member[PPOHyperparams]]) -> torch.Tensor:
     """Which of all weights, (K, P), no member has."""
     flat = torch.zeros_like(rows.networks.weights)
     views = rows.networks.views_of(flat)
@@ -134,6 +139,7 @@ def test_weights_that_are_written_into_a_stack_come_back() -> None:
 def test_padding_stays_zero(activation: str, kind: str) -> None:
     members, rows = make_stack(3, activation, shares=False)
     networks, column = rows.networks, torch.full((2 * len(members), 1), 0.9)
+    optimizer: StackedAdam | StackedRMSprop
     if kind == "adam":
         optimizer = StackedAdam(networks.weights, column * 0.01, column.double(), column.double(), column * 1e-8)
     else:
@@ -195,7 +201,7 @@ def take_over(optimizer: StackedAdam | StackedRMSprop, rows: Sequence[Separate])
 def compare_with_torch(
     stacked: Callable[[torch.Tensor], StackedAdam | StackedRMSprop],
     make_separate: type[Adam | RMSprop],
-    columns: dict[str, Sequence[float | tuple[float, float]]],
+    columns: Mapping[str, Sequence[float | tuple[float, float]]],
 ) -> None:
     """Two stretches of four steps beside torch.optim; row k has made 3 * k steps before."""
     rng = torch.Generator().manual_seed(0)
@@ -321,7 +327,7 @@ def test_groups_are_of_one_activation_and_like_sizes() -> None:
     assert min(sizes) >= MAX_GROUP // 2
 
 
-def _members_by_key(members: Sequence[Member]) -> list[int]:
+def _members_by_key(members: Sequence[Member[PPOHyperparams]]) -> list[int]:
     keys = [(m.hyperparams.activation, size_class(m.hyperparams.hidden_sizes[0])) for m in members]
     return [keys.count(key) for key in set(keys)]
 

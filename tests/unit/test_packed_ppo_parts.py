@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -72,7 +72,7 @@ def test_gradients_by_hand_are_those_of_the_loss(num_actions: int, with_kl: bool
     outputs.requires_grad_()
     values.requires_grad_()
     parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
-    parts.total_loss.sum().backward()
+    parts.total_loss.sum().backward()  # type: ignore[no-untyped-call]
     for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
         close(mine, other)
     assert (parts.kl > 0).all() == with_kl
@@ -92,7 +92,7 @@ def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
     found = ppo.gradients(outputs, values, batch, coefficients, is_gaussian=False)
     outputs.requires_grad_()
     values.requires_grad_()
-    ppo.loss(outputs, values, batch, coefficients, is_gaussian=False).total_loss.sum().backward()
+    ppo.loss(outputs, values, batch, coefficients, is_gaussian=False).total_loss.sum().backward()  # type: ignore[no-untyped-call]
     for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
         close(mine, other)
 
@@ -171,7 +171,7 @@ class Loops:
     def follow(
         self, member_ids: Sequence[str], rewards: NDArray[np.float32], ended: NDArray[np.bool_]
     ) -> list[list[tuple[float, int]]]:
-        found = {name: [] for name in member_ids}
+        found: dict[str, list[Any]] = {name: [] for name in member_ids}
         for step in range(len(rewards)):
             row = 0
             for name in member_ids:
@@ -231,8 +231,8 @@ def test_observations_are_normalised_as_rlmodules_do_it() -> None:
     references = [Statistics(size) for _ in members]
     observations = Observations(members, num_envs, normalizes=True)
     for num_steps in (1, 5, 40):
-        rows = rng.normal(size=(num_steps, len(members) * num_envs, size)) * [1e-3, 1.0, 100.0] + [0.0, 5.0, 300.0]
-        rows = rows.astype(np.float32)
+        drawn = rng.normal(size=(num_steps, len(members) * num_envs, size)) * [1e-3, 1.0, 100.0] + [0.0, 5.0, 300.0]
+        rows = drawn.astype(np.float32)
         rows[-1, :, 0] = 1e3 * num_steps**2  # far outside
         prepared = observations.prepare(rows)
         assert prepared.shape == (num_steps, len(members), num_envs, size)

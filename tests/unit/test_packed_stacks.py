@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm, make_hyperparams
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.envs.make import make_packed_envs
 from policies.packed.initial import new_member
 from policies.packed.make import make_stack
 from policies.packed.shared import SharedByDQN, SharedByPPO, shared_of
+from policies.packed.stack import Stack
 
 if TYPE_CHECKING:
-    from policies.packed.dqn.stack import DQNStack
-    from policies.packed.member import Member
-    from policies.packed.ppo.stack import PPOStack
+    from policies.packed.member import AnyMember
 
 SHARED = {"ppo": SharedByPPO, "dqn": SharedByDQN}
 SMALL = {"hidden_sizes": (4,), "num_envs": 2, "train_batch_size": 8}
@@ -25,31 +24,31 @@ ALGORITHMS = {"ppo": SMALL | {"minibatch_size": 4}, "dqn": SMALL | {"replay_capa
 
 
 @pytest.fixture(params=ALGORITHMS)
-def algorithm(request: pytest.FixtureRequest) -> str:
-    return cast("str", request.param)
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    return cast("Algorithm", request.param)
 
 
 @pytest.fixture
-def stack(algorithm: Algorithm) -> Iterator[DQNStack | PPOStack]:
+def stack(algorithm: Algorithm) -> Iterator[Stack[Any, Any, Any]]:
     envs = make_packed_envs("CartPole-v1", {}, 2, kind="vectorised")
-    made = make_stack(make_hyperparams(algorithm, ALGORITHMS[algorithm]), envs)
+    made = make_stack(cast("TrainedHyperparams", make_hyperparams(algorithm, ALGORITHMS[algorithm])), envs)
     yield made
     envs.close()
 
 
-def member(stack: DQNStack | PPOStack, algorithm: Algorithm, name: str, **values: float) -> Member:
-    hyperparams = make_hyperparams(algorithm, ALGORITHMS[algorithm] | values)
+def member(stack: Stack[Any, Any, Any], algorithm: Algorithm, name: str, **values: float) -> AnyMember:
+    hyperparams = cast("TrainedHyperparams", make_hyperparams(algorithm, ALGORITHMS[algorithm] | values))
     return new_member(name, hyperparams, 3, stack.envs.observation_space, stack.envs.action_space)
 
 
 def test_what_is_shared_are_hyperparameters(algorithm: Algorithm) -> None:
     names = {field.name for field in dataclasses.fields(SHARED[algorithm])}
     assert names <= HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields.keys()
-    made = make_hyperparams(algorithm, ALGORITHMS[algorithm])
+    made = cast("TrainedHyperparams", make_hyperparams(algorithm, ALGORITHMS[algorithm]))
     assert dataclasses.asdict(shared_of(made)) == {name: getattr(made, name) for name in names}
 
 
-def test_members_come_and_go(stack: DQNStack | PPOStack, algorithm: Algorithm) -> None:
+def test_members_come_and_go(stack: Stack[Any, Any, Any], algorithm: Algorithm) -> None:
     first, second = member(stack, algorithm, "a", lr=0.1), member(stack, algorithm, "b", lr=0.2)
     stack.add(first, 1)
     stack.add(second, 2)
@@ -60,7 +59,7 @@ def test_members_come_and_go(stack: DQNStack | PPOStack, algorithm: Algorithm) -
     assert stack.member("b") is second
 
 
-def test_who_shares_something_else_does_not_get_in(stack: DQNStack | PPOStack, algorithm: Algorithm) -> None:
+def test_who_shares_something_else_does_not_get_in(stack: Stack[Any, Any, Any], algorithm: Algorithm) -> None:
     stack.add(member(stack, algorithm, "a"), 1)
     with pytest.raises(ValueError, match="train_batch_size=4"):
         stack.add(member(stack, algorithm, "b", train_batch_size=4), 2)
@@ -69,9 +68,9 @@ def test_who_shares_something_else_does_not_get_in(stack: DQNStack | PPOStack, a
 
 
 def test_who_there_is_no_memory_for_is_no_member(
-    stack: DQNStack | PPOStack, algorithm: Algorithm, monkeypatch: pytest.MonkeyPatch
+    stack: Stack[Any, Any, Any], algorithm: Algorithm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(_: Member) -> None:
+    def refuse(_: AnyMember) -> None:
         raise MemoryError
 
     stack.add(member(stack, algorithm, "a"), 1)

@@ -110,7 +110,7 @@ def test_engines_are_chosen_trial_by_trial(monkeypatch: pytest.MonkeyPatch) -> N
     assert "auto" in caught.value.hint
 
 
-def test_environments_without_seeds_are_left_to_rllib(unseedable_env) -> None:
+def test_environments_without_seeds_are_left_to_rllib(unseedable_env: None) -> None:
     reason = "CartPole-v1 gives other observations with the same seed"
     made = plan()
     assert made.notes == (f"No trial is packed, RLlib trains them all: {reason}.",)
@@ -193,7 +193,7 @@ def test_what_can_be_stacked_is_handed_out_together() -> None:
     ids = [trial.trial_id for trial in mixed.trials if trial.point["num_envs"] == 8]
     assert present(mixed.packs).trial_ids[:4] == tuple(ids)
     # Points that are not known come last.
-    made = plan(**{**TPE, "search": {"type": "tpe", "num_startup_trials": 3}})
+    made = plan(**(TPE | {"search": {"type": "tpe", "num_startup_trials": 3}}))
     assert present(made.packs).trial_ids == tuple(trial.trial_id for trial in made.trials)
 
 
@@ -228,7 +228,7 @@ def test_members_of_a_stack_share_what_shapes_their_work(algorithm: Algorithm) -
 
 
 def test_two_kinds_of_target_updates_are_not_stacked() -> None:
-    values = [
+    values: list[dict[str, Any]] = [
         {"tau": 0.5}, {"tau": 0.5, "target_update_freq": 4}, {"double_q": False},
         {"double_q": False, "target_network": False},
     ]  # fmt: skip

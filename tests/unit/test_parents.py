@@ -40,7 +40,7 @@ def ends_with_its_parent(arguments: str, work: str) -> bool:
         # The pipe is the child's too: it is closed when both have ended.
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-        ready, _, _ = select.select([parent.stdout], [], [], 60)
+        ready, _, _ = select.select([present(parent.stdout)], [], [], 60)
         return bool(ready) and present(parent.stdout).read() == b""
     finally:
         parent.kill()

@@ -4,7 +4,7 @@ import collections
 import enum
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ class Colour(enum.StrEnum):
 
 
 class Broken:
-    def __repr__(self) -> None:
+    def __repr__(self) -> str:
         raise RuntimeError
 
 
@@ -100,12 +100,12 @@ def test_what_a_sweep_folder_cannot_hold_is_told_with_its_place(value: Any, part
 
 
 def test_what_is_shared_is_counted_as_often_as_it_stands_there() -> None:
-    shared = [1] * 10
+    shared: list[Any] = [1] * 10
     for _ in range(20):
         shared = [shared] * 10
     with pytest.raises(SpecError, match="more than 50,000 values"):
         load_spec({**MINIMAL, "env": {"id": "x", "args": {"a": shared}}})
-    spec = SweepSpec.model_construct(env={"id": "x", "args": {"a": shared}})
+    spec = cast("Any", SweepSpec).model_construct(env={"id": "x", "args": {"a": shared}})
     with pytest.raises(SpecError, match="more than 50,000 values"):
         to_plain(spec, "sweep")
     twice = [1, 2]

@@ -41,7 +41,9 @@ def legend_of(figure: Figure) -> list[str]:
 
 
 def lines_longer_than(axes: Axes, length: int) -> list[Line2D]:
-    return [line for line in axes.lines if len(line.get_xdata()) > length and line.get_linestyle() != "None"]
+    return [
+        line for line in axes.lines if len(cast("Any", line.get_xdata())) > length and line.get_linestyle() != "None"
+    ]
 
 
 def test_every_trial_with_results_has_its_curve(synthetic: Synthetic) -> None:
@@ -50,9 +52,9 @@ def test_every_trial_with_results_has_its_curve(synthetic: Synthetic) -> None:
     curves = lines_longer_than(axes, 2)
     assert len(curves) == 19
     expected = {tuple(row.training_return for row in rows) for rows in synthetic.results.values() if rows}
-    assert {tuple(line.get_ydata()) for line in curves} == expected
+    assert {tuple(cast("Any", line.get_ydata())) for line in curves} == expected
     thick = [line for line in curves if line.get_linewidth() == 3.0]
-    assert [tuple(line.get_ydata()) for line in thick] == [
+    assert [tuple(cast("Any", line.get_ydata())) for line in thick] == [
         tuple(row.training_return for row in synthetic.results[winner])
     ]
     assert axes.get_xlabel() == "env steps"
@@ -74,8 +76,11 @@ def test_long_curves_are_thinned_but_keep_their_ends() -> None:
     axes = learning_curves(long.trials, long.results, threshold=None).axes[0]
     (line,) = lines_longer_than(axes, 2)
     rows = long.results["t0000"]
-    assert len(line.get_xdata()) == 300
-    assert (line.get_xdata()[0], line.get_xdata()[-1]) == (rows[0].num_env_steps, rows[-1].num_env_steps)
+    assert len(cast("Any", line.get_xdata())) == 300
+    assert (cast("Any", line.get_xdata())[0], cast("Any", line.get_xdata())[-1]) == (
+        rows[0].num_env_steps,
+        rows[-1].num_env_steps,
+    )
 
 
 def test_the_range_over_the_seeds_of_the_winning_point_is_drawn() -> None:
@@ -103,7 +108,7 @@ def test_scores_stand_at_their_learning_rates(synthetic: Synthetic) -> None:
 
 def test_trials_that_cannot_win_are_marked_at_the_edge(synthetic: Synthetic) -> None:
     axes = score_by_lr(synthetic.trials).axes[0]
-    lost = next(c for c in axes.collections if c.get_label().startswith("no score"))
+    lost = next(c for c in axes.collections if str(c.get_label()).startswith("no score"))
     assert [x for x, _ in np.asarray(lost.get_offsets())] == [synthetic.trials[3].point["lr"]]
 
 
@@ -147,13 +152,13 @@ def test_score_per_episode_has_goal_trend_and_histogram_of_the_last_fifty() -> N
     figure = score_per_episode(scores, goal=195.0, title="trial t0001")
     left, right = figure.axes
     dots = next(line for line in left.lines if line.get_label() == "score")
-    assert dots.get_ydata().tolist() == scores.tolist()
-    assert dots.get_xdata()[0] == 1
+    assert cast("Any", dots.get_ydata()).tolist() == scores.tolist()
+    assert cast("Any", dots.get_xdata())[0] == 1
     trend = next(line for line in left.lines if line.get_label() == "linear trend")
-    slope = (trend.get_ydata()[1] - trend.get_ydata()[0]) / 199
+    slope = (cast("Any", trend.get_ydata())[1] - cast("Any", trend.get_ydata())[0]) / 199
     assert slope == pytest.approx(np.polyfit(np.arange(1, 201), scores, 1)[0])
     mean = next(line for line in left.lines if line.get_label() == "mean of last 100")
-    assert mean.get_ydata()[-1] == pytest.approx(scores[-100:].mean())
+    assert cast("Any", mean.get_ydata())[-1] == pytest.approx(scores[-100:].mean())
     assert sum(cast("Any", patch).get_height() for patch in right.patches) == 50
     assert max(cast("Any", patch).get_height() for patch in right.patches) == 50
     assert right.get_title(loc="left") == "last 50 episodes"

@@ -17,7 +17,7 @@ from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.activations import ACTIVATIONS
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
-from policies.portable.file import save_policy
+from policies.portable.file import ActionTransform, save_policy
 from policies.portable.network import PolicyNetwork
 from tests.narrowing import present
 from tests.rounding import assert_rounded, dense
@@ -83,15 +83,15 @@ def test_convolutions_compute_what_torch_computes(activation: str, normalize: bo
         sizes = torch.nn.functional.conv2d(sizes, weight.abs(), bias.abs(), stride=layer.stride)
         num_roundings = math.ceil(1.13 * num_roundings) + weight[0].numel() + 9
     x, (sizes, others) = x.flatten(1), dense(network.layers, sizes.flatten(1))
-    for layer in network.layers:
-        weight, bias = torch.from_numpy(layer.weight).double(), torch.from_numpy(layer.bias).double()
+    for dense_layer in network.layers:
+        weight, bias = (torch.from_numpy(part).double() for part in (dense_layer.weight, dense_layer.bias))
         x = torch.nn.functional.linear(x, weight, bias)
-        x = x if layer.activation == "linear" else function(x)
+        x = x if dense_layer.activation == "linear" else function(x)
     policy = NetworkPolicy(portable)
     outputs = policy.outputs(images)
     assert_rounded(outputs, x, sizes=sizes, num_roundings=num_roundings + others)
     np.testing.assert_array_equal(policy.act(images), outputs.argmax(axis=1))
-    assert set(policy.act(images)) == {0, 1, 2}
+    assert set(cast("NDArray[Any]", policy.act(images))) == {0, 1, 2}
 
 
 def test_an_action_for_an_image_does_not_depend_on_its_batch_to_the_last_bit() -> None:
@@ -121,8 +121,11 @@ def test_one_observation_gives_what_the_env_takes(env_id: str, kind: type[Networ
     assert env.action_space.contains(action)
     env.step(action)
     actions = policy.act(np.stack([observation] * 5))
-    assert cast("NDArray[Any]", actions).shape == (5, *env.action_space.shape)
-    assert cast("NDArray[Any]", policy.act(np.zeros((0, len(observation))))).shape == (0, *env.action_space.shape)
+    assert cast("NDArray[Any]", actions).shape == (5, *present(env.action_space.shape))
+    assert cast("NDArray[Any]", policy.act(np.zeros((0, len(observation))))).shape == (
+        0,
+        *present(env.action_space.shape),
+    )
     assert policy.act(observation.tolist()) is not None
 
 
@@ -136,7 +139,7 @@ def test_an_action_does_not_depend_on_its_batch_to_the_last_bit(activation: str,
         np.testing.assert_array_equal(
             policy.act(observations[first : first + 5]), cast("NDArray[Any]", batch)[first : first + 5]
         )
-    for observation, action in zip(observations, batch, strict=True):
+    for observation, action in zip(observations, cast("NDArray[Any]", batch), strict=True):
         np.testing.assert_array_equal(policy.act(observation), action)
 
 
@@ -154,7 +157,7 @@ def test_q_values_act_by_the_largest() -> None:
     np.testing.assert_array_equal(policy.act(observations), policy.outputs(observations).argmax(axis=1))
 
 
-def _gaussian(env_id: str, transform: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _gaussian(env_id: str, transform: ActionTransform) -> tuple[NDArray[np.float32], int | NDArray[Any]]:
     policy = NetworkPolicy(dataclasses.replace(make_portable(env_id, seed=5), action_transform=transform))
     observations = 3 * np.random.default_rng(0).normal(size=(300, present(policy.observation_space.shape)[0]))
     size = present(policy.action_space.shape)[0]
@@ -186,7 +189,7 @@ def test_older_files_say_unsquash_of_boxes_with_an_open_bound() -> None:
     observations = 9 * np.random.default_rng(0).normal(size=(300, present(acting.observation_space.shape)[0]))
     mean = acting.outputs(observations)[:, :2]
     assert (mean[:, 0] < -0.1).any()
-    np.testing.assert_array_equal(acting.act(observations), np.maximum(mean, np.float32([[-0.1, -np.inf]])))
+    np.testing.assert_array_equal(acting.act(observations), np.maximum(mean, np.array([[-0.1, -np.inf]], np.float32)))
 
 
 def test_clipping_keeps_each_bound() -> None:
@@ -255,7 +258,7 @@ def test_random_actions_are_uniform_and_of_another_stream_than_the_env() -> None
     policy = RandomPolicy.for_env("CartPole-v1", seed=7)
     actions = policy.act(np.zeros((4000, 4)))
     assert abs(cast("NDArray[Any]", actions).mean() - 0.5) < 0.05
-    space = gym.spaces.Discrete(2, seed=7)  # as env.reset(seed=7) seeds the env's generator
+    space: gym.spaces.Discrete[Any] = gym.spaces.Discrete(2, seed=7)  # as env.reset(seed=7) seeds the env's generator
     assert [space.sample() for _ in range(50)] != cast("NDArray[Any]", actions)[:50].tolist()
 
 

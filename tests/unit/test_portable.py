@@ -46,7 +46,7 @@ def test_what_is_saved_is_what_is_read(env_id: str, tmp_path: Path) -> None:
     path = save_policy(saved, tmp_path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["policy.json", "policy.safetensors"]
     for place in (tmp_path, path, tmp_path / "policy.safetensors", str(path)):
-        read = read_policy(place)
+        read = read_policy(cast("Path", place))
         for field in dataclasses.fields(saved):
             if field.name != "network":
                 assert getattr(read, field.name) == getattr(saved, field.name)
@@ -74,8 +74,8 @@ def test_all_parts_of_a_network_are_read_as_they_were_saved(
             assert one.dtype == other.dtype
             np.testing.assert_array_equal(one, other)
     assert read.network.scale == saved.network.scale
-    for one, other in zip(read.network.conv, saved.network.conv, strict=True):
-        assert (one.stride, one.activation) == (other.stride, other.activation)
+    for layer, saved_layer in zip(read.network.conv, saved.network.conv, strict=True):
+        assert (layer.stride, layer.activation) == (saved_layer.stride, saved_layer.activation)
     if saved.network.module is not None:
         assert present(read.network.module).class_path == saved.network.module.class_path
         assert present(read.network.module).model_config == saved.network.module.model_config
@@ -122,7 +122,11 @@ def _conv(**changes: Any) -> dict[str, tuple[ConvLayer, ConvLayer]]:
         (_conv(weight=np.zeros((3, 5, 6, 6), np.float32)), "kernels of 6 x 6, but its input has only 5 x 4"),
         ({"conv": ()}, "its input has 260 numbers"),
         (
-            {"normalization": dataclasses.replace(make_image_policy().network.normalization, std=np.ones(3))},
+            {
+                "normalization": dataclasses.replace(
+                    present(make_image_policy().network.normalization), std=cast("Any", np.ones(3))
+                )
+            },
             r"a std of shape \(3,\)",
         ),
         ({"kind": "module"}, "no module"),
@@ -164,7 +168,7 @@ def test_transposed_weights_are_saved_as_what_they_are(tmp_path: Path) -> None:
         gym.spaces.Discrete(3, start=-2),
     ],
 )
-def test_spaces_survive_json(space: gym.spaces.Box | gym.spaces.Discrete) -> None:
+def test_spaces_survive_json(space: gym.spaces.Box | gym.spaces.Discrete[Any]) -> None:
     text = json.dumps(describe_space(space), allow_nan=False)
     assert space_from_description(json.loads(text)) == space
 

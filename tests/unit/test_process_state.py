@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import warnings
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def disturb() -> None:
     os.environ.update(RAY_X="1", TUNE_X="1", PYTHONBREAKPOINT="none", PYTHONPATH="/nowhere", SDL_VIDEODRIVER="dummy")
     signal.signal(signal.SIGUSR1, lambda *_: None)
     signal.signal(signal.SIGTERM, lambda *_: None)
-    sys.excepthook = threading.excepthook = lambda *_: None
+    sys.excepthook = threading.excepthook = cast("Any", lambda *_: None)
     faulthandler.enable()
     for log in (logging.getLogger(), logging.getLogger("tune_jobs_test.known")):
         log.setLevel(3)

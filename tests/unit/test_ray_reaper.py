@@ -60,7 +60,7 @@ def test_what_a_raylet_started_ends_with_the_driver_and_nothing_else_does() -> N
         present(driver.stdin).write("go on\n")
         present(driver.stdin).flush()
         assert present(driver.stdout).readline() == "mine\n"
-        ready, _, _ = select.select([driver.stdout], [], [], 60)
+        ready, _, _ = select.select([present(driver.stdout)], [], [], 60)
         assert ready
         assert present(driver.stdout).read() == ""
     finally:

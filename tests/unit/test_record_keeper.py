@@ -17,7 +17,8 @@ from tune_jobs.store.transitions import with_point
 @pytest.fixture
 def kept(tmp_path: Path) -> tuple[SweepStore, RecordKeeper, FakeClock, list[Any]]:
     """(store, keeper, its clock, everything the listener was told) of 50 trials; the last was done before this run."""
-    store, clock, told = SweepStore(tmp_path / "mine"), FakeClock(), []
+    store, clock = SweepStore(tmp_path / "mine"), FakeClock()
+    told: list[Any] = []
     store.create()
     for index in range(50):
         record = TrialRecord(trial_id=f"t{index:04d}", index=index, point_index=index, seed=index, point={})

@@ -3,12 +3,12 @@
 import json
 import math
 from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, Union, cast, get_args, get_origin
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from hypothesis.strategies._internal.lazy import LazyStrategy
+from pydantic import BaseModel
 from synthetic_sweep import make_sweep
 
 from analysis.records import (
@@ -30,7 +30,7 @@ CHANGE = ChangeRecord(
 )
 TRIAL = SYNTHETIC.trials[0]
 CHECKPOINT = TRIAL.checkpoints[0].model_copy(update={"iteration": 1})
-SAMPLES = {
+SAMPLES: dict[Any, BaseModel | None] = {
     CheckpointRecord: CHECKPOINT,
     IterationRecord: SYNTHETIC.results["t0000"][0],
     ChangeRecord: CHANGE,
@@ -42,7 +42,7 @@ SAMPLES = {
 ANY_SETTINGS = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-def _values(annotation: Any) -> st.SearchStrategy | None:
+def _values(annotation: Any) -> st.SearchStrategy[Any] | None:
     """Values of a field's type, if there are numbers of any size in it."""
     if annotation is float or annotation in SAMPLES:
         return st.floats() if annotation is float else _records(annotation)
@@ -60,7 +60,7 @@ def _values(annotation: Any) -> st.SearchStrategy | None:
     return None
 
 
-def _records(kind: type) -> LazyStrategy:
+def _records(kind: type[BaseModel]) -> st.SearchStrategy[Any]:
     """Records of a kind whose numbers may be anything; all else is as in a real one."""
     drawn = {
         name: values for name, field in kind.model_fields.items() if (values := _values(field.annotation)) is not None
@@ -77,9 +77,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     return store
 
 
-def _write(
-    store: SweepStore, record: BestRecord | CheckpointRecord | IterationRecord
-) -> tuple[BestRecord | CheckpointRecord | IterationRecord, str]:
+def _write(store: SweepStore, record: BaseModel) -> tuple[Any, str]:
     """Write a record as the product does; returns what it reads back, and the file's text."""
     trial = store.trial("t0000")
     if isinstance(record, SweepRecord):
@@ -96,17 +94,17 @@ def _write(
         folder = store.folder / record.path
         return read_manifest(folder), (folder / "manifest.json").read_text()
     trial.keep_iterations([])
-    trial.append_iterations([record])
+    trial.append_iterations([cast("IterationRecord", record)])
     (found,) = trial.read_iterations()
     return found, trial.results_path.read_text()
 
 
-def _refuse(token) -> None:
+def _refuse(token: str) -> None:
     raise ValueError(f"{token} is no JSON")
 
 
 @pytest.mark.parametrize("kind", [IterationRecord, TrialRecord, BestRecord, SweepRecord, CheckpointRecord])
-def test_a_record_with_any_numbers_comes_back_from_its_file(store: SweepStore, kind: type) -> None:
+def test_a_record_with_any_numbers_comes_back_from_its_file(store: SweepStore, kind: type[BaseModel]) -> None:
     @ANY_SETTINGS
     @given(record=_records(kind))
     def check(record: BestRecord | CheckpointRecord | IterationRecord) -> None:
@@ -139,11 +137,11 @@ def test_null_in_files_of_older_versions_is_nan(store: SweepStore) -> None:
     assert found.learner == {"loss": None}
     best = json.loads(present(SAMPLES[BestRecord]).model_dump_json()) | {"selection_score": None, "format_version": 1}
     best["confirmation"]["returns"][0] = None
-    store.write_best(present(SAMPLES[BestRecord]))
+    store.write_best(cast("BestRecord", SAMPLES[BestRecord]))
     (store.best_folder / "evaluation.json").write_text(json.dumps(best))
-    found = store.read_best()
-    assert math.isnan(found.selection_score)
-    assert math.isnan(found.confirmation.mean_return)
+    winner = store.read_best()
+    assert math.isnan(winner.selection_score)
+    assert math.isnan(winner.confirmation.mean_return)
 
 
 @ANY_SETTINGS

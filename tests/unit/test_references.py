@@ -9,7 +9,7 @@ import tokenize
 from ast import ClassDef, Module
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from click.testing import CliRunner
@@ -150,9 +150,9 @@ def test_every_word_in_backticks_is_one_of_the_code() -> None:
 def test_every_dotted_name_of_ours_leads_somewhere() -> None:
     known = defined()
     by_stem: dict[str, Any] = {}
-    for name, inside in known.items():
+    for name, names in known.items():
         if "." in name:
-            by_stem.setdefault(name.rpartition(".")[2], set()).update(inside)
+            by_stem.setdefault(name.rpartition(".")[2], set()).update(names)
     missing = set()
     for place, text in TEXTS:
         for reference in quoted(text) if not place.startswith(DECISIONS) else ():
@@ -162,7 +162,7 @@ def test_every_dotted_name_of_ours_leads_somewhere() -> None:
             head, last = match.group(1).removesuffix("."), match.group(2)
             if head in SECTIONS:
                 continue
-            inside = known.get(head, by_stem.get(head))
+            inside = cast("set[str] | None", known.get(head, by_stem.get(head)))
             if inside is None and head.partition(".")[0] in PACKAGES:
                 missing.add(f"{place}: `{reference}`: no {head}")
             # A file of data has an ending, no attribute; an inherited one is somebody else's.

@@ -22,7 +22,7 @@ from tests.narrowing import present
 def rows(first: int, count: int) -> Transitions:
     numbers = np.arange(first, first + count, dtype=np.float32)
     obs = np.stack([numbers, -numbers], axis=1)
-    return Transitions(obs, (numbers % 3).astype(np.int64), numbers, obs + 0.5, numbers / 10)
+    return Transitions(obs, (numbers % 3).astype(np.int64), numbers, obs + np.float32(0.5), numbers / np.float32(10))
 
 
 def fragment(

@@ -82,8 +82,13 @@ def test_a_film_goes_where_output_says(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("there").mkdir()
-    asked = []
-    monkeypatch.setattr("tune_jobs.sweeps.conclude.make_video", lambda policy, path, *more: asked.append(path) or {})
+    asked: list[Path] = []
+
+    def film(policy: object, path: Path, *more: object) -> dict[str, Path]:
+        asked.append(path)
+        return {}
+
+    monkeypatch.setattr("tune_jobs.sweeps.conclude.make_video", film)
     tune_jobs.video("random", env_id="CartPole-v1", output=output)
     # Either ending gives both files.
     assert [path.with_suffix("") for path in asked] == [Path(expected)]

@@ -18,7 +18,7 @@ from tune_jobs.sweeps.resume import check_same_trials
 
 LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
 TPE = {"space": LR, "num_samples": 20, "search": "tpe"}
-PBT = {"space": LR, "num_samples": 4, "scheduler": "pbt"}
+PBT: dict[str, Any] = {"space": LR, "num_samples": 4, "scheduler": "pbt"}
 MACHINE = Machine(num_cpus=2)
 
 
@@ -76,7 +76,7 @@ def test_what_does_not_go_together_is_refused_with_both_names(
 def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name: str) -> None:
     values = {"hidden_sizes": [[8], [16]], "activation": ["tanh", "relu"], "num_envs": [4, 8]}.get(name, [True, False])
     assert f"space.{name}: can't be changed within a trial" in errors(
-        **{**PBT, "space": {**LR, name: {"choice": values}}}
+        **(PBT | {"space": {**LR, name: {"choice": values}}})
     )
     # A sweep without pbt may search it.
     load_spec({**MINIMAL, "num_samples": 4, "space": {name: {"choice": values}}})
@@ -198,9 +198,14 @@ def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused() -> None:
 def test_a_list_of_sizes_is_measured_once_however_many_points_it_stands_for(monkeypatch: pytest.MonkeyPatch) -> None:
     from tune_jobs.plan import sweep_plan as plan
 
-    measured = []
+    measured: list[Any] = []
     real = plan.max_env_steps  # type: ignore[attr-defined]
-    monkeypatch.setattr(plan, "max_env_steps", lambda spec, values: measured.append(values) or real(spec, values))
+
+    def counted(spec: Any, values: Any) -> Any:
+        measured.append(values)
+        return real(spec, values)
+
+    monkeypatch.setattr(plan, "max_env_steps", counted)
     spec = load_spec({**MINIMAL, **TPE, "space": {"num_envs": {"randint": [1, 8]}}, "num_samples": 1_000})
     make_plan(spec, MACHINE)
     # The random points at the start, and the two ends for all others.

@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from tune_jobs.spec.domains import DOMAIN_KINDS, Domain, draw_points
 ADAPTER = TypeAdapter(Domain)
 
 
-def domain(**raw: Sequence[Any]) -> Any:
+def domain(**raw: Any) -> Any:
     return ADAPTER.validate_python(raw)
 
 
@@ -23,7 +22,7 @@ def samples(parsed: Any, num: int = 2_000) -> list[bool | float]:
     return [parsed.sample(rng) for _ in range(num)]
 
 
-def message(raw: float | dict[str, Sequence[float]]) -> str:
+def message(raw: Any) -> str:
     with pytest.raises(ValidationError) as caught:
         ADAPTER.validate_python(raw)
     return str(caught.value)
@@ -107,7 +106,7 @@ def test_the_log_form_favours_small_values() -> None:
         (0.01, "fix it under hyperparams"),
     ],
 )
-def test_wrong_domains_are_refused_with_their_values(raw: float | dict[str, list[Any]] | list[int], part: str) -> None:
+def test_wrong_domains_are_refused_with_their_values(raw: Any, part: str) -> None:
     assert part in message(raw)
 
 

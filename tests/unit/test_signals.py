@@ -158,7 +158,7 @@ def test_an_interrupted_run_raises_with_what_there_is() -> None:
 
 def test_a_run_interrupted_before_it_began_has_no_result() -> None:
     @run_alone
-    def run():
+    def run() -> SweepResult:
         send(signal.SIGINT)
         return make_result()
 
@@ -190,7 +190,7 @@ def test_a_process_runs_one_sweep_at_a_time() -> None:
 
 def test_a_run_that_fails_lets_the_next_one_begin() -> None:
     @run_alone
-    def fails() -> None:
+    def fails() -> SweepResult:
         raise ValueError("broken")
 
     with pytest.raises(ValueError, match="broken"):

@@ -3,7 +3,7 @@
 import importlib
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,15 +36,15 @@ OBSERVATIONS = {
     "tuple": spaces.Tuple((NUMBERS, spaces.Dict({"flags": spaces.MultiBinary(2)}))),
     "text": spaces.Text(4),
 }
-ACTIONS = {
+ACTIONS: dict[str, gym.Space[Any]] = {
     "multi-discrete": spaces.MultiDiscrete([3, 2, 4]),
-    "multi-discrete matrix": spaces.MultiDiscrete([[3, 2], [2, 2]]),
+    "multi-discrete matrix": spaces.MultiDiscrete(cast("Any", [[3, 2], [2, 2]])),
     "multi-binary": spaces.MultiBinary(3),
     "multi-binary matrix": spaces.MultiBinary([2, 2]),
     "matrix": spaces.Box(-1, 1, (2, 2), np.float32),
     "number": spaces.Box(-1, 1, (), np.float32),
 }
-BEYOND = {
+BEYOND: dict[str, tuple[gym.Space[Any], gym.Space[Any], str]] = {
     "graph": (spaces.Graph(NUMBERS, None), NUMBERS, "gymnasium.ObservationWrapper"),
     "sequence": (spaces.Sequence(NUMBERS), NUMBERS, "gymnasium.ObservationWrapper"),
     "empty": (spaces.Box(-1, 1, (0,), np.float32), NUMBERS, "gymnasium.ObservationWrapper"),
@@ -52,11 +52,15 @@ BEYOND = {
     "many combinations": (NUMBERS, spaces.MultiDiscrete([1000] * 3), "gymnasium.ActionWrapper"),
 }
 
+Refusal = Callable[..., EnvError]
+"""Two spaces, and maybe an algorithm -> why an env of them is refused."""
+OwnModule = Callable[[str], None]
+
 
 class Odd(gym.Env[Any, Any]):
     """Of any spaces; refuses an action that is not in its own."""
 
-    def __init__(self, observations, actions) -> None:
+    def __init__(self, observations: gym.Space[Any], actions: gym.Space[Any]) -> None:
         self.observation_space, self.action_space = observations, actions
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -69,12 +73,12 @@ class Odd(gym.Env[Any, Any]):
 
 
 @pytest.fixture
-def refusal(monkeypatch: pytest.MonkeyPatch):
+def refusal(monkeypatch: pytest.MonkeyPatch) -> Refusal:
     """What check_env says of an env of these spaces."""
     monkeypatch.setattr(env_modules, "_allowed", set())
     monkeypatch.setitem(gym.registry, "Odd-v0", None)
 
-    def refuse(observations, actions, algorithm: Algorithm = "ppo"):
+    def refuse(observations: gym.Space[Any], actions: gym.Space[Any], algorithm: Algorithm = "ppo") -> EnvError:
         del gym.registry["Odd-v0"]
         gym.register("Odd-v0", cast("Any", lambda: Odd(observations, actions)))
         with pytest.raises(EnvError) as caught:
@@ -85,11 +89,11 @@ def refusal(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[OwnModule]:
     """Writes a module of the user's own, as docs/guides/own-environment.md shows one, with an expression in it."""
     monkeypatch.syspath_prepend(tmp_path)
 
-    def write(expression) -> None:
+    def write(expression: str) -> None:
         (tmp_path / "wrapped_envs.py").write_text(
             "import gymnasium\nimport numpy\n\n\n"
             f"def make(render_mode=None):\n    return {expression}\n\n\n"
@@ -103,13 +107,15 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]
     importlib.invalidate_caches()
 
 
-def expression_in(error):
+def expression_in(error: EnvError) -> str:
     (found,) = re.findall("`(.+?)`", error.hint)
-    return found
+    return str(found)
 
 
 @pytest.mark.parametrize("kind", OBSERVATIONS)
-def test_the_wrapper_that_is_named_makes_observations_that_are_taken(kind: str, refusal, own_module) -> None:
+def test_the_wrapper_that_is_named_makes_observations_that_are_taken(
+    kind: str, refusal: Refusal, own_module: OwnModule
+) -> None:
     error = refusal(OBSERVATIONS[kind], spaces.Discrete(2))
     assert "Odd-v0 has" in error.message
     own_module(expression_in(error))
@@ -123,7 +129,9 @@ def test_the_wrapper_that_is_named_makes_observations_that_are_taken(kind: str, 
 
 
 @pytest.mark.parametrize("kind", ACTIONS)
-def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(kind: str, refusal, own_module) -> None:
+def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(
+    kind: str, refusal: Refusal, own_module: OwnModule
+) -> None:
     own_module(expression_in(refusal(NUMBERS, ACTIONS[kind])))
     info = check_env("wrapped_envs:Wrapped-v0", None, "ppo")
     env, space = gym.make("Wrapped-v0"), info.action_space
@@ -131,14 +139,19 @@ def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(kind: str, re
     actions = range(int(space.n)) if isinstance(space, spaces.Discrete) else [space.sample() for _ in range(5)]
     sent = []
     step = env.unwrapped.step
-    env.unwrapped.step = lambda action: sent.append(tuple(np.ravel(action))) or step(action)  # type: ignore[method-assign]
+
+    def noted(action: Any) -> Any:
+        sent.append(tuple(np.ravel(action)))
+        return step(action)
+
+    env.unwrapped.step = noted  # type: ignore[method-assign]
     for action in actions:
         env.step(action)
     assert len(set(sent)) == len(actions)
 
 
 @pytest.mark.parametrize("kind", BEYOND)
-def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind: str, refusal) -> None:
+def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind: str, refusal: Refusal) -> None:
     observations, actions, words = BEYOND[kind]
     assert words in refusal(observations, actions).hint
 
@@ -150,7 +163,7 @@ def test_a_class_of_a_module_is_made_as_such(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_frozen_lake_can_be_trained_on_in_the_wrapper_that_is_named(
-    own_module, monkeypatch: pytest.MonkeyPatch
+    own_module: OwnModule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(env_modules, "_allowed", set())
     with pytest.raises(EnvError) as caught:

@@ -4,7 +4,7 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from spec_errors import MINIMAL, errors, write
@@ -41,8 +41,8 @@ stop: {num_env_steps: 5e4, time_s: 1e+2}
         )
     )
     assert spec.hyperparams == {"lr": 3e-4, "hidden_sizes": [512, 256, 64], "grad_clip": None}
-    assert spec.space["gamma"].bounds == (0.9, 0.99)
-    assert spec.space["clip_param"].values == (0.1, 0.2)
+    assert cast("Any", spec.space["gamma"]).bounds == (0.9, 0.99)
+    assert cast("Any", spec.space["clip_param"]).values == (0.1, 0.2)
     assert (spec.stop.num_env_steps, spec.stop.time_s) == (50_000, 100.0)
 
 
@@ -91,7 +91,7 @@ def test_domains_can_be_given_as_objects() -> None:
 
 def test_a_spec_cannot_be_changed() -> None:
     with pytest.raises(Exception, match="frozen"):
-        load_spec(MINIMAL).num_samples = 3
+        load_spec(MINIMAL).num_samples = 3  # type: ignore[misc]
 
 
 # -- presets
@@ -146,7 +146,7 @@ def test_a_sweep_that_says_nothing_of_itself_is_written_as_if_there_were_no_such
         ({"titel": "x"}, "about.titel: there is no field 'titel' here. Did you mean 'title'?"),
     ],
 )
-def test_what_a_sweep_says_of_itself_is_text(about, part) -> None:
+def test_what_a_sweep_says_of_itself_is_text(about: Any, part: str) -> None:
     assert part in errors(about=about)
 
 
@@ -158,9 +158,9 @@ def test_the_words_of_about_are_not_proposed_as_settings() -> None:
 def test_the_cartpole_preset_is_the_tutorials_sweep() -> None:
     spec = load_spec("cartpole-ppo")
     assert spec.env.id == "CartPole-v0"
-    assert spec.space["hidden_sizes"].values == ([32], [64])
-    assert spec.space["activation"].values == ("linear", "relu")
-    assert spec.space["lr"].bounds == (1e-7, 1e-2)
+    assert cast("Any", spec.space["hidden_sizes"]).values == ([32], [64])
+    assert cast("Any", spec.space["activation"]).values == ("linear", "relu")
+    assert cast("Any", spec.space["lr"]).bounds == (1e-7, 1e-2)
     assert spec.num_samples == 5
     assert spec.stop.training_return == 195
 
@@ -296,7 +296,9 @@ def test_every_problem_is_told_at_once() -> None:
 
 
 def test_whole_values_of_a_quantised_float_range_are_accepted() -> None:
-    assert load_spec({**MINIMAL, "space": {"num_epochs": {"quniform": [2, 8, 2]}}}).space["num_epochs"].q == 2
+    assert (
+        cast("Any", load_spec({**MINIMAL, "space": {"num_epochs": {"quniform": [2, 8, 2]}}}).space["num_epochs"]).q == 2
+    )
 
 
 @pytest.mark.parametrize(

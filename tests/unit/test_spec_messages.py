@@ -12,6 +12,7 @@ from spec_errors import MINIMAL, write
 
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import TrialPlan, make_plan  # type: ignore[attr-defined]
 from tune_jobs.spec.domains import DOMAIN_KINDS
@@ -24,13 +25,13 @@ FOREIGN = re.compile(
     r"[A-Z]\w+(Spec|Hyperparams)\b|should match pattern|\bmodel\b",
     re.IGNORECASE,
 )
-WRONG = [
+WRONG: list[Any] = [
     None, True, 0, -1, 3, 1.5, -0.5, 10**39, float("nan"), float("inf"), "", "x", "no", "3", "010", [], [None], [[]],
     [0], ["x"], [1.5], [True], [1, 2, 3], [3, 2, 1, 0, -1], {}, {"x": 1}, {"id": 3}, {"type": None}, {"grid": 3},
 ]  # fmt: skip
 
 
-def sections(model: type = SweepSpec, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def sections(model: type[BaseModel] = SweepSpec, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     """The path of every field of the sweep file."""
     for name, field in model.model_fields.items():
         yield (*path, name)
@@ -137,7 +138,7 @@ def test_no_whole_sweep_does(value: Any) -> None:
     ],
 )
 def test_what_is_said_of_common_mistakes(fields: dict[str, Any], message: str) -> None:
-    assert f"sweep: {message}" in problem_with({**MINIMAL, **fields})
+    assert f"sweep: {message}" in present(problem_with({**MINIMAL, **fields}))
 
 
 def test_a_search_that_is_no_is_told_where_it_stands(tmp_path: Path) -> None:

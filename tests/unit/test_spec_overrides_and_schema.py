@@ -35,7 +35,7 @@ def test_set_overrides_and_creates_fields() -> None:
     assert spec.stop.training_return == 195
     assert (spec.env.id, spec.env.args) == ("CartPole-v1", {"sutton_barto_reward": True})
     assert (spec.scheduler.type, spec.scheduler.grace_env_steps) == ("asha", 50)
-    assert spec.space["lr"].values == (1e-3, 2e-3)
+    assert cast("Any", spec.space["lr"]).values == (1e-3, 2e-3)
     assert spec.resources.max_concurrent == 1
     assert spec.hyperparams["grad_clip"] is None
 
@@ -130,13 +130,13 @@ def test_the_schema_accepts_presets_and_refuses_what_is_wrong() -> None:
         assert list(validator.iter_errors(wrong)), wrong
 
 
-VALUES = [
+VALUES: list[Any] = [
     None, True, 0, 1, -1, 1.5, 5.0, 1e3, 1e6, "", "5", "x", "m:C", "asha", "relu", [], [1], [1.5], ["a"], [[1, 2]],
     [[1, 2, 3]], {}, {"a": 1}, {"grid": [8]}, {"grid": []},
 ]  # fmt: skip
 
 
-def fields(model: type = SweepSpec, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def fields(model: type[BaseModel] = SweepSpec, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     for name, field in model.model_fields.items():
         yield (*path, name)
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
@@ -163,7 +163,7 @@ def test_the_schema_and_the_model_refuse_the_same_values_of_a_field(
     jsonschema = pytest.importorskip("jsonschema")
     validator = jsonschema.Draft202012Validator(json_schema())
     for value in VALUES:
-        data = {"env": {"id": "x"}, "algorithm": algorithm}
+        data: dict[str, Any] = {"env": {"id": "x"}, "algorithm": algorithm}
         section = data
         for name in path[:-1]:
             section = section.setdefault(name, {})

@@ -48,9 +48,13 @@ def test_a_process_without_standard_streams_works_and_stays_without(tmp_path: Pa
 
 @pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
 def test_commands_run_where_nobody_listens(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    def close_them() -> None:
+        for number in closed:
+            os.close(number)
+
     done = subprocess.run(
         [sys.executable, "-m", "tune_jobs.cli.commands", "list", "--storage", str(tmp_path)],
-        preexec_fn=lambda: [os.close(number) for number in closed],
+        preexec_fn=close_them,
         stderr=subprocess.PIPE, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")

@@ -1,6 +1,7 @@
 """What every store promises of checkpoints, copies and what is set aside, as its contract says it."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,11 @@ from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.store.contract import Sweep, Trial
 
 # -- checkpoints
+
+
+def in_turn(folder: Path, then: Callable[[], None]) -> None:
+    fill(folder)
+    then()
 
 
 def test_a_checkpoint_comes_back_as_it_was_written(sweep: Sweep, trial: Trial, another: Reopen) -> None:
@@ -26,9 +32,12 @@ def test_a_checkpoint_comes_back_as_it_was_written(sweep: Sweep, trial: Trial, a
 
 def test_a_checkpoint_is_seen_when_it_is_whole(trial: Trial, another: Reopen) -> None:
     seen = []
-    trial.write_checkpoint(
-        make_checkpoint(1), lambda folder: seen.append((list(folder.iterdir()), numbers(another))) or fill(folder)
-    )
+
+    def look_and_fill(folder: Path) -> None:
+        seen.append((list(folder.iterdir()), numbers(another)))
+        fill(folder)
+
+    trial.write_checkpoint(make_checkpoint(1), look_and_fill)
     assert seen == [([], [])]
     assert numbers(another) == [1]
 
@@ -51,7 +60,7 @@ def test_of_a_checkpoint_whose_writer_is_killed_nothing_is_seen_and_the_next_own
 ) -> None:
     trial.write_checkpoint(make_checkpoint(3), fill)
     before = harness.keys("mine")
-    killed(lambda die: trial.write_checkpoint(make_checkpoint(4), lambda folder: (fill(folder), die())))
+    killed(lambda die: trial.write_checkpoint(make_checkpoint(4), lambda folder: in_turn(folder, die)))
     assert numbers(another) == [3]
     trial.remove_leftovers()
     assert harness.keys("mine") == before
@@ -180,11 +189,11 @@ def test_leftovers_of_a_sweep_are_removed_and_nothing_else(harness: Harness, swe
     trial.write_record(make_trial(status="completed"))
     trial.write_checkpoint(make_checkpoint(3), fill)
     before = harness.keys("mine")
-    killed(lambda die: trial.write_checkpoint(make_checkpoint(4), lambda folder: (fill(folder), die())))
+    killed(lambda die: trial.write_checkpoint(make_checkpoint(4), lambda folder: in_turn(folder, die)))
     running = sweep.trial("t0001")
     running.write_record(make_trial(1, status="running"))
     running.write_checkpoint(
-        make_checkpoint(1, trial_id="t0001"), lambda folder: (fill(folder), sweep.remove_leftovers())
+        make_checkpoint(1, trial_id="t0001"), lambda folder: in_turn(folder, sweep.remove_leftovers)
     )
     assert running.checkpoint_iterations() == [1]
     assert {key for key in harness.keys("mine") if "t0001" not in key} == before

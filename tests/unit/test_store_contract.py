@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -187,10 +188,11 @@ def test_a_record_whose_writing_fails_is_the_one_before(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", fails)
-        for write in (
+        writes: tuple[Callable[[], None], ...] = (
             lambda: sweep.write_record(make_sweep(num_trials=9)),
             lambda: trial.write_record(make_trial(seed=9)),
-        ):
+        )
+        for write in writes:
             with pytest.raises(CannotRunError, match="No space"):
                 write()
     assert (another().read_record(), another().read_trials()) == (make_sweep(), [make_trial()])
@@ -202,9 +204,9 @@ def test_a_record_whose_writer_is_killed_is_the_one_before_or_the_one_after(
 ) -> None:
     sweep.write_record(make_sweep())
 
-    def act(die) -> None:
+    def act(die: Callable[..., None]) -> None:
         setattr(os, call, die)
-        Path.replace = die  # type: ignore[method-assign]
+        Path.replace = die  # type: ignore[method-assign,assignment]
         sweep.write_record(make_sweep(num_trials=9))
 
     killed(act)

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -36,7 +37,7 @@ def test_one_process_at_a_time_drives_a_sweep(sweep: Sweep, another: Reopen) -> 
 
 
 def test_a_killed_driver_holds_no_lock(sweep: Sweep, another: Reopen) -> None:
-    def act(die) -> None:
+    def act(die: Callable[..., None]) -> None:
         with another().lock():
             die()
 

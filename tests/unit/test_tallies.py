@@ -29,8 +29,7 @@ from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.store.sweep_store import SweepStore
 
 if TYPE_CHECKING:
-    from policies.packed.envs.cartpole import CartPoleEnvs
-    from policies.packed.envs.scalar import ScalarEnvs
+    from policies.packed.envs.vector import PackedEnvs
 
 __all__ = ["kept", "make", "own_modules"]
 
@@ -84,7 +83,7 @@ def test_what_is_no_tally_says_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])
 def test_env_steps_of_a_pack_are_counted_up_to_the_failure(
-    make: Callable[..., CartPoleEnvs | ScalarEnvs], tmp_path: Path, kind: str
+    make: Callable[..., PackedEnvs], tmp_path: Path, kind: str
 ) -> None:
     for name in ("a", "b"):
         begin_tally(name, tmp_path / name, BEGUN)

@@ -43,7 +43,7 @@ def record(
     score: float | None = None,
     *,
     status: str = "completed",
-    point_index: None = None,
+    point_index: int | None = None,
     steps: int = 200_000,
 ) -> TrialRecord:
     point_index = index if point_index is None else point_index
@@ -135,7 +135,7 @@ def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad:
 def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_steps_within_a_rung_do_not_matter() -> None:
     spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
 
-    def proposed(left: dict[str, float], right: dict[str, float]) -> np.float64:
+    def proposed(left: dict[str, Any], right: dict[str, Any]) -> np.float64:
         records = [
             record(index, {"lr": lr}, status="stopped", **(left if lr < 0.5 else right))
             for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24)))
@@ -155,7 +155,7 @@ def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended() -> 
     def proposed(other_seed: dict[str, Any]) -> np.float64:
         records = []
         for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24))):
-            second = {"score": 1.0} if lr < 0.5 else other_seed
+            second: dict[str, Any] = {"score": 1.0} if lr < 0.5 else other_seed
             records += [
                 record(2 * index, {"lr": lr}, 1.0 if lr < 0.5 else 5.0, point_index=index),
                 record(2 * index + 1, {"lr": lr}, point_index=index, **second),
@@ -226,7 +226,7 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.Monkey
         importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find_spec(name, *rest)
     )
 
-    def no_optuna(name: str, *rest: Any):
+    def no_optuna(name: str, *rest: Any) -> Any:
         assert not name.startswith("optuna")
         return real_import(name, *rest)
 

@@ -15,6 +15,7 @@ from policies.errors import NonFiniteWeightsError
 from tests.narrowing import present
 from tune_jobs.store.ownership import Owner, OwnershipLostError
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.training.protocol import IterationStats
 
 # -- going on
 
@@ -129,7 +130,7 @@ def test_who_lost_the_trial_writes_nothing_any_more(tmp_path: Path) -> None:
     old.run_to(3)
     new = Trial(tmp_path, **task)
 
-    def everything():
+    def everything() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
     before = everything()
@@ -190,8 +191,8 @@ def test_nan_weights_end_a_trial_as_failed(tmp_path: Path) -> None:
     trial = Trial(tmp_path, engine=FakeEngine(nan_from=5), checkpoints={"every_iterations": 2, "keep": 2})
     progress = trial.run()
     assert (progress.status, progress.num_iterations, progress.stop_reason) == ("failed", 5, None)
-    assert "NaN" in progress.error
-    assert "iteration 5" in progress.error
+    assert "NaN" in present(progress.error)
+    assert "iteration 5" in present(progress.error)
     assert progress.ended_at is not None
     # What was good before is there, and nothing of iteration 5 was saved.
     assert progress.best_iteration == 4
@@ -201,7 +202,7 @@ def test_nan_weights_end_a_trial_as_failed(tmp_path: Path) -> None:
 
 def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path: Path) -> None:
     class Engine(FakeEngine):
-        def train_iteration(self):
+        def train_iteration(self) -> IterationStats:
             if self.iteration == 3:
                 present(tally_of("t0000")).add(40, 2)
                 raise NonFiniteWeightsError("The gradients of an update are NaN or infinite.", "Lower lr.")

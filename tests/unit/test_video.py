@@ -19,7 +19,6 @@ from policies.acting.movies import GifWriter, Mp4Writer
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.acting.video import record_comparison, record_video
 from policies.errors import CannotRunError, EnvError, NonFiniteWeightsError, SpecError
-from tests.narrowing import present
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
@@ -34,10 +33,10 @@ def read_mp4(path: Path) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
     return meta, frames
 
 
-def gif_frames(path: Path) -> tuple[tuple[int, int], int, list[tuple[int, NDArray[np.uint8]]]]:
+def gif_frames(path: Path) -> tuple[tuple[int, int], int | None, list[tuple[int, NDArray[np.uint8]]]]:
     with Image.open(path) as image:
         frames = []
-        for index in range(image.n_frames):
+        for index in range(cast("Any", image).n_frames):
             image.seek(index)
             frames.append((image.info["duration"], np.array(image.convert("RGB"))))
         return image.size, image.info.get("loop"), frames
@@ -67,10 +66,10 @@ def test_the_frames_show_the_env_under_a_caption(tmp_path: Path) -> None:
     (_, frames), (_, untitled) = read_mp4(tmp_path / "a.mp4"), read_mp4(tmp_path / "b.mp4")
     env = gym.make("CartPole-v0", render_mode="rgb_array")
     env.reset(seed=0)
-    picture = present(env.render())
-    scene = frames[0][-cast("Any", picture).shape[0] :].astype(int)
+    picture: Any = env.render()
+    scene = frames[0][-picture.shape[0] :].astype(int)
     assert np.abs(scene - picture).mean() < 2  # H.264 is not exact
-    strip, without = (film[0][: -cast("Any", picture).shape[0]].astype(int) for film in (frames, untitled))
+    strip, without = (film[0][: -picture.shape[0]].astype(int) for film in (frames, untitled))
     half = strip.shape[1] // 2
     assert strip[:, :half].max() > 150 > without[:, :half].max()
     assert strip[:, half:].max() > 150
@@ -175,7 +174,7 @@ def test_a_file_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> Non
                 env_id="CartPole-v0",
                 seeds=0,
                 max_steps=2,
-                **{name: tmp_path / "file" / "a"},
+                **cast("dict[str, Any]", {name: tmp_path / "file" / "a"}),
             )
 
 
@@ -210,11 +209,11 @@ def test_a_gif_stays_within_its_size_and_its_time(tmp_path: Path, monkeypatch: p
     writer = GifWriter(tmp_path / "a.gif", 50, max_bytes=60_000)
     drawn = []
 
-    def noise() -> Image:
+    def noise() -> Image.Image:
         drawn.append(1)
         return Image.fromarray(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8))
 
-    def red() -> Image:
+    def red() -> Image.Image:
         return Image.new("RGB", (80, 60), (255, 0, 0))
 
     for step in range(300):
