@@ -17,7 +17,7 @@ INF = np.inf
 def box(
     low: Sequence[float | np.float32] | NDArray[Any] | tuple[float, ...],
     high: Sequence[float | np.float32] | NDArray[Any] | tuple[float, ...],
-    dtype: type = np.float32,
+    dtype: type[np.floating[Any]] = np.float32,
 ) -> gym.spaces.Box:
     return gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
 
@@ -42,7 +42,7 @@ def test_a_component_does_not_depend_on_the_others() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
-def test_every_action_is_one_of_the_space(dtype: type) -> None:
+def test_every_action_is_one_of_the_space(dtype: type[np.floating[Any]]) -> None:
     rng = np.random.default_rng(1)
     drawn = rng.normal(size=(100, 6)).astype(np.float32) * 5
     for _ in range(20):

@@ -107,7 +107,9 @@ def test_a_cluster_does_not_change_the_trials(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [SpecError, CannotRunError, KeyboardInterrupt])
-def test_what_cannot_be_created_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type) -> None:
+def test_what_cannot_be_created_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
     def write(*_: object) -> None:
         raise error("broken")
 

@@ -320,7 +320,7 @@ def test_ctrl_c_in_the_process_of_whoever_launched_is_ctrl_c(monkeypatch: pytest
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
-def test_numbers_are_looked_at_in_every_precision(dtype: type) -> None:
+def test_numbers_are_looked_at_in_every_precision(dtype: type[np.floating[Any]]) -> None:
     assert is_sound(np.array([-1, np.finfo(np.float16).max], dtype))
     for value in (np.nan, np.inf, -np.inf):
         assert not is_sound(np.array([0, value], dtype))

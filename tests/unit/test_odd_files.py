@@ -222,7 +222,7 @@ def test_weights_that_are_damaged_are_refused(folder: Path, seed: int) -> None:
 @pytest.mark.parametrize("dtype", [np.float64, np.int32, np.bool_, np.float16])
 @pytest.mark.parametrize("shape", [None, (), (0,), (3, 3, 3)])
 def test_weights_of_other_types_and_shapes_are_taken_or_refused(
-    folder: Path, dtype: type, shape: tuple[int, ...] | None
+    folder: Path, dtype: type[np.generic], shape: tuple[int, ...] | None
 ) -> None:
     from hashlib import sha256
 

@@ -207,7 +207,7 @@ def test_priorities_that_are_no_numbers_do_not_spoil_the_tree() -> None:
     ("replay", "kind", "capacity"),
     [("uniform", ReplayBuffer, 700), ("prioritized", PrioritizedReplayBuffer, 700), ("none", LastTransitions, 32)],
 )
-def test_the_memory_that_the_hyperparameters_name(replay: str, kind: type, capacity: int) -> None:
+def test_the_memory_that_the_hyperparameters_name(replay: str, kind: type[object], capacity: int) -> None:
     made = make_replay(DQNHyperparams(replay=replay, replay_capacity=700, train_batch_size=32), seed=3)
     assert type(made) is kind
     assert made.capacity == capacity
