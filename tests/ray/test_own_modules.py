@@ -121,8 +121,8 @@ def test_a_module_that_is_gone_is_an_error(
     ("algorithm", "values", "name", "words"),
     [
         ("ppo", {}, "NUMBER", "is 3, which is not an RLModule class"),
-        ("ppo", {}, "NoValues", "no ValueFunctionAPI"),
-        ("dqn", {}, "OwnPPO", "no QNetAPI"),
+        ("ppo", {}, "NoValues", "is not a ValueFunctionAPI"),
+        ("dqn", {}, "OwnPPO", "is not a QNetAPI"),
         ("ppo", {}, "Nothing", "nothing called 'Nothing'"),
         ("dqn", {"epsilon_schedule": "exponential"}, "PlainDQN", "epsilon_schedule exponential"),
         ("dqn", {"target_network": False, "double_q": False}, "PlainDQN", "target_network is false"),
