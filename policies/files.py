@@ -9,11 +9,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
-import hashlib
 import os
 import platform
 import re
-import secrets
 import stat
 import time
 from collections.abc import Iterator
@@ -162,7 +160,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     # Hidden, so that a listing of "*.json" or "*.mp4" never picks up an unfinished file. Made by the writer
     # itself and not by tempfile.mkstemp, whose mode 0600 would keep other users of a shared folder from
     # reading the result.
-    writer = f"{_this_place()}-{os.getpid()}-{secrets.token_hex(4)}"
+    writer = f"{_this_place()}-{os.getpid()}-{os.urandom(4).hex()}"
     temporary = path.with_name(f".{path.stem}.{writer}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -193,6 +191,9 @@ def is_abandoned(path: Path) -> bool:
 @functools.cache
 def _this_place() -> str:
     """Return eight digits for the scope of process ids: this boot of this machine, in this container."""
+    # Here, as in `sha256_file`.
+    import hashlib
+
     known = []
     with contextlib.suppress(OSError):
         known.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
@@ -223,6 +224,9 @@ def _cannot_write(path: Path, error: OSError) -> CannotRunError:
 
 def sha256_file(path: Path) -> str:
     """Return the SHA-256 of a file's content as 64 lower-case hexadecimal digits."""
+    # Loading it takes a twentieth of what `tune-jobs --help` does.
+    import hashlib
+
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
