@@ -6,39 +6,21 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from store_parts import make_iteration, make_sweep, make_trial
 
 from analysis.records import (
     FORMAT_VERSION,
     BestRecord,
     CheckpointRecord,
     EvaluationRecord,
-    IterationRecord,
-    SweepRecord,
-    TrialRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from tests.narrowing import present
 from tune_jobs.store.manifests import read_manifest, verify_checkpoint
 from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
 from tune_jobs.store.trial_store import TrialStore
-
-
-def make_sweep(**changes: Any) -> SweepRecord:
-    values = {"name": "mine", "state": "running", "spec": {"a": 1}, "evaluation_seeds": (1, 2), "num_trials": 2,
-              "confirmation_seeds": (3,), "created_at": 5.0}  # fmt: skip
-    return SweepRecord(**values | changes)
-
-
-def make_trial(index: int = 0, **changes: Any) -> TrialRecord:
-    values = {"trial_id": f"t{index:04d}", "index": index, "point_index": index, "seed": index, "point": {"lr": 0.1}}
-    return TrialRecord(**values | changes)
-
-
-def make_iteration(number: int, **changes: Any) -> IterationRecord:
-    return IterationRecord(iteration=number, num_env_steps=100 * number, num_episodes=number, time_s=number, **changes)
 
 
 @pytest.fixture

@@ -80,6 +80,7 @@ def test_infinity_is_read_as_yaml_writes_it(text: str, value: float) -> None:
         ("089", ["089 begins with 0", "Write 89, or '089' in quotes"]),
         ("00", ["00 begins with 0"]),
         ("1:30", ["1:30 may mean a time, 90 to some", "'1:30' in quotes"]),
+        ("-1:30", ["-1:30 may mean a time, -90 to some", "Write -90 if"]),
         ("1:30:00", ["5400"]),
         ("1:30.5", ["90.5"]),
         ("0b11", ["0b11 may mean a binary number", "Write 3"]),

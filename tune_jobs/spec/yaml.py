@@ -198,6 +198,8 @@ def _refuse_two_meanings(_: _Loader, node: yaml.ScalarNode) -> NoReturn:
     total = 0.0
     for part in text.lstrip("-+").replace("_", "").split(":"):
         total = total * 60 + float(part)
+    if text.startswith("-"):
+        total = -total
     raise _error(
         node,
         f"{text} may mean a time, {total:.10g} to some, or a text",

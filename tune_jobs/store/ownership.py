@@ -19,6 +19,7 @@ import secrets
 import socket
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -175,15 +176,15 @@ class Owner:
         )
 
 
-class OwnedFolder:
+class OwnedFolder(ABC):
     """A folder that only one process at a time writes to: the one that took it last."""
 
     _owner: Owner | None = None
 
     @property
+    @abstractmethod
     def folder(self) -> Path:
         """Its path."""
-        raise NotImplementedError
 
     def take(self, under: Ownership | None = None) -> None:
         """Become the process that writes here; see `Owner.take`.
