@@ -42,7 +42,7 @@ def test_a_part_is_dead_when_it_has_been_silent_for_long() -> None:
 
 
 def test_what_a_trial_raised_is_not_waited_for() -> None:
-    from ray.exceptions import RayTaskError
+    from ray.exceptions import RaySystemError, RayTaskError
 
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch
 
@@ -50,6 +50,9 @@ def test_what_a_trial_raised_is_not_waited_for() -> None:
     watch.check_after(RayTaskError("step", "Traceback", ValueError("of the env")))
     with pytest.raises(RayDiedError, match="it"):
         watch.check_after(RuntimeError("of Ray"))
+    # Its env runners were lost with Ray, and the trial was the first to notice.
+    with pytest.raises(RayDiedError, match="it"):
+        watch.check_after(RayTaskError("step", "Traceback", RaySystemError("an env runner is gone")))
     assert not issubclass(RayDiedError, Exception)
 
 

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import ray
-from ray.exceptions import RayTaskError
+from ray.exceptions import RayError, RayTaskError
 
 from policies.errors import CannotRunError
 from tune_jobs.process.interruption import current
@@ -141,12 +141,13 @@ class RayWatch:
         """Find out whether the death of a part of Ray caused a failure; if one is silent, wait until that is certain.
 
         Args:
-            failure: The error that was raised; an error of a trial itself is not caused by Ray.
+            failure: The error that was raised; Ray causes an error of a trial itself only if it is one of Ray's own,
+                as when the trial's env runners are gone.
 
         Raises:
             RayDiedError: A part of Ray died.
         """
-        if isinstance(failure, RayTaskError):
+        if isinstance(failure, RayTaskError) and not isinstance(failure.cause, RayError):
             return
         self.look()
         while self._silent_since and self._dead is None:
