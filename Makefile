@@ -1,6 +1,6 @@
 # make sweep   install into .venv, run the tutorial's sweep, show where its results lie
 # make test    install the test tools too, then lint, types and every test that can run here
-# make unit    the tests of tests/unit, which start no Ray: while one works
+# make unit    the tests of tests/unit, which start next to nothing and take under a minute: while one works
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table
 # make bench   the benchmarks, beside their peers, in one table
@@ -50,7 +50,7 @@ $(VENV)/installed-bench: $(VENV)/installed
 # reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
 # the environment says.
 RAY := tests/ray
-test: export PYTHONDONTWRITEBYTECODE =
+test unit: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
 	$(BIN)/python -m pytest $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,10 +24,7 @@ from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.store.progress import Progress
-from tune_jobs.store.sweep_store import SweepStore
-from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
-from tune_jobs.sweeps.drive import write_new
 from tune_jobs.training.baseline import BaselineEngine
 from tune_jobs.training.protocol import IterationStats, TrialTask
 from tune_jobs.training.trial_loop import TrialLoop
@@ -246,76 +241,6 @@ def test_a_trial_ends_with_its_last_wanted_episode(tmp_path: Path) -> None:
     assert progress.best_evaluation_return is not None
 
 
-# -- sweeps
-
-
-def finished_sweep(tmp_path: Path, algorithm: Algorithm, **hyperparams: int) -> SweepStore:
-    """A sweep of one trial, run without Ray Tune."""
-    spec = load_spec(
-        {
-            "env": "CartPole-v1",
-            "algorithm": algorithm,
-            "hyperparams": {"env_steps_per_iteration": 100, **hyperparams},
-            "stop": {"num_env_steps": 1000},
-            "evaluation": {"num_episodes": 5},
-        }
-    )
-    store = SweepStore(tmp_path / "mine")
-    store.create()
-    plan = make_plan(spec, Machine(1))
-    write_new(store, spec, plan, None)
-    task = make_task(
-        store.folder, algorithm, hyperparams=plan.trials[0].hyperparams, stop=spec.stop, checkpoints=spec.checkpoints
-    )
-    run_trial(task)
-    trial = store.trial("t0000")
-    record = trial.read_record()
-    trial.write_record(
-        record.model_copy(
-            update={"status": "completed", "checkpoints": tuple(trial.checkpoints()), "num_iterations": 10}
-        )
-    )
-    return store
-
-
-def test_the_best_of_a_baselines_sweep_is_confirmed_filmed_and_reported(tmp_path: Path) -> None:
-    store = finished_sweep(tmp_path, "constant", action=1)
-    best = finish.choose_best(store)
-    assert 8 <= best.confirmation.mean_return <= 11 < best.random.mean_return
-    policy = load_policy(store.best_folder)
-    assert isinstance(policy, ConstantPolicy)
-    assert policy.description == "constant action 1"
-    videos = finish.make_videos(store)
-    assert all(path.stat().st_size > 1000 for path in videos.values())
-    page = finish.make_report(store).read_text()
-    assert "After training" not in page
-    assert "A constant action on CartPole-v1" in page
-
-
-def test_random_play_scores_as_the_random_policy_does(tmp_path: Path) -> None:
-    best = finish.choose_best(finished_sweep(tmp_path, "random"))
-    assert best.confirmation.returns == best.random.returns
-
-
-def test_a_baseline_is_not_restored_to_rllib(tmp_path: Path) -> None:
-    finished_sweep(tmp_path, "random")
-    with pytest.raises(CheckpointError, match="is of the baseline random") as caught:
-        sweeps.restore("mine/t0000", storage=tmp_path)
-    assert "load_policy" in caught.value.hint
-
-
-def test_baselines_are_evaluated_and_filmed_by_name(tmp_path: Path) -> None:
-    record, random = sweeps.evaluate("constant", env_id="CartPole-v1", num_episodes=5)
-    assert record.policy == "constant action 0"
-    assert 8 <= record.mean_return <= 11
-    assert random.policy == "random policy"
-    assert sweeps.evaluate("constant", env_id="Pendulum-v1", num_episodes=1, action=[2])[0].policy == (
-        "constant action [2.0]"
-    )
-    paths = sweeps.video("constant", env_id="CartPole-v1", action=1, output=tmp_path / "left.mp4")
-    assert paths["mp4"].stat().st_size > 1000
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -359,14 +284,3 @@ def test_the_action_can_be_set_and_searched() -> None:
     assert [trial.point["action"] for trial in make_plan(both, Machine(1)).trials] == [0, 1]
     box = load_spec({"env": "Pendulum-v1", "algorithm": "constant"}, ["hyperparams.action=[-2.0]"])
     assert json.loads(json.dumps(make_plan(box, Machine(1)).to_json()))["trials"][0]["hyperparams"]["action"] == [-2.0]
-
-
-def test_playing_a_baseline_needs_neither_ray_nor_torch(tmp_path: Path) -> None:
-    code = (
-        "import sys; from pathlib import Path\n"
-        "import tune_jobs.training.baseline, tune_jobs.training.trial_loop, policies.acting.baselines\n"
-        "from policies.acting.policy import RandomPolicy\n"
-        "RandomPolicy.for_env('CartPole-v1').act([0, 0, 0, 0])\n"
-        "assert not {'ray', 'torch'} & set(sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)

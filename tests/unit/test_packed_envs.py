@@ -88,6 +88,13 @@ def rows_of(envs: PackedEnvs, member_id: str, num_envs: int = N) -> slice:
     return slice(first, first + num_envs)
 
 
+def go_on(envs: PackedEnvs, breaking: str | None = None, how: int = 0, place: int = 1) -> Step:
+    actions = np.zeros(len(envs.observations), dtype=np.int64)
+    if breaking is not None:
+        actions[rows_of(envs, breaking)][place] = how
+    return envs.step(actions)
+
+
 def seen_by(envs: PackedEnvs, step: Step, member_id: str) -> dict[str, NDArray[Any]]:
     rows = rows_of(envs, member_id)
     names = ("observations", "final_observations", "rewards", "own_rewards", "terminated", "truncated")

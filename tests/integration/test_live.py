@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+import test_monitor
 from fake_engine import FakeClock
 from rich.console import Console
 from test_monitor import make_monitor, make_trial
@@ -133,7 +134,7 @@ print("done")
 @pytest.mark.parametrize(("progress", "lines"), [("auto", 1), ("none", 0)])
 def test_nothing_else_is_on_the_terminal(tmp_path: Path, progress: str, lines: int) -> None:
     log = tmp_path / "driver.log"
-    code = PROGRAM.format(here=os.path.dirname(__file__), progress=progress, log=str(log))  # noqa: PTH120
+    code = PROGRAM.format(here=os.path.dirname(test_monitor.__file__), progress=progress, log=str(log))  # noqa: PTH120
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "done\n"
     # Without a terminal, a line at the end (and now and then); results are for standard output, so not there.

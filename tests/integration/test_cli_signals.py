@@ -103,7 +103,7 @@ cli.main()
 
 
 def run_script(*arguments: str, stdout: TextIO) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", RUNS, str(Path(__file__).parent), *arguments]
+    command = [sys.executable, "-c", RUNS, str(Path(__file__).parents[1] / "unit"), *arguments]
     return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from report_page import Page
 from synthetic_sweep import Synthetic, make_points, make_sweep
 
 from analysis.records import CheckpointRecord
@@ -30,6 +29,7 @@ from analysis.wording import (
     shown_path,
 )
 from policies.hyperparams import Algorithm
+from tests.integration.report_page import Page
 from tests.narrowing import present
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7*7 }}"

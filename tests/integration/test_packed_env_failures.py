@@ -12,22 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from odd_envs import EXIT, RAISE, WRONG_SHAPE
-from test_packed_envs import assert_equal_bits, make, own_modules, rows_of, seen_by
+from test_packed_envs import assert_equal_bits, go_on, make, own_modules, rows_of, seen_by
 
 from policies.errors import EnvError
 from tests.narrowing import present
 
 if TYPE_CHECKING:
-    from policies.packed.envs.vector import PackedEnvs, Step
+    from policies.packed.envs.vector import PackedEnvs
 
 __all__ = ["make", "own_modules"]
-
-
-def go_on(envs: PackedEnvs, breaking: str | None = None, how: int = 0, place: int = 1) -> Step:
-    actions = np.zeros(len(envs.observations), dtype=np.int64)
-    if breaking is not None:
-        actions[rows_of(envs, breaking)][place] = how
-    return envs.step(actions)
 
 
 @pytest.mark.parametrize("kind", ["scalar", "processes"])

@@ -205,7 +205,7 @@ def test_what_an_env_prints_is_not_on_standard_output(tmp_path: Path) -> None:
         "        return super().reset(**kwargs)\n"
     )
     code = "from policies.guard import guarded; print(guarded.check_env('loud_envs:Loud', {}).env_id)"
-    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parent), str(ROOT)])
+    paths = os.pathsep.join([str(tmp_path), str(ROOT / "tests" / "unit"), str(ROOT)])
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=os.environ | {"PYTHONPATH": paths, "TUNE_JOBS_ALLOWED_MODULES": "loud_envs"},
@@ -261,7 +261,7 @@ def test_a_child_does_not_outlive_a_killed_parent(tmp_path: Path) -> None:
         "from policies.guard import guarded\n"
         f"guarded.check_env({HOSTILE!r}, {{'how': 'hang_without_python', 'where': 'step', 'pids': {str(pids)!r}}})\n"
     )
-    paths = os.pathsep.join([str(Path(__file__).parent), str(ROOT)])
+    paths = os.pathsep.join([str(ROOT / "tests" / "unit"), str(ROOT)])
     parent = subprocess.Popen(
         [sys.executable, "-c", code],
         env=os.environ | {"PYTHONPATH": paths, "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},
@@ -285,7 +285,7 @@ def test_an_interrupted_parent_ends_its_child(tmp_path: Path) -> None:
         "except KeyboardInterrupt:\n"
         "    print('interrupted')\n"
     )
-    paths = os.pathsep.join([str(Path(__file__).parent), str(ROOT)])
+    paths = os.pathsep.join([str(ROOT / "tests" / "unit"), str(ROOT)])
     parent = subprocess.Popen(
         [sys.executable, "-c", code],
         env=os.environ | {"PYTHONPATH": paths, "TUNE_JOBS_ALLOWED_MODULES": "hostile_envs"},

@@ -26,6 +26,7 @@ from tune_jobs.sweeps.drive import _finished, write_new
 from tune_jobs.sweeps.outcome import SweepResult
 
 HOSTILE = "hostile_envs:Hostile"
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -152,7 +153,7 @@ def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path: Path, argumen
     (tmp_path / "sweep.yaml").write_text(
         f"env: {{id: '{HOSTILE}', args: {{how: hang}}}}\nalgorithm: ppo\niteration_timeout_s: 1\n"
     )
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    paths = [str(ROOT / "tests" / "unit"), str(ROOT), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [sys.executable, "-m", "tune_jobs.cli.commands", *arguments],
         cwd=tmp_path,

@@ -20,7 +20,7 @@ from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
 
-SAMPLE = Path(__file__).parent / "samples" / "sweep_format_1"
+SAMPLE = Path(__file__).parents[1] / "unit" / "samples" / "sweep_format_1"
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Functions that stand in for runs of sweeps: what test_apart.py has called in processes of their own.
 
-Run as a script, with a folder: calls `until_asked` in two threads, and does in the main thread what is said.
+Run as a module, with a folder: calls `until_asked` in two threads, and does in the main thread what is said.
 """
 
 import json
@@ -125,6 +125,6 @@ def main(folder: Path, how: str) -> None:
 if __name__ == "__main__":
     warnings.simplefilter("error")
     # As other processes find it, not as `__main__`.
-    import apart_runs
+    from tests.integration import apart_runs
 
     apart_runs.main(Path(sys.argv[1]), sys.argv[2])

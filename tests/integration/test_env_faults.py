@@ -17,8 +17,7 @@ import pytest
 from fake_engine import make_task
 from odd_envs import RAISED
 from policy_factory import make_policy
-from test_packed_env_failures import go_on
-from test_packed_envs import assert_equal_bits, make, own_modules, seen_by
+from test_packed_envs import assert_equal_bits, go_on, make, own_modules, seen_by
 
 from policies.acting.evaluate import Evaluator, evaluate_policy
 from policies.acting.policy import RandomPolicy

@@ -14,14 +14,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import apart_runs
 import pytest
-from apart_runs import make_result
 
 import tune_jobs
 import tune_jobs.sweeps.verbs  # and with it Gymnasium, which sets a variable
 from policies.envs.modules import allow_modules, allowed_again, allowed_modules
 from policies.errors import CannotRunError, EnvError, SpecError
+from tests.integration import apart_runs
+from tests.integration.apart_runs import make_result
 from tune_jobs.process.interruption import can_drive, taking_signals
 from tune_jobs.process.state import given_back
 from tune_jobs.process.streams import quiet
@@ -29,6 +29,7 @@ from tune_jobs.sweeps import apart
 from tune_jobs.sweeps.interrupted import SweepInterrupted
 from tune_jobs.sweeps.outcome import SweepResult
 
+ROOT = Path(__file__).parents[2]
 LIMIT_S = 120
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
@@ -126,8 +127,8 @@ def script(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
 
     def start(how: str) -> subprocess.Popen[str]:
         names = ("one", "two", "main")[: 2 + (how == "drives")]
-        command = [sys.executable, apart_runs.__file__, str(tmp_path), how]
-        process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", apart_runs.__name__, str(tmp_path), how]
+        process = subprocess.Popen(command, cwd=ROOT, start_new_session=True, stderr=subprocess.PIPE, text=True)
         started.append(process)
         wait_until(lambda: all((tmp_path / name).exists() for name in names))
         return process

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from fake_engine import FakeClock, FakeEngine
 from fake_pack import Pack
-from test_packed_env_failures import go_on
-from test_packed_envs import make, own_modules
+from test_packed_envs import go_on, make, own_modules
 from test_record_keeper import kept, progress
 from trial_runs import Trial
 
