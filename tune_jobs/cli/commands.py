@@ -11,7 +11,6 @@ from typing import Any
 import click
 
 from policies.errors import SpecError
-from policies.guard.guard import guarding
 from policies.standard_streams import standard_streams
 from tune_jobs.cli.base import (
     DEBUG,
@@ -75,6 +74,8 @@ def launch(
     **options: Any,
 ) -> None:
     """Run a sweep: all trials, then the best policy, its video and a report."""
+    from policies.guard.guard import guarding
+
     # The guard's child starts while this process still imports its own modules.
     ctx.with_resource(guarding(start=True))
     if dry_run:
