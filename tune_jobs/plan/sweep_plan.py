@@ -32,6 +32,7 @@ from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.tpe import check_installed
 from tune_jobs.spec.domains import num_points
 from tune_jobs.spec.engines import engine_named
+from tune_jobs.spec.hyperparam_problems import check_distinct
 from tune_jobs.spec.rules import idle_settings
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -111,11 +112,13 @@ def make_plan(
         EnvError: The environment isn't registered, can't be made, or doesn't fit the algorithm.
         SpecError: A point's values contradict each other or the environment, there are too many trials, a class is in
             a module that is not allowed, trials can't be packed though the sweep asks for it, or a new sweep searches
-            a hyperparameter that can't act.
+            a hyperparameter that can't act, or lists one value in two forms.
         CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
     if spec.search.type == "tpe":
         check_installed()
+    if not records:
+        check_distinct(spec.algorithm, spec.space)
     check_env_args(spec)
     env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
     check_rl_module(spec)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,11 +13,13 @@ from pydantic import (
     create_model,
 )
 
+from policies.errors import SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.suggestions import did_you_mean
 from policies.wrong_values import details_of, dotted, explain
-from tune_jobs.spec.domains import Domain
-from tune_jobs.spec.problems import Problem
+from tune_jobs.spec.domains import Domain, Listed
+from tune_jobs.spec.list_forms import list_to_write, text_of_several
+from tune_jobs.spec.problems import SPEC_HINT, Problem
 
 
 def hyperparam_problems(
@@ -50,6 +53,27 @@ def hyperparam_problems(
     return problems
 
 
+def check_distinct(algorithm: Algorithm, space: Mapping[str, Domain]) -> None:
+    """Check that no listed value means the same as another one, as 64 and [64] do; a new sweep's space alone needs it.
+
+    Raises:
+        SpecError: A value is listed twice in two forms.
+    """
+    for name, domain in space.items():
+        if not isinstance(domain, Listed):
+            continue
+        seen: dict[str, int] = {}
+        for index, value in enumerate(domain.values):
+            known = _alone(algorithm, name).model_validate({name: value}).model_dump(mode="json")
+            first = seen.setdefault(json.dumps(known), index)
+            if first != index:
+                raise SpecError(
+                    f"space.{name}.{domain.kind}[{index}]: {value!r} is the same as {domain.values[first]!r}, in "
+                    f"{domain.kind}[{first}]: list it once (seeds_per_point repeats points with other seeds)",
+                    SPEC_HINT,
+                )
+
+
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
@@ -79,11 +103,34 @@ def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -
     try:
         checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
     except ValidationError as error:
+        if (told := _told(algorithm, name, value, path=path)) is not None:
+            return [Problem(path, told)]
         return [Problem(path + dotted(detail["loc"][1:], root=False), explain(detail)) for detail in details_of(error)]
     if not _same_kind(value, checked):
         meant = list(checked) if isinstance(checked, tuple) else checked
         return [Problem(path, f"{value!r} is of the wrong type: write {meant!r} if that is meant")]
     return []
+
+
+def _told(algorithm: Algorithm, name: str, value: Any, *, path: str) -> str | None:
+    """Return what to write in place of a value that is refused; None: that is not known."""
+    if path == f"hyperparams.{name}":
+        several = text_of_several(name, value, lambda one: _is_allowed(algorithm, name, one))
+        if several is not None:
+            return several
+    meant = list_to_write(value, lambda form: _is_allowed(algorithm, name, form))
+    if meant is None:
+        return None
+    wanted = "" if isinstance(value, list | tuple) else "it should be a list: "
+    return f"{shortened(value)} is not allowed: {wanted}write {meant!r}"
+
+
+def _is_allowed(algorithm: Algorithm, name: str, value: Any) -> bool:
+    try:
+        checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
+    except ValidationError:
+        return False
+    return _same_kind(value, checked)
 
 
 def _same_kind(raw: Any, checked: Any) -> bool:

@@ -13,6 +13,7 @@ from policies.suggestions import did_you_mean
 from policies.wrong_values import Detail, details_of, dotted, explain
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
+from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
 from tune_jobs.spec.problems import Problem
 from tune_jobs.spec.sections import NAME_RULE, SweepFields
 
@@ -61,12 +62,25 @@ def _from_detail(detail: Detail) -> Problem:
     if detail["type"] == "missing":
         options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
         return Problem(path, f"is missing{f': give {options}' if options else ''}")
+    if (written := _in_space(location, detail)) is not None:
+        return Problem(path, written)
     if path in _FORMS:
         return Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")
     if detail["type"] == "model_type":
         fields = ", ".join(_section(location).model_fields)
         return Problem(path, f"{shortened(detail['input'])} is not allowed: give a mapping of its fields ({fields})")
     return Problem(path, explain(detail))
+
+
+def _in_space(location: Sequence[int | str], detail: Detail) -> str | None:
+    """Return what to write where a domain, or the list of one, was left out; None: this is not the mistake."""
+    if not location or location[0] != "space":
+        return None
+    if len(location) == 2 and detail["type"] == "value_error":
+        return text_of_no_domain(str(location[1]), detail["input"])
+    if len(location) == 3 and detail["type"] == "tuple_type" and location[2] in ("grid", "choice"):
+        return text_of_no_list(str(location[1]), detail["input"])
+    return None
 
 
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:
