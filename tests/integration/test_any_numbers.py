@@ -15,7 +15,8 @@ from trial_runs import Trial
 from analysis.report import build_report
 from analysis.tables import groups_frame, iterations_frame, steps_to_solve_frame, trials_frame
 from tests.narrowing import present
-from tune_jobs.cli.output import show_best, show_evaluation, show_result, show_status, show_sweeps, show_trials
+from tune_jobs.cli.output import show_best, show_evaluation, show_result, show_status, show_sweeps
+from tune_jobs.cli.trials_table import show_trials
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.live_table import summary_line

@@ -79,7 +79,7 @@ def test_a_mutated_learning_rate_is_the_one_in_the_trials_optimizer(population: 
 
 
 def test_all_trials_of_a_population_train_to_the_end_and_their_history_is_shown(population: SweepResult) -> None:
-    from tune_jobs.cli.output import show_trials
+    from tune_jobs.cli.trials_table import show_trials
 
     trials = population.trials
     assert [trial.status for trial in trials] == ["completed"] * 4

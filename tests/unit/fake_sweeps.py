@@ -97,6 +97,7 @@ TRIALS = [
         training_return=float("nan"),
         best_evaluation_return=200.0,
         time_s=61.0,
+        checkpoints=(CHECKPOINT,),
     ),
 ]
 

@@ -240,7 +240,7 @@ def test_two_kinds_of_target_updates_are_not_stacked() -> None:
 
 
 def test_trials_are_listed_with_their_engines_if_they_differ(capsys: pytest.CaptureFixture[str]) -> None:
-    from tune_jobs.cli.output import show_trials
+    from tune_jobs.cli.trials_table import show_trials
 
     records = [pending_record(trial) for trial in plan(num_samples=2).trials]
     show_trials(records, as_json=False)

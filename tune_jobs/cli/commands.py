@@ -125,16 +125,21 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
 
 @cli.command()
 @click.argument("sweep")
+@click.option("--sort", metavar="COLUMN", help="Sort by a column, such as score or lr; scores best first.")
+@click.option("--top", type=click.IntRange(min=1), metavar="N", help="The first N only; without --sort, by score.")
 @storage_option
 @json_option
-def trials(*, sweep: str, storage: str | None, as_json: bool) -> None:
-    """List the trials of a sweep with their points, scores and errors."""
-    from tune_jobs.cli import output as cli_output
+def trials(*, sweep: str, sort: str | None, top: int | None, storage: str | None, as_json: bool) -> None:
+    """List the trials of a sweep with their points, scores and errors.
+
+    On a terminal, columns that don't fit are left out, the least important ones first.
+    """
+    from tune_jobs.cli import trials_table
     from tune_jobs.sweeps import verbs as sweeps
 
     with stdout_for(as_json=as_json):
         records = sweeps.trials(sweep, storage=storage)
-    cli_output.show_trials(records, as_json=as_json)
+    trials_table.show_trials(records, sort=sort, top=top, as_json=as_json)
 
 
 @cli.command()

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 # Derived values, so that readers of the JSON need not compute them.
 _DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
-_STATUS_STYLES: dict[TrialStatus, str] = {
+STATUS_STYLES: dict[TrialStatus, str] = {
     "completed": "green",
     "failed": "red",
     "running": "cyan",
     "stopped": "yellow",
     "paused": "yellow",
 }
-_STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "running", "paused", "pending")
+STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "running", "paused", "pending")
 
 
 def to_json(value: Any) -> Any:
@@ -87,7 +87,7 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
 
 
 def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None:
-    counts: dict[TrialStatus, int] = dict.fromkeys(_STATUS_ORDER, 0)
+    counts: dict[TrialStatus, int] = dict.fromkeys(STATUS_ORDER, 0)
     for trial in trials:
         counts[trial.status] += 1
     told = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
@@ -95,11 +95,11 @@ def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None
     console.print(f"{counted(len(trials), 'trial')}: {told}; {counted(steps, 'env step')}")
     for trial in trials:
         if trial.status == "failed":
-            console.print(f"{trial.trial_id} failed: {_first_line(trial.error)}", style="red")
-    _print_trial_notes(console, trials)
+            console.print(f"{trial.trial_id} failed: {first_line(trial.error)}", style="red")
+    print_trial_notes(console, trials)
 
 
-def _print_trial_notes(console: Console, trials: Sequence[TrialRecord]) -> None:
+def print_trial_notes(console: Console, trials: Sequence[TrialRecord]) -> None:
     """Print what was damaged in trials; they went on from something other than their latest checkpoint or results."""
     for trial in trials:
         for note in trial.notes:
@@ -150,37 +150,6 @@ def _state(status: SweepStatus) -> str:
 
 def _counts(status: SweepStatus) -> str:
     return ", ".join(f"{number} {name}" for name, number in status.counts.items() if number) or "none"
-
-
-def show_trials(trials: Sequence[TrialRecord], *, as_json: bool) -> None:
-    """Print one line per trial."""
-    if as_json:
-        print_json(trials)
-        return
-    from rich.text import Text
-
-    names = list(dict.fromkeys(name for trial in trials for name in trial.point))
-    columns = ["trial", "status", *names, "env steps", "time", "training", "evaluation", "best", "ended by"]
-    engines_differ = len({trial.engine for trial in trials}) > 1
-    copies = any(trial.changes for trial in trials)
-    table = make_table(*columns, *(["engine"] if engines_differ else []), *(["copied"] if copies else []))
-    for trial in trials:
-        table.add_row(
-            trial.trial_id,
-            Text(trial.status, style=_STATUS_STYLES.get(trial.status, "")),
-            *(setting_text(trial.point.get(name)) for name in names),
-            f"{trial.num_env_steps:,}",
-            duration(trial.time_s, none=PLAIN_NONE),
-            return_text(trial.training_return, none=PLAIN_NONE),
-            return_text(trial.evaluation_return, none=PLAIN_NONE),
-            return_text(trial.best_evaluation_return, none=PLAIN_NONE),
-            Text(_first_line(trial.error) if trial.status == "failed" else (trial.stop_reason or PLAIN_NONE)),
-            *([trial.engine] if engines_differ else []),
-            *([", ".join(change.source_trial_id for change in trial.changes) or PLAIN_NONE] if copies else []),
-        )
-    console = make_console()
-    console.print(table)
-    _print_trial_notes(console, trials)
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:
@@ -311,5 +280,6 @@ def print_facts(console: Console, facts: Mapping[str, str]) -> None:
     console.print(grid)
 
 
-def _first_line(text: str | None) -> str:
+def first_line(text: str | None) -> str:
+    """Return the first line of an error."""
     return (text or "no error recorded").strip().splitlines()[0]
