@@ -111,10 +111,10 @@ class _Child:
     def was_lost(self) -> bool:
         """Whether it ended between two jobs, for example because the system killed it when memory was scarce.
 
-        It is False for a child that could not even begin, so that its error is reported.
+        It may never have begun: a signal can end it while Python starts, with any exit code. If no child can begin, the
+        error of the next one is reported.
         """
-        code = self.process.poll()
-        return code is not None and (self.has_worked or code < 0)
+        return self.process.poll() is not None
 
     def frames(self) -> list[str]:
         """Return the frames of the user's code, innermost first, as Python's fault handler wrote them."""

@@ -326,3 +326,13 @@ def test_a_child_that_cannot_begin_is_told_as_that(monkeypatch: pytest.MonkeyPat
         with pytest.raises(EnvFailedError, match="ended with exit code 9") as caught:
             guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
     assert "printed" in caught.value.hint
+
+
+def test_a_child_that_ended_before_it_began_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As by a signal while Python starts, which then ends with 1 as by an error of its own."""
+    with EnvGuard() as guard:
+        with monkeypatch.context() as patch:
+            patch.setattr("policies.guard.guard._BOOTSTRAP", "raise SystemExit(1)")
+            guard.start()
+        present(guard._child).process.wait()
+        assert guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)["env_id"] == "CartPole-v1"
