@@ -16,18 +16,12 @@ import click
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tune_jobs.cli.commands import cli
 from tune_jobs.spec.file import json_schema, list_presets
+from tune_jobs.spec.hyperparam_table import TYPE_WORDS, elsewhere_text, hyperparam_tables, range_text
 
 Schema = Mapping[str, Any]
 
 DECISIONS = Path(__file__).parents[1] / "decisions"
-_TYPES = {
-    "integer": "whole number",
-    "number": "number",
-    "string": "text",
-    "boolean": "`true` or `false`",
-    "null": "`null`",
-    "object": "mapping",
-}
+_TYPES = {**TYPE_WORDS, "boolean": "`true` or `false`", "null": "`null`"}
 
 
 def sweep_fields() -> str:
@@ -47,12 +41,20 @@ def sweep_fields() -> str:
 
 
 def hyperparameters() -> str:
-    """The hyperparameters of each algorithm."""
+    """The hyperparameters of each algorithm, with the names that other libraries have for them."""
     definitions = json_schema()["$defs"]
     parts = []
-    for algorithm, model in HYPERPARAMS_BY_ALGORITHM.items():
-        schema = definitions[model.__name__]
-        parts.append(f"## {algorithm}\n\n{_paragraphs(schema['description'])}\n\n{_fields(schema)}")
+    for table in hyperparam_tables():
+        schema = definitions[HYPERPARAMS_BY_ALGORITHM[table.algorithm].__name__]
+        elsewhere = {
+            row.name: ". ".join(f"{library}: {_escaped(names)}" for library, names in elsewhere_text(row).items())
+            for row in table.hyperparams
+        }
+        fields = _fields(schema, more=("elsewhere", elsewhere) if any(elsewhere.values()) else None)
+        parts.append(f"## {table.algorithm}\n\n{_paragraphs(schema['description'])}\n\n{fields}")
+        if table.not_here:
+            lines = [f"- {row.library}: `{row.name}`: {_escaped(row.difference)}" for row in table.not_here]
+            parts.append("Settings of other libraries that are no hyperparameters here:\n\n" + "\n".join(lines))
     return "\n\n".join(parts)
 
 
@@ -103,8 +105,14 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
-def _fields(schema: Schema, links: Mapping[str, str] = {}) -> str:
-    """A table of a mapping's fields; `links` has the words for fields that are mappings themselves, by definition."""
+def _fields(schema: Schema, links: Mapping[str, str] = {}, more: tuple[str, Mapping[str, str]] | None = None) -> str:
+    """A table of a mapping's fields.
+
+    Args:
+        schema: The mapping.
+        links: The words for fields that are mappings themselves, by definition.
+        more: The heading of another column, and its texts by field.
+    """
     required = schema.get("required", ())
     rows: list[tuple[str, ...]] = [
         (
@@ -112,10 +120,11 @@ def _fields(schema: Schema, links: Mapping[str, str] = {}) -> str:
             " or ".join(dict.fromkeys(_values(field, links))),
             "must be given" if name in required else _default(field),
             _escaped(field.get("description", "")),
+            *([more[1][name]] if more is not None else []),
         )
         for name, field in schema["properties"].items()
     ]
-    return _table(("field", "values", "default", "meaning"), rows)
+    return _table(("field", "values", "default", "meaning", *([more[0]] if more is not None else [])), rows)
 
 
 def _values(field: Schema, links: Mapping[str, str]) -> list[str]:
@@ -130,15 +139,7 @@ def _values(field: Schema, links: Mapping[str, str]) -> list[str]:
         return [f"list of: {words}" for words in _values(field["items"], links)]
     if "enum" in field:
         return [", ".join(f"`{value}`" for value in field["enum"])]
-    return [" ".join(filter(None, (_TYPES[field.get("type", "object")], _range(field))))]
-
-
-def _range(field: Schema) -> str:
-    low, high = field.get("minimum"), field.get("maximum")
-    if low is not None and high is not None:
-        return f"from {low:,g} to {high:,g}"
-    limits = [("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<")]
-    return ", ".join(f"{sign} {field[key]:,g}" for key, sign in limits if key in field)
+    return [" ".join(filter(None, (_TYPES[field.get("type", "object")], range_text(field))))]
 
 
 def _section(field: Schema) -> str | None:

@@ -314,6 +314,20 @@ def presets(*, name: str | None, as_json: bool) -> None:
 
 
 @cli.command()
+@click.argument("algorithm", required=False)
+@json_option
+def hyperparams(*, algorithm: str | None, as_json: bool) -> None:
+    """List the hyperparameters of ppo, dqn, random or constant, with the names that other libraries have for them.
+
+    Other libraries are Stable-Baselines3 and RLlib; it is said where a name of theirs means something else.
+    """
+    from tune_jobs.cli import hyperparam_view as cli_hyperparams
+    from tune_jobs.spec.hyperparam_table import hyperparam_tables
+
+    cli_hyperparams.show_hyperparams(hyperparam_tables(algorithm), as_json=as_json)
+
+
+@cli.command()
 @json_option
 def schema(*, as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON either way
     """Print the JSON Schema of the sweep file, for editors."""

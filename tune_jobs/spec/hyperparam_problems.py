@@ -14,6 +14,7 @@ from pydantic import (
 )
 
 from policies.errors import SpecError, shortened
+from policies.foreign_names import answer_for_others, answer_to
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.suggestions import did_you_mean
 from policies.wrong_values import details_of, dotted, explain
@@ -78,9 +79,11 @@ def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
     have = "have" if len(others) > 1 else "has"
-    suggestion = f" ({' and '.join(others)} {have} it.)" if others else did_you_mean(name, known)
-    if name == "learning_rate":
-        suggestion = " Did you mean 'lr'?"  # by its letters, DQN's learning_starts would be nearer
+    of_others = f" ({' and '.join(others)} {have} it.)" if others else ""
+    # By its letters, DQN's learning_starts would be nearer to learning_rate than lr is.
+    suggestion = (
+        answer_to(algorithm, name) or of_others or answer_for_others(algorithm, name) or did_you_mean(name, known)
+    )
     listed = "" if suggestion else f" It has {', '.join(sorted(known))}."
     return f"{algorithm} has no hyperparameter {name!r}.{suggestion}{listed}"
 
