@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 from fake_engine import FakeEngine
-from fake_sweeps import Result, Status
+from fake_sweeps import Result
 from synthetic_sweep import Synthetic, make_sweep
 from trial_runs import Trial
 
@@ -71,12 +71,12 @@ def test_the_report_and_the_tables_are_made(made: Synthetic, tmp_path: Path) -> 
 def test_everything_is_shown_and_json_is_json(
     made: Synthetic, tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
-    status = Status(made.sweep, {"completed": 1, "failed": 1}, alive=False)
+    status = SweepStatus(made.sweep, {"completed": 1, "failed": 1}, alive=False)
     result = Result(tmp_path, made.sweep, made.trials, made.best, None, {})
     shown: list[Callable[[], None]] = [
         lambda: show_result(cast("SweepResult", result), storage=None, as_json=as_json),
-        lambda: show_sweeps([cast("SweepStatus", status)], as_json=as_json),
-        lambda: show_status(cast("SweepStatus", status), as_json=as_json),
+        lambda: show_sweeps([status], as_json=as_json),
+        lambda: show_status(status, as_json=as_json),
         lambda: show_trials(made.trials, as_json=as_json),
         lambda: show_best(present(made.best), as_json=as_json),
         lambda: show_evaluation(present(made.best).confirmation, present(made.best).random, as_json=as_json),

@@ -12,6 +12,7 @@ import pytest
 
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, SweepRecord, TrialRecord
 from tune_jobs.cli.commands import cli
+from tune_jobs.sweeps.status import SweepStatus
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
@@ -50,13 +51,6 @@ class Result:
     interrupted: bool = False
     notes: tuple[str, ...] = ("no video: it can't be drawn",)
     exit_code: int = 0
-
-
-@dataclasses.dataclass(frozen=True)
-class Status:
-    sweep: SweepRecord
-    counts: dict[str, int]
-    alive: bool
 
 
 SWEEP = SweepRecord(
@@ -136,7 +130,7 @@ def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSweeps:
     fake = FakeSweeps("tune_jobs.sweeps.verbs")
     folder = tmp_path / "sweeps" / "mine"
     result = Result(folder, SWEEP, TRIALS, BEST, None, {"report": folder / "report" / "index.html"}, exit_code=3)
-    status = Status(SWEEP, {"completed": 1, "failed": 1, "running": 0}, alive=False)
+    status = SweepStatus(SWEEP, {"completed": 1, "failed": 1, "running": 0}, alive=False)
     fake.calls = []
     fake.answers = {
         "launch": result,

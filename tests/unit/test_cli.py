@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from fake_sweeps import SWEEP, TRIALS, FakeSweeps, RunCommand, Status, evaluation
+from fake_sweeps import SWEEP, TRIALS, FakeSweeps, RunCommand, evaluation
 
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.output import to_json
 from tune_jobs.sweeps.interrupted import SweepInterrupted
+from tune_jobs.sweeps.status import BestSoFar, SweepStatus
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
@@ -143,10 +144,64 @@ def test_trials_are_a_table_in_which_no_value_is_cut_or_taken_for_markup(run: Ru
 
 def test_a_sweep_whose_process_is_gone_is_not_called_running(run: RunCommand, sweeps: FakeSweeps) -> None:
     running = SWEEP.model_copy(update={"state": "running"})
-    sweeps.answers["status"] = Status(running, {"running": 2}, alive=False)
+    sweeps.answers["status"] = SweepStatus(running, {"running": 2}, alive=False)
     assert "interrupted" in run("status", "mine").stdout
-    sweeps.answers["status"] = Status(running, {"running": 2}, alive=True)
+    sweeps.answers["status"] = SweepStatus(running, {"running": 2}, alive=True)
     assert "interrupted" not in run("status", "mine").stdout
+
+
+BEST_SO_FAR = BestSoFar("t0003", 7, 7_168, {"lr": 3e-5}, 9, 123.45)
+RUNNING = SweepStatus(
+    SWEEP.model_copy(update={"state": "running", "run_time_s": 0.0}), {"completed": 1, "running": 2}, alive=True,
+    num_env_steps=79_999, max_env_steps=160_000, env_steps_per_s=1_234.5, time_left_s=84.0, best=BEST_SO_FAR,
+)  # fmt: skip
+
+
+def facts(output: str) -> dict[str, str]:
+    """The lines of a command that prints facts, by name."""
+    pairs = (line.split("  ", 1) for line in output.splitlines() if "  " in line.strip())
+    return {name.strip(): text.strip() for name, text in pairs}
+
+
+def test_the_status_tells_progress_the_best_and_the_time_left(run: RunCommand, sweeps: FakeSweeps) -> None:
+    sweeps.answers["status"] = RUNNING
+    told = facts(run("status", "mine").stdout)
+    assert told["progress"] == "49 %: 79,999 of at most 160,000 env steps"
+    assert told["trials"] == "2: 1 completed, 2 running"
+    assert told["best so far"] == "123.5  lr 3e-05  (t0003, at 7,168 env steps)"
+    assert told["speed"] == "1,234 env steps/s"
+    assert told["time left"] == "about 1 min 24 s"
+    document = json.loads(run("status", "mine", "--json").stdout)
+    assert (document["num_env_steps"], document["max_env_steps"], document["time_left_s"]) == (79_999, 160_000, 84.0)
+    assert (document["best"]["trial_id"], document["best"]["score"]) == ("t0003", 123.45)
+    assert document["counts"] == {"completed": 1, "running": 2}
+
+
+@pytest.mark.parametrize(
+    ("state", "alive", "words"),
+    [
+        ("running", True, "not known before the first env steps are reported"),
+        ("completed", True, "the trials are done; the best is being confirmed and filmed, and the report written"),
+        ("interrupted", False, "nothing runs; `tune-jobs resume mine --storage 'my sweeps'` continues it"),
+        ("created", False, "nothing runs; `tune-jobs resume mine --storage 'my sweeps'` starts it"),
+        ("completed", False, None),
+    ],
+)
+def test_time_left_is_told_in_words_where_there_is_no_number(
+    run: RunCommand, sweeps: FakeSweeps, state: str, alive: bool, words: str | None
+) -> None:
+    record = SWEEP.model_copy(update={"state": state})
+    sweeps.answers["status"] = dataclasses.replace(RUNNING, sweep=record, alive=alive, time_left_s=None)
+    assert facts(run("status", "mine", "--storage", "my sweeps").stdout).get("time left") == words
+
+
+def test_a_status_without_scores_steps_or_a_known_spec_says_so(run: RunCommand, sweeps: FakeSweeps) -> None:
+    sweeps.answers["status"] = SweepStatus(SWEEP, {}, alive=False)
+    told = facts(run("status", "mine").stdout)
+    assert told["best so far"] == "no evaluation yet"
+    assert told["progress"] == "0 env steps"
+    assert told["trials"] == "2: none"
+    assert "speed" not in told
 
 
 def test_an_empty_storage_is_no_error(run: RunCommand, sweeps: FakeSweeps) -> None:

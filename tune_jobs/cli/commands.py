@@ -114,13 +114,13 @@ def list_command(*, storage: str | None, as_json: bool) -> None:
 @storage_option
 @json_option
 def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
-    """Say how far a sweep is."""
+    """Say how far a sweep is: its env steps, the best so far, and the time that is left."""
     from tune_jobs.cli import output as cli_output
     from tune_jobs.sweeps import verbs as sweeps
 
     with stdout_for(as_json=as_json):
         state = sweeps.status(sweep, storage=storage)
-    cli_output.show_status(state, as_json=as_json)
+    cli_output.show_status(state, storage=storage, as_json=as_json)
 
 
 @cli.command()

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from analysis.records import BestRecord, EvaluationRecord, TrialRecord, TrialStatus
     from tune_jobs.spec.file import Preset
+    from tune_jobs.sweeps.status import BestSoFar
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
 # Derived values, so that readers of the JSON need not compute them.
@@ -61,7 +62,7 @@ def print_json(value: Any) -> None:
 
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
     """Print the result of a launch, resume or extend, and the paths of its files."""
-    at = "" if storage is None else f" --storage {shlex.quote(storage)}"
+    at = _storage_option(storage)
     if result.sweep.address is not None:
         at += f" --address {shlex.quote(result.sweep.address)}"
     how_to_resume = f"tune-jobs resume {shlex.quote(result.sweep.name)}{at}"
@@ -84,6 +85,10 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
         done = result.sweep.state == "completed"
         kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Continue with"
         click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
+
+
+def _storage_option(storage: str | None) -> str:
+    return "" if storage is None else f" --storage {shlex.quote(storage)}"
 
 
 def _print_trial_counts(console: Console, trials: Sequence[TrialRecord]) -> None:
@@ -128,18 +133,64 @@ def _local_time(unix_time: float) -> str:
         return PLAIN_NONE
 
 
-def show_status(status: SweepStatus, *, as_json: bool) -> None:
-    """Print how far a sweep is."""
+def show_status(status: SweepStatus, *, storage: str | None = None, as_json: bool) -> None:
+    """Print how far a sweep is, what is best so far, and how long it will take."""
     if as_json:
         print_json(status)
         return
     facts = {
         "sweep": status.sweep.name,
         "state": _state(status),
-        "trials": f"{status.sweep.num_trials}: {_counts(status)}",
-        "run time": duration(status.sweep.run_time_s, none=PLAIN_NONE),
+        "progress": _progress(status),
+        "trials": f"{status.sweep.num_trials:,}: {_counts(status)}",
+        "best so far": _best_so_far(status.best),
+        "speed": "" if status.env_steps_per_s is None else f"{status.env_steps_per_s:,.0f} env steps/s",
+        "time left": _time_left(status, storage),
+        "run time": _run_time(status),
     }
-    print_facts(make_console(), facts)
+    print_facts(make_console(), {name: text for name, text in facts.items() if text})
+
+
+def _progress(status: SweepStatus) -> str:
+    if status.max_env_steps is None:
+        return counted(status.num_env_steps, "env step")
+    if status.num_env_steps >= status.max_env_steps:
+        return f"100 %: {counted(status.num_env_steps, 'env step')}"
+    # Rounded down, so that 100 % means done.
+    share = 100 * status.num_env_steps // status.max_env_steps
+    return f"{share} %: {status.num_env_steps:,} of at most {counted(status.max_env_steps, 'env step')}"
+
+
+def _best_so_far(best: BestSoFar | None) -> str:
+    if best is None:
+        return "no evaluation yet"
+    point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
+    where = f"{best.trial_id}, at {best.num_env_steps:,} env steps"
+    return f"{return_text(best.score)}  {point or 'no searched values'}  ({where})"
+
+
+def _time_left(status: SweepStatus, storage: str | None) -> str:
+    if not status.alive:
+        if status.sweep.state == "completed":
+            return ""
+        verb = "starts" if status.sweep.state == "created" else "continues"
+        where = shlex.quote(status.sweep.name) + _storage_option(storage)
+        return f"nothing runs; `tune-jobs resume {where}` {verb} it"
+    if status.sweep.state == "completed":
+        return "the trials are done; the best is being confirmed and filmed, and the report written"
+    if status.time_left_s is None:
+        return "not known before the first env steps are reported"
+    return f"about {duration(status.time_left_s, tenths=False, none=PLAIN_NONE)}"
+
+
+def _run_time(status: SweepStatus) -> str:
+    before, started = status.sweep.run_time_s, status.sweep.started_at
+    if not status.alive or status.sweep.state == "completed":
+        return duration(before, none=PLAIN_NONE)
+    if before == 0 and started is not None:
+        return duration(max(0.0, time.time() - started), tenths=False, none=PLAIN_NONE)
+    # When this run began is not recorded.
+    return f"{duration(before, none=PLAIN_NONE)} before this run"
 
 
 def _state(status: SweepStatus) -> str:

@@ -32,6 +32,11 @@ def max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     return min(spec.stop.num_env_steps - 1 + iteration, spec.stop.num_iterations * iteration)
 
 
+def planned_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
+    """Return the env steps after which a trial ends at the latest; its last iteration may go beyond."""
+    return min(spec.stop.num_env_steps, spec.stop.num_iterations * _wanted_env_steps(values))
+
+
 def max_iterations(spec: SweepSpec, values: Hyperparams) -> int:
     """Return the most iterations of one trial."""
     return min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
