@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from policies.errors import CannotRunError, TuneJobsError, said_by
+from tune_jobs.cli.completion import complete_folders, complete_sources, complete_sweeps
 
 if TYPE_CHECKING:
     from tune_jobs.sweeps.outcome import SweepResult
@@ -122,8 +123,11 @@ json_option = click.option(
     help="Print one JSON document on standard output.",
 )  # fmt: skip
 storage_option = click.option(
-    "--storage", metavar="FOLDER", help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]"
-)
+    "--storage", metavar="FOLDER", shell_complete=complete_folders,
+    help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]",
+)  # fmt: skip
+sweep_argument = click.argument("sweep", shell_complete=complete_sweeps)
+source_argument = click.argument("source", shell_complete=complete_sources)
 num_episodes_option = click.option(
     "--num-episodes", type=click.IntRange(1, 2**18), default=100, show_default=True, help="Greedy episodes."
 )
@@ -133,7 +137,9 @@ set_option = click.option(
 )  # fmt: skip
 
 
-def _allow(_: click.Context, __: click.Parameter, names: tuple[str, ...]) -> None:
+def _allow(ctx: click.Context, _: click.Parameter, names: tuple[str, ...]) -> None:
+    if ctx.resilient_parsing:
+        return  # a shell completes the line
     from policies.envs.modules import allow_modules
 
     allow_modules(names)

@@ -25,9 +25,12 @@ from tune_jobs.cli.base import (
     result_of,
     run_options,
     set_option,
+    source_argument,
     stdout_for,
     storage_option,
+    sweep_argument,
 )
+from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -53,7 +56,7 @@ def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's sign
 
 
 @cli.command()
-@click.argument("spec")
+@click.argument("spec", shell_complete=complete_specs)
 @set_option
 @click.option(
     "--name", help="Name of the sweep.  [default: SPEC's `name`, else the file's or preset's, with a number if taken]"
@@ -110,7 +113,7 @@ def list_command(*, storage: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @storage_option
 @json_option
 def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
@@ -124,7 +127,7 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @click.option("--sort", metavar="COLUMN", help="Sort by a column, such as score or lr; scores best first.")
 @click.option("--top", type=click.IntRange(min=1), metavar="N", help="The first N only; without --sort, by score.")
 @storage_option
@@ -143,7 +146,7 @@ def trials(*, sweep: str, sort: str | None, top: int | None, storage: str | None
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @click.option("--retry-failed", is_flag=True, help="Run the failed trials again, too.")
 @run_options
 @click.pass_context
@@ -164,7 +167,7 @@ def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: b
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @click.option("--num-samples", type=click.IntRange(min=1), required=True, help="How many more samples to run.")
 @run_options
 @click.pass_context
@@ -183,7 +186,7 @@ def extend(
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @storage_option
 @json_option
 def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
@@ -197,7 +200,7 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @num_episodes_option
 @allow_module_option
 @storage_option
@@ -213,7 +216,7 @@ def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -
 
 
 @cli.command()
-@click.argument("source")
+@source_argument
 @num_episodes_option
 @click.option("--first-seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the first episode; they count up.")
 @env_option
@@ -248,7 +251,7 @@ def evaluate(
 
 
 @cli.command()
-@click.argument("source")
+@source_argument
 @click.option("--output", metavar="PATH", help="File to write, as .mp4 and .gif; or a folder, ending with /.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
@@ -285,7 +288,7 @@ def _check_baseline(source: str, env_id: str | None) -> None:
 
 
 @cli.command()
-@click.argument("sweep")
+@sweep_argument
 @allow_module_option
 @storage_option
 @json_option
@@ -300,7 +303,7 @@ def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=complete_presets)
 @json_option
 def presets(*, name: str | None, as_json: bool) -> None:
     """List the presets, or print the sweep file of one."""
@@ -314,7 +317,7 @@ def presets(*, name: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("algorithm", required=False)
+@click.argument("algorithm", required=False, shell_complete=complete_algorithms)
 @json_option
 def hyperparams(*, algorithm: str | None, as_json: bool) -> None:
     """List the hyperparameters of ppo, dqn, random or constant, with the names that other libraries have for them.

@@ -55,6 +55,11 @@ def list_presets() -> list[Preset]:
     return [read_preset(name, file.read_text(encoding="utf-8")) for name, file in _preset_files().items()]
 
 
+def preset_names() -> list[str]:
+    """Return the names of the presets, in order, without reading them."""
+    return list(_preset_files())
+
+
 def read_preset(name: str, text: str) -> Preset:
     """Read a preset from its file's text; fields that `about` leaves out are empty.
 
