@@ -102,6 +102,13 @@ def setting_text(value: Any) -> str:
     return PLAIN_NONE if value is None else str(value)
 
 
+def short_text(value: Any) -> str:
+    """Return a hyperparameter's text where there is little room: three significant digits; 64x64 for lists."""
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "x".join(map(short_text, value)) if isinstance(value, list | tuple) else setting_text(value)
+
+
 def return_text(value: float | None, *, none: str = NONE) -> str:
     """Format a return or a score, with one decimal."""
     return none if value is None else f"{value:z.1f}"

@@ -1,7 +1,10 @@
 """What a person sees of a running sweep, on a terminal of known width and without one."""
 
+import contextlib
 import io
 import os
+import pty
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,14 +17,20 @@ from rich.console import Console
 from test_monitor import make_monitor, make_trial
 
 from tune_jobs.sweeps import live_table as live
+from tune_jobs.sweeps import live_view
 from tune_jobs.sweeps.monitor import SweepMonitor
 
 
-def screen(monitor: SweepMonitor, width: int = 120) -> str:
+def screen(monitor: SweepMonitor, width: int = 120, height: int | None = None) -> str:
     """The table as text."""
     console = Console(file=io.StringIO(), width=width, color_system=None, force_terminal=True, legacy_windows=False)
-    console.print(live.render(monitor))
+    console.print(live.render(monitor, width, height))
     return cast("str", cast("Any", console.file).getvalue())
+
+
+def rows(text: str) -> list[list[str]]:
+    """The rows of trials, each as its words."""
+    return [words for words in map(str.split, text.splitlines()) if len(words) > 1 and words[1].startswith("t0")]
 
 
 @pytest.fixture
@@ -41,41 +50,121 @@ def running() -> tuple[SweepMonitor, FakeClock]:
 
 
 def test_the_table_tells_how_far_it_is_what_is_best_and_what_runs(running: tuple[SweepMonitor, FakeClock]) -> None:
-    text = screen(running[0])
+    text = screen(running[0], 140)
     lines = text.splitlines()
-    assert "mine" in lines[0]
-    assert "2 of 6 trials" in lines[0]
-    for word in ("2 running", "1 completed", "1 failed", "2 pending"):
-        assert word in lines[0]
+    # Of 50,000 and 10 env steps that ended trials took, and 50,000 of each of the other four.
+    assert lines[0].split()[0] == "mine"
+    assert lines[0].split()[-2:] == ["24", "%"]
+    assert lines[1].split("   ")[-1].strip() == "2 running  1 completed  1 failed  2 pending"
+    assert "2 of 6 ended" in lines[1]
     assert "stopped" not in text  # what there is none of
-    best = next(line for line in lines if line.startswith("best so far"))
-    assert "195.2" in best
-    assert "lr 0.001" in best
-    assert "t0000, at 50,000 env steps" in best
-    assert "62,355 env steps in all" in text
-    assert "1 min 15 s" in text
-    assert "left: about" in text
-    first = next(line for line in lines if line.startswith("t0002"))
-    assert first.split() == ["t0002", "lr", "0.003", "12,345", "33.0", "-1.5", "2,469"]
-    second = next(line for line in lines if line.startswith("t0003"))
-    assert second.split() == ["t0003", "lr", "0.004", "0", "-", "-"]
-    assert not any(line.startswith(("t0000", "t0001", "t0004")) for line in lines)
+    assert "62,355 of at most 250,010" in lines[2]
+    assert "1 min 15 s" in lines[3]
+    assert "left: about" in lines[3]
+    assert lines[4].rstrip().split("  ")[-2:] == ["lr 0.001", "(t0000, at 50,000 env steps)"]
+    assert re.split("  +", lines[5].strip()) == [
+        "rank", "trial", "score", "status", "env steps", "lr", "training", "evaluation", "env steps/s",
+    ]  # fmt: skip
+    assert rows(text) == [
+        ["1", "t0000", "195.2", "completed", "50,000", "0.001", "-", "-"],
+        ["2", "t0002", "20.0", "running", "12,345", "0.003", "33.0", "-1.5", "2,469"],
+        ["-", "t0003", "-", "running", "0", "0.004", "-", "-"],
+    ]
+
+
+def test_the_bar_moves_by_env_steps() -> None:
+    monitor = make_monitor(make_trial(0), make_trial(1), cap=1_000)
+    filled = [screen(monitor).splitlines()[0]]
+    for steps in (400, 800):
+        monitor.update(make_trial(0, "running", steps=steps))
+        filled.append(screen(monitor).splitlines()[0])
+    assert [line.split()[-2] for line in filled] == ["0", "20", "40"]
+    lengths = [line.count("━") for line in filled]
+    assert lengths[0] == 0 < lengths[1] < lengths[2]
 
 
 def test_before_the_first_score_and_rate_it_says_so() -> None:
     text = screen(make_monitor(make_trial(0)))
     assert "no evaluation yet" in text
-    assert "0 of 1 trials" in text
-    assert "left: about ?" in text
+    assert "0 of 1 ended" in text
+    assert "left: not known yet" in text
 
 
-def test_many_running_trials_do_not_fill_the_screen() -> None:
+def test_what_is_done_before_the_trials_train_is_shown_until_the_first_runs() -> None:
+    monitor = make_monitor(make_trial(0))
+    monitor.phase = "starting Ray"
+    assert "starting Ray ..." in screen(monitor)
+    assert live.summary_line(monitor) == "mine: 0 s; starting Ray"
+    monitor.update(make_trial(0, "pending"))
+    assert "starting Ray" in screen(monitor)
+    monitor.update(make_trial(0, "running"))
+    assert "starting Ray" not in screen(monitor)
+    assert "1 running" in live.summary_line(monitor)
+
+
+def test_the_leader_is_shown_however_many_run() -> None:
+    """It ended long ago, and is the last one; of those that run, the best ones are shown."""
+    monitor = make_monitor(*(make_trial(index) for index in range(40)))
+    monitor.update(make_trial(39, "completed", steps=900, score=99.0))
+    monitor.update(make_trial(38, "completed", steps=900, score=98.0))
+    for index in range(30):
+        monitor.update(make_trial(index, "running", steps=10, score=float(index)))
+    text = screen(monitor)
+    assert [row[1] for row in rows(text)] == ["t0039", *(f"t{index:04d}" for index in range(29, 18, -1))]
+    assert [row[0] for row in rows(text)] == ["1", *map(str, range(3, 14))]
+    assert "and 19 more running" in text
+
+
+def test_a_low_terminal_shows_fewer_trials_and_still_the_leader() -> None:
     monitor = make_monitor(*(make_trial(index) for index in range(40)))
     for index in range(30):
-        monitor.update(make_trial(index, "running"))
-    text = screen(monitor)
-    assert "and 18 more" in text
-    assert sum(line.startswith("t00") for line in text.splitlines()) == 12
+        monitor.update(make_trial(index, "running", steps=10, score=float(index)))
+    for height in range(3, 30):
+        text = screen(monitor, height=height)
+        assert rows(text)[0][1] == "t0029"
+        assert len(text.splitlines()) <= max(height, 8)
+
+
+def test_when_few_run_the_best_of_the_others_are_shown_by_rank() -> None:
+    monitor = make_monitor(*(make_trial(index) for index in range(20)))
+    for index in range(18):
+        monitor.update(make_trial(index, "completed", steps=10, score=float(index)))
+    monitor.update(make_trial(18, "running", steps=10, score=-7.0))
+    monitor.update(make_trial(19, "running", steps=5))
+    assert [row[1] for row in rows(screen(monitor))] == [
+        *(f"t{index:04d}" for index in range(17, 7, -1)), "t0018", "t0019",
+    ]  # fmt: skip
+
+
+def test_trials_of_one_point_have_its_rank_and_the_leader_is_of_the_best_point() -> None:
+    monitor = make_monitor(*(make_trial(index, point_index=index // 2) for index in range(4)))
+    for index, score in enumerate([100.0, 0.0, 60.0, 70.0]):
+        monitor.update(make_trial(index, "completed", steps=10, score=score, point_index=index // 2))
+    assert [row[:3] for row in rows(screen(monitor))] == [
+        ["1", "t0003", "70.0"], ["1", "t0002", "60.0"], ["2", "t0000", "100.0"], ["2", "t0001", "0.0"],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 140, 200])
+def test_ids_and_scores_are_whole_on_every_terminal(running: tuple[SweepMonitor, FakeClock], width: int) -> None:
+    text = screen(running[0], width)
+    assert all(len(line) <= width for line in text.splitlines())
+    assert [row[1:3] for row in rows(text)] == [["t0000", "195.2"], ["t0002", "20.0"], ["t0003", "-"]]
+    assert "…" not in text
+
+
+def test_values_have_three_digits_and_those_that_differ_come_first() -> None:
+    points = [{"gamma": 0.99, "lr": 0.00123456 * (1 + index), "hidden_sizes": [64, 32]} for index in range(2)]
+    trials = [
+        make_trial(index, "running", steps=5, score=1.0).model_copy(update={"point": point})
+        for index, point in enumerate(points)
+    ]
+    text = screen(make_monitor(*trials), 80)
+    assert ["rank", "trial", "score", "status", "env", "steps", "lr", "gamma", "hidden_sizes"] in [
+        line.split() for line in text.splitlines()
+    ]
+    assert [row[4:] for row in rows(text)] == [["5", "0.00123", "0.99", "64x32"], ["5", "0.00247", "0.99", "64x32"]]
+    assert "lr 0.00123, hidden_sizes 64x32" in text.replace("gamma 0.99, ", "")
 
 
 def test_who_stops_it_is_told_what_happens(running: tuple[SweepMonitor, FakeClock]) -> None:
@@ -83,13 +172,6 @@ def test_who_stops_it_is_told_what_happens(running: tuple[SweepMonitor, FakeCloc
     assert "Ctrl-C again" not in screen(monitor)
     monitor.stopping = True
     assert "Stopping: the running trials save a checkpoint. Ctrl-C again ends them now." in screen(monitor)
-
-
-def test_a_narrow_terminal_still_shows_the_numbers(running: tuple[SweepMonitor, FakeClock]) -> None:
-    text = screen(running[0], width=80)
-    assert all(len(line) <= 80 for line in text.splitlines())
-    assert "12,345" in text
-    assert "195.2" in text
 
 
 def test_values_are_no_markup() -> None:
@@ -108,12 +190,22 @@ def test_a_point_without_values_is_named() -> None:
 def test_a_line_for_logs_tells_the_same(running: tuple[SweepMonitor, FakeClock]) -> None:
     line = live.summary_line(running[0])
     assert "\n" not in line
-    words = ("mine: 1 min 15 s", "2 running", "1 failed", "62,355 env steps", "best 195.2 (t0000: lr 0.001)", "left")
+    words = (
+        "mine: 1 min 15 s; 24 %, 62,355 env steps;", "2 running", "1 failed", "best 195.2 (t0000: lr 0.001)", "left",
+    )  # fmt: skip
     for word in words:
         assert word in line
     line = live.summary_line(make_monitor(make_trial(0)))
     assert "best" not in line
     assert "left" not in line
+
+
+def test_a_line_stays_short_however_many_values_there_are() -> None:
+    point = {f"hyperparameter_{number}": 0.123456 for number in range(20)}
+    trial = make_trial(0, "running", steps=5, score=1.0).model_copy(update={"point": point})
+    line = live.summary_line(make_monitor(trial))
+    assert "hyperparameter_0 0.123, hyperparameter_1 0.123, ..." in line
+    assert len(line) < 160
 
 
 # What happens to the real streams has to be seen from outside of the process.
@@ -122,7 +214,7 @@ import os, sys
 sys.path.insert(0, {here!r})
 from pathlib import Path
 from test_monitor import make_monitor, make_trial
-from tune_jobs.sweeps.live_table import shown
+from tune_jobs.sweeps.live_view import shown
 with shown(make_monitor(make_trial(0)), {progress!r}, Path({log!r})):
     print("printed by a library")
     print("a library's warning", file=sys.stderr)
@@ -149,7 +241,7 @@ def test_nothing_else_is_on_the_terminal(tmp_path: Path, progress: str, lines: i
 def test_the_plans_notes_come_first(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], progress: str, first: str
 ) -> None:
-    with live.shown(make_monitor(make_trial(0)), progress, tmp_path / "driver.log", ["one", "two"]):
+    with live_view.shown(make_monitor(make_trial(0)), progress, tmp_path / "driver.log", ["one", "two"]):
         pass
     assert capfd.readouterr().err.startswith(first)
     assert progress == "auto" or not capfd.readouterr().err
@@ -157,7 +249,7 @@ def test_the_plans_notes_come_first(
 
 def test_streams_come_back_after_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     def fail() -> None:
-        with live.shown(make_monitor(make_trial(0)), "none", tmp_path / "driver.log"):
+        with live_view.shown(make_monitor(make_trial(0)), "none", tmp_path / "driver.log"):
             os.write(1, b"hidden")
             raise ZeroDivisionError
 
@@ -165,3 +257,63 @@ def test_streams_come_back_after_an_error(tmp_path: Path, capfd: pytest.CaptureF
         fail()
     os.write(1, b"seen")
     assert capfd.readouterr().out == "seen"
+
+
+def test_what_is_left_on_the_screen_is_no_phase(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    monitor = make_monitor(make_trial(0))
+    with live_view.shown(monitor, "auto", tmp_path / "driver.log"):
+        monitor.phase = "ending Ray"
+    assert capfd.readouterr().err == "mine: 0 s; 0 %, 0 env steps; 1 pending\n"
+
+
+FINISHING = """
+import sys, time
+from tune_jobs.sweeps import live_view
+live_view._LINE_INTERVAL_S = float(sys.argv[1])
+with live_view.working("mine", "filming the best policy", sys.argv[2]):
+    print("a warning", file=sys.stderr, flush=True)
+    for _ in sys.stdin:
+        pass
+"""
+
+
+def finishing(interval: str, progress: str, stderr: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-c", FINISHING, interval, progress], stdin=subprocess.PIPE, stderr=stderr,
+        start_new_session=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("progress", ["auto", "none"])
+def test_without_a_terminal_finishing_is_told_only_if_it_takes_long(progress: str) -> None:
+    with finishing("1000", progress, subprocess.PIPE) as process:
+        assert process.communicate()[1] == b"a warning\n"
+
+
+def test_without_a_terminal_finishing_that_takes_long_is_told_in_lines() -> None:
+    with finishing("0.05", "auto", subprocess.PIPE) as process:
+        assert process.stderr is not None
+        lines = [process.stderr.readline().decode() for _ in range(3)]
+        process.communicate()
+    assert lines.pop(lines.index("a warning\n"))
+    assert all(line.startswith("mine: filming the best policy, 0 s") or " s" in line for line in lines)
+
+
+def test_on_a_terminal_finishing_is_shown_and_leaves_nothing() -> None:
+    ours, theirs = pty.openpty()
+    with finishing("1000", "auto", theirs) as process:
+        os.close(theirs)
+        seen = b""
+        while b"filming the best policy ..." not in seen or b"a warning" not in seen:
+            seen += os.read(ours, 1_000)
+        assert process.stdin is not None
+        process.stdin.close()
+        rest = b""
+        with contextlib.suppress(OSError):  # the terminal's end, on Linux
+            while more := os.read(ours, 1_000):
+                rest += more
+    os.close(ours)
+    assert process.returncode == 0
+    # The line is deleted at the end, and the cursor is shown again.
+    assert rest.rfind(b"\x1b[2K") > rest.rfind(b"filming")
+    assert rest.rfind(b"\x1b[?25h") >= 0

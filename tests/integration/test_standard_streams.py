@@ -19,7 +19,7 @@ for number in json.loads(sys.argv[1]):
 sys.stdout = None
 
 from policies.guard.guarded import check_env
-from tune_jobs.sweeps.live_table import quiet
+from tune_jobs.process.streams import quiet
 from tune_jobs.process.state import given_back
 
 said = {"env": check_env("CartPole-v1", {}).env_id}

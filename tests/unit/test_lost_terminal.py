@@ -11,10 +11,10 @@ import pytest
 SCRIPT = """
 import os, sys
 from pathlib import Path
-from tune_jobs.sweeps.live_table import shown
+from tune_jobs.sweeps.live_view import shown
 from tune_jobs.sweeps.monitor import SweepMonitor
 
-monitor = SweepMonitor("mine", [], max_env_steps_per_trial=1, max_concurrent=1)
+monitor = SweepMonitor("mine", [], caps={}, max_concurrent=1)
 with shown(monitor, "auto", Path(sys.argv[1])):
     os.write(1, b"what a library says")
     sys.stdin.read()

@@ -40,7 +40,11 @@ def make_monitor(
     *records: TrialRecord, clock: FakeClock | None = None, cap: int = 1_000, max_concurrent: int = 2
 ) -> SweepMonitor:
     return SweepMonitor(
-        "mine", records, max_env_steps_per_trial=cap, max_concurrent=max_concurrent, clock=clock or FakeClock()
+        "mine",
+        records,
+        caps=dict.fromkeys([record.trial_id for record in records], cap),
+        max_concurrent=max_concurrent,
+        clock=clock or FakeClock(),
     )
 
 

@@ -129,5 +129,5 @@ def test_a_process_does_not_tell_what_there_is_no_field_for() -> None:
 
 def test_every_status_is_shown() -> None:
     statuses = set(get_args(TrialStatus))
-    assert set(live_table._STATUS_STYLES) == set(output.STATUS_ORDER) == statuses
+    assert set(live_table.STATUS_STYLES) == set(output.STATUS_ORDER) == statuses
     assert statuses > FINISHED

@@ -40,6 +40,13 @@ def standard_error() -> int:
     return _shown_on[-1].fileno() if _shown_on else 2
 
 
+@contextlib.contextmanager
+def patient_stream() -> Iterator[IO[str]]:
+    """Yield a stream to the real standard error that drops what cannot be written there."""
+    with _PatientStream(os.fdopen(os.dup(standard_error()), "wb"), encoding="utf-8") as stream:
+        yield stream
+
+
 def say_at_last(text: str) -> None:
     """Write a text to the real standard error, in a process that is about to end."""
     for stream in _shown_on[-1:]:

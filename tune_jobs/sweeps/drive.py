@@ -27,6 +27,7 @@ from tune_jobs.store.closing import close_run
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.transitions import pending_record
+from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult
 
@@ -181,11 +182,11 @@ def _run_sweep(
         record = store.read_record()
         started = record.started_at or time.time()
         store.write_record(record.model_copy(update={"state": "running", "started_at": started, "ended_at": None}))
-        spec = stored_spec(record)
+        spec, trials = stored_spec(record), store.read_trials()
         monitor = SweepMonitor(
             store.name,
-            store.read_trials(),
-            max_env_steps_per_trial=spec.stop.num_env_steps,
+            trials,
+            caps=caps_of(spec, trials),
             max_concurrent=plan.max_concurrent,
         )
         try:
@@ -200,7 +201,7 @@ def _run_sweep(
     result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
     if interrupted or not finish:
         return result
-    return replace(result, interrupted=True) if current().came else _finished(store, result)
+    return replace(result, interrupted=True) if current().came else _finished(store, result, progress)
 
 
 def _run_trials(
@@ -214,13 +215,14 @@ def _run_trials(
     machine: Machine | None,
     progress: str,
 ) -> None:
-    from tune_jobs.sweeps.live_table import shown
+    from tune_jobs.sweeps.live_view import shown
 
     def ask() -> None:
         monitor.stopping = True
         store.request_stop()
 
     started = time.time()
+    monitor.phase = "starting Ray" if address is None else f"joining the Ray cluster at {address}"
     with _noted(), shown(monitor, progress, store.driver_log, plan.notes):
         from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
@@ -234,6 +236,7 @@ def _run_trials(
             run=run.token,
         )
         with current().asking(ask), connected(address, machine) as connection:
+            monitor.phase = "starting the trials"
             try:
                 if connection.is_client:
                     from tune_jobs.ray_tune.driver_actor import run_trials_remotely
@@ -246,6 +249,7 @@ def _run_trials(
                 if not current().came:
                     raise
             finally:
+                monitor.phase = "ending Ray" if address is None else "leaving the Ray cluster"
                 # Done before Ray is shut down: if a part of Ray died, that takes long, and may end this process.
                 with current().shielded(), run.held():
                     close_run(store, started)
@@ -267,9 +271,9 @@ def _close_if_open(store: Sweep) -> None:
             close_run(store)
 
 
-def _finished(store: Sweep, result: SweepResult) -> SweepResult:
+def _finished(store: Sweep, result: SweepResult, progress: str = "none") -> SweepResult:
     """Choose, confirm and film the winner, and write the report; what can't be made is noted, and raises no error."""
-    made = _Finish(store)
+    made = _Finish(store, progress)
     with _noted():
         made.make_all()
     return replace(
@@ -286,8 +290,9 @@ def _finished(store: Sweep, result: SweepResult) -> SweepResult:
 class _Finish:
     """Makes what comes after the trials, as far as possible."""
 
-    def __init__(self, store: Sweep) -> None:
+    def __init__(self, store: Sweep, progress: str) -> None:
         self._store = store
+        self._progress = progress
         self.best: BestRecord | None = None
         self._why: TuneJobsError | None = None
         self.artifacts: dict[str, Path] = {}
@@ -307,22 +312,29 @@ class _Finish:
         from tune_jobs.sweeps import conclude as finish
 
         try:
-            self.best = finish.choose_best(self._store)
+            with self._working("confirming the best policy"):
+                self.best = finish.choose_best(self._store)
             self.artifacts["policy"] = self._store.best_policy_path
         except TuneJobsError as error:
             self._why = error
         self.failed = self._why is not None
         if self.best is not None:
-            self._attempt("video", lambda: finish.make_videos(self._store))
-        self._attempt("report", lambda: {"report": finish.make_report(self._store, self._why)})
+            self._attempt("video", "filming the best policy", lambda: finish.make_videos(self._store))
+        self._attempt("report", "writing the report", lambda: {"report": finish.make_report(self._store, self._why)})
 
-    def _attempt(self, what: str, make: Callable[[], dict[str, Path]]) -> None:
+    def _working(self, doing: str) -> AbstractContextManager[None]:
+        from tune_jobs.sweeps.live_view import working
+
+        return working(self._store.name, doing, self._progress)
+
+    def _attempt(self, what: str, doing: str, make: Callable[[], dict[str, Path]]) -> None:
         # Another process may have asked to stop, which ends this too.
         self.stopped = self.stopped or self._store.stop_requested()
         if self.stopped:
             return
         try:
-            self.artifacts.update(make())
+            with self._working(doing):
+                self.artifacts.update(make())
         except TuneJobsError as error:
             self.notes.append(f"No {what}: {error}")
             # Other errors are expected, as not every environment can be drawn.

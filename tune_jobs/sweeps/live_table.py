@@ -1,89 +1,123 @@
-"""Show a running sweep: a table that is redrawn on a terminal, or else a line from time to time."""
+"""Draw a running sweep: as a table for a terminal, or in one line."""
 
 from __future__ import annotations
 
-import contextlib
-import threading
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import IO
+import itertools
+from collections.abc import Sequence
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
+from rich.console import Group, RenderableType
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import Selection
-from analysis.wording import PLAIN_NONE, duration, return_text, setting_text
-from tune_jobs.process.streams import quiet
-from tune_jobs.sweeps.monitor import SweepMonitor
+from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
+from tune_jobs.sweeps.columns import fit
+from tune_jobs.sweeps.monitor import Row, SweepMonitor
 
-_REFRESH_PER_S = 4
-_LINE_INTERVAL_S = 10.0
-_STATUS_STYLES: dict[TrialStatus, str] = {
+STATUS_STYLES: dict[TrialStatus, str] = {
     "running": "bold cyan", "completed": "green", "stopped": "yellow", "failed": "bold red", "paused": "magenta",
     "pending": "dim",
 }  # fmt: skip
-_MAX_RUNNING_ROWS = 12
-
-_shares_terminal = False
-
-
-def share_terminal() -> None:
-    """Print lines on a terminal too from now on, because another process writes there and would break a table."""
-    global _shares_terminal  # noqa: PLW0603 (a process has one standard error)
-    _shares_terminal = True
+_MAX_ROWS = 12
+_ROOM_FOR_OTHERS = 9
+"""Lines of a terminal that are not for trials: the facts above them, their titles, and what follows."""
+_GAP = 2
+_MAX_MEASURED = 200
 
 
-def describe_point(record: TrialRecord) -> str:
-    """Describe a trial's sampled values in one line."""
+def describe_point(record: TrialRecord, most: int | None = None) -> str:
+    """Describe a trial's sampled values in one line.
+
+    Args:
+        record: The trial.
+        most: About how many characters it may have; None: all values are named.
+    """
     if not record.has_point:
         return "chosen at its start"
-    return ", ".join(f"{name} {setting_text(value)}" for name, value in record.point.items()) or "no searched values"
+    text = ""
+    for name, value in record.point.items():
+        more = f"{text}{', ' if text else ''}{name} {short_text(value)}"
+        if most is not None and text and len(more) > most:
+            return f"{text}, ..."
+        text = more
+    return text or "no searched values"
 
 
-def render(monitor: SweepMonitor) -> RenderableType:
-    """Return the live table of a sweep."""
-    counts = monitor.counts()
-    total = len(monitor.records)
-    finished = sum(count for status, count in counts.items() if status in FINISHED)
-    head = Table.grid(padding=(0, 2))
-    head.add_row(
-        Text(monitor.name, style="bold"),
-        ProgressBar(total=max(1, total), completed=finished, width=24),
-        f"{finished} of {total} trials",
-        _status_line(counts),
-    )
-    parts: list[RenderableType] = [head, _facts(monitor)]
-    if counts.get("running"):
-        parts.append(_running(monitor))
+def render(monitor: SweepMonitor, width: int = 120, height: int | None = None) -> RenderableType:
+    """Return the live table of a sweep.
+
+    Args:
+        monitor: The sweep.
+        width: Characters of a line; of trials, as many columns are shown as fit.
+        height: Lines of the terminal; None: any number.
+    """
+    parts: list[RenderableType] = [_head(monitor, width), _facts(monitor)]
+    most = _MAX_ROWS if height is None else max(1, min(_MAX_ROWS, height - _ROOM_FOR_OTHERS))
+    rows, left_out = monitor.rows(most)
+    if rows:
+        parts.append(_trials(monitor, rows, width))
+    if left_out:
+        parts.append(Text(f"and {left_out:,} more running", "dim"))
     if monitor.stopping:
         parts.append(Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow"))
     return Group(*parts)
 
 
-def _status_line(counts: dict[TrialStatus, int]) -> Text:
-    words = [
-        Text(f"{counts[status]} {status}", style=style)
-        for status, style in _STATUS_STYLES.items()
-        if counts.get(status)
-    ]
-    return Text("  ").join(words)
+def _head(monitor: SweepMonitor, width: int) -> RenderableType:
+    progress = monitor.progress()
+    head = Table.grid(padding=(0, 2))
+    head.add_column(no_wrap=True)
+    head.add_column()
+    head.add_column(no_wrap=True)
+    total = max(1, progress.max_env_steps)
+    head.add_row(
+        Text(monitor.name, style="bold"),
+        ProgressBar(total=total, completed=progress.num_env_steps, width=max(8, min(40, width // 3))),
+        f"{100 * progress.num_env_steps // total} %",
+    )
+    return head
 
 
 def _facts(monitor: SweepMonitor) -> RenderableType:
     estimate = monitor.estimate()
-    left = "?" if estimate.time_left_s is None else duration(estimate.time_left_s, tenths=False, none=PLAIN_NONE)
-    rate = "?" if estimate.env_steps_per_s is None else f"{estimate.env_steps_per_s:,.0f}"
+    progress = monitor.progress()
     grid = Table.grid(padding=(0, 2))
+    counts = monitor.counts()
+    ended = sum(count for status, count in counts.items() if status in FINISHED)
+    grid.add_row("trials", Text(f"{ended:,} of {len(monitor.records):,} ended   ").append_text(_status_line(counts)))
+    steps = f"{progress.num_env_steps:,}"
+    if progress.num_env_steps < progress.max_env_steps:
+        steps += f" of at most {progress.max_env_steps:,}"
+    rate = "" if estimate.env_steps_per_s is None else f"   {estimate.env_steps_per_s:,.0f} a second"
+    grid.add_row("env steps", f"{steps}{rate}")
+    time = Text(duration(monitor.elapsed_s, tenths=False))
+    if monitor.phase:
+        time.append(f"   {monitor.phase} ...", "cyan")
+    else:
+        time.append(_time_left(monitor))
+    grid.add_row("time", time)
     grid.add_row("best so far", _best_text(monitor.best()))
-    grid.add_row("env steps/s", f"{rate}   ({monitor.num_env_steps:,} env steps in all)")
-    unfinished = any(record.status not in FINISHED for record in monitor.records.values())
-    time_left = f"   left: about {left}" if unfinished and not monitor.stopping else ""
-    grid.add_row("time", f"{duration(monitor.elapsed_s, tenths=False)}{time_left}")
     return grid
+
+
+def _time_left(monitor: SweepMonitor) -> str:
+    if monitor.stopping or all(record.status in FINISHED for record in list(monitor.records.values())):
+        return ""
+    seconds = monitor.estimate().time_left_s
+    if seconds is None:
+        return "   left: not known yet"
+    return f"   left: about {duration(seconds, tenths=False, none=PLAIN_NONE)}"
+
+
+def _status_line(counts: dict[TrialStatus, int]) -> Text:
+    words = [
+        Text(f"{counts[status]:,} {status}", style=style)
+        for status, style in STATUS_STYLES.items()
+        if counts.get(status)
+    ]
+    return Text("  ").join(words)
 
 
 def _best_text(best: Selection | None) -> Text:
@@ -97,100 +131,68 @@ def _best_text(best: Selection | None) -> Text:
     return text
 
 
-def _running(monitor: SweepMonitor) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_edge=False)
-    for column in ("trial", "values"):
-        table.add_column(column)
-    for column in ("env steps", "training return", "evaluation return", "env steps/s"):
-        table.add_column(column, justify="right")
-    running = [record for record in monitor.records.values() if record.status == "running"]
-    for record in running[:_MAX_RUNNING_ROWS]:
-        speed = record.num_env_steps / record.time_s if record.time_s else None
-        table.add_row(
-            record.trial_id,
-            describe_point(record),
-            f"{record.num_env_steps:,}",
-            return_text(record.training_return, none=PLAIN_NONE),
-            return_text(record.evaluation_return, none=PLAIN_NONE),
-            "" if speed is None else f"{speed:,.0f}",
-        )
-    if len(running) > _MAX_RUNNING_ROWS:
-        table.add_row(f"and {len(running) - _MAX_RUNNING_ROWS} more", "", "", "", "", "")
+def _trials(monitor: SweepMonitor, rows: Sequence[Row], width: int) -> Table:
+    """Return the table of some trials, with as many columns as fit, the most important ones first."""
+    # One width for the whole run, or columns would come and go while numbers grow.
+    measured = [row.trial for row in rows]
+    measured += itertools.islice(list(monitor.records.values()), _MAX_MEASURED)
+    texts = [{name: short_text(value) for name, value in trial.point.items()} for trial in measured]
+    names = list(dict.fromkeys(name for values in texts for name in values))
+    names.sort(key=lambda name: len({values.get(name) for values in texts}) == 1)
+    titles = ["rank", "trial", "score", "status", "env steps", *names, "training", "evaluation", "env steps/s"]
+    most_steps = f"{monitor.progress().max_env_steps // max(1, len(monitor.records)):,}"
+    widest = [
+        ["", "", "-100.0", "completed", most_steps, *(values.get(name, "") for name in names), "-100.0", "", ""]
+        for values in texts
+    ]
+    cells = [_cells(row, names) for row in rows]
+    fitting = fit(titles, [*cells, *widest], width, gap=_GAP, num_always=3)
+    table = Table(box=None, padding=(0, _GAP, 0, 0), pad_edge=False, header_style="dim", show_edge=False)
+    for position in fitting.shown:
+        is_text = titles[position] in ("trial", "status", *names)
+        table.add_column(titles[position], justify="left" if is_text else "right", no_wrap=True)
+    for row, texts_of_row in zip(rows, cells, strict=True):
+        style = "bold" if row is rows[0] and row.rank == 1 else ""
+        styles = ["", "", "", STATUS_STYLES[row.trial.status], *[""] * len(titles)]
+        # Passed as Text, because rich would read brackets as a style.
+        shown = (Text(texts_of_row[position], style=styles[position]) for position in fitting.shown)
+        table.add_row(*shown, style=style)
     return table
 
 
-def summary_line(monitor: SweepMonitor) -> str:
-    """Describe the state of a sweep in one line, for logs."""
-    counts = ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items()))
-    estimate = monitor.estimate()
-    best = monitor.best()
-    words = [
-        f"{monitor.name}: {duration(monitor.elapsed_s, tenths=False)}",
-        counts,
-        f"{monitor.num_env_steps:,} env steps",
+def _cells(row: Row, names: Sequence[str]) -> list[str]:
+    trial = row.trial
+    speed = trial.num_env_steps / trial.time_s if trial.status == "running" and trial.time_s else None
+    point = trial.point if trial.has_point else {}
+    return [
+        PLAIN_NONE if row.rank is None else str(row.rank),
+        trial.trial_id,
+        return_text(row.score, none=PLAIN_NONE),
+        trial.status,
+        f"{trial.num_env_steps:,}",
+        *(short_text(point.get(name)) for name in names),
+        return_text(trial.training_return, none=PLAIN_NONE),
+        return_text(trial.evaluation_return, none=PLAIN_NONE),
+        "" if speed is None else f"{speed:,.0f}",
     ]
+
+
+def summary_line(monitor: SweepMonitor) -> str:
+    """Describe the state of a sweep in one short line, for logs."""
+    elapsed = f"{monitor.name}: {duration(monitor.elapsed_s, tenths=False)}"
+    if monitor.phase:
+        return f"{elapsed}; {monitor.phase}"
+    progress = monitor.progress()
+    share = 100 * progress.num_env_steps // max(1, progress.max_env_steps)
+    words = [
+        elapsed,
+        f"{share} %, {counted(progress.num_env_steps, 'env step')}",
+        ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items())),
+    ]
+    best = monitor.best()
     if best is not None:
-        words.append(f"best {return_text(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial)})")
-    if estimate.time_left_s:
-        words.append(f"about {duration(estimate.time_left_s, tenths=False, none=PLAIN_NONE)} left")
+        words.append(f"best {return_text(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial, 60)})")
+    seconds = monitor.estimate().time_left_s
+    if seconds:
+        words.append(f"about {duration(seconds, tenths=False, none=PLAIN_NONE)} left")
     return "; ".join(words)
-
-
-class _Lines:
-    """Prints a line at regular intervals and at the end."""
-
-    def __init__(self, monitor: SweepMonitor, stream: IO[str]) -> None:
-        self._monitor = monitor
-        self._stream = stream
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-        self._print()
-
-    def _run(self) -> None:
-        while not self._over.wait(_LINE_INTERVAL_S):
-            self._print()
-
-    def _print(self) -> None:
-        print(summary_line(self._monitor), file=self._stream, flush=True)
-
-
-class _Screen:
-    """Gives rich the present table each time it redraws."""
-
-    def __init__(self, monitor: SweepMonitor) -> None:
-        self._monitor = monitor
-
-    def __rich__(self) -> RenderableType:
-        return render(self._monitor)
-
-
-@contextlib.contextmanager
-def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] = ()) -> Iterator[None]:
-    """Show a sweep on standard error while the block runs; what libraries print there goes to a file instead.
-
-    Args:
-        monitor: The monitor of the sweep to show.
-        progress: `auto`: a table on a terminal, else lines; `none`: nothing.
-        log: File for everything else that this process prints.
-        notes: Notes of the plan, which are shown first.
-    """
-    with quiet(log) as stream:
-        if progress != "none":
-            for note in notes:
-                print(f"note: {note}", file=stream, flush=True)
-        if progress == "none":
-            yield
-        elif stream.isatty() and not _shares_terminal:
-            console = Console(file=stream)
-            with Live(_Screen(monitor), console=console, refresh_per_second=_REFRESH_PER_S):
-                yield
-        else:
-            with _Lines(monitor, stream):
-                yield

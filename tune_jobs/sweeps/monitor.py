@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, Selection, select_best
+from tune_jobs.sweeps.forecast import Forecast, forecast
 
 _RATE_WINDOW_S = 20.0
 
@@ -21,13 +22,23 @@ class Estimate:
     time_left_s: float | None
 
 
+@dataclass(frozen=True)
+class Row:
+    """A trial in the live table."""
+
+    rank: int | None
+    """The rank of its point, from 1; None: it has no score yet."""
+    score: float | None
+    trial: TrialRecord
+
+
 class SweepMonitor:
     """Takes trial records when they change, and sums them up.
 
     Args:
         name: The sweep's name.
         records: Its trials at the start.
-        max_env_steps_per_trial: Cap of each trial.
+        caps: The env steps after which each trial ends at the latest, by its id.
         max_concurrent: How many trials run at once.
         clock: A monotonic clock, in seconds.
     """
@@ -37,7 +48,7 @@ class SweepMonitor:
         name: str,
         records: Iterable[TrialRecord],
         *,
-        max_env_steps_per_trial: int,
+        caps: Mapping[str, int],
         max_concurrent: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -45,7 +56,9 @@ class SweepMonitor:
         self.records: dict[str, TrialRecord] = {record.trial_id: record for record in records}
         self.max_concurrent = max_concurrent
         self.stopping = False
-        self._cap = max_env_steps_per_trial
+        self.phase = ""
+        """What is done before the trials train or after they have, such as "starting Ray"; empty while they do."""
+        self._caps = caps
         self._clock = clock
         self._start = clock()
         self._finished_before = {r.trial_id for r in self.records.values() if r.status in FINISHED}
@@ -65,8 +78,14 @@ class SweepMonitor:
         """Env steps of all trials so far."""
         return self._num_env_steps
 
+    def progress(self) -> Forecast:
+        """Return how far the trials are, in env steps."""
+        return forecast(list(self.records.values()), self._caps)
+
     def update(self, record: TrialRecord) -> None:
         """Take the new state of a trial."""
+        if record.status == "running":
+            self.phase = ""
         before = self.records.get(record.trial_id)
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
         self.records[record.trial_id] = record
@@ -95,6 +114,38 @@ class SweepMonitor:
                 self._selection = None
         return self._selection
 
+    def rows(self, most: int) -> tuple[list[Row], int]:
+        """Return the trials that matter now: the leader, those that run, and the best of the others.
+
+        Args:
+            most: How many at most, one or more.
+
+        Returns:
+            The trials by rank, those without a score last; and the number of running ones that are left out.
+        """
+        best = self.best()
+        ranked = [] if best is None else self._ranked(best)
+        known = {row.trial.trial_id for row in ranked}
+        new = [
+            Row(None, None, record)
+            for record in list(self.records.values())
+            if record.status == "running" and record.trial_id not in known
+        ]
+        rows = [*ranked, *sorted(new, key=lambda row: (-row.trial.num_env_steps, row.trial.index))]
+        # The first is the leader. Sorting keeps the order by rank among those that are as important.
+        by_worth = sorted(rows[1:], key=lambda row: row.trial.status != "running")
+        shown = {row.trial.trial_id for row in [*rows[:1], *by_worth][:most]}
+        left_out = sum(row.trial.status == "running" and row.trial.trial_id not in shown for row in rows)
+        return [row for row in rows if row.trial.trial_id in shown], left_out
+
+    def _ranked(self, best: Selection) -> list[Row]:
+        return [
+            # The selection may be older than the newest report of its trials.
+            Row(rank, scored.score, self.records[scored.trial.trial_id])
+            for rank, point in enumerate(best.ranking, start=1)
+            for scored in point.trial_scores
+        ]
+
     def estimate(self) -> Estimate:
         """Return the rate over the last seconds, and the time left if other trials take as long as those that ended."""
         now = self._clock()
@@ -111,5 +162,7 @@ class SweepMonitor:
             work = sum(max(0.0, seconds - record.time_s) for record in left)
             return Estimate(rate, work / max(1, min(self.max_concurrent, len(left))))
         if rate:
-            return Estimate(rate, sum(max(0, self._cap - record.num_env_steps) for record in left) / rate)
+            return Estimate(
+                rate, sum(max(0, self._caps[record.trial_id] - record.num_env_steps) for record in left) / rate
+            )
         return Estimate(rate, None)

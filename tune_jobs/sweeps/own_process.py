@@ -75,7 +75,7 @@ def main(parent: int, descriptor: int) -> None:
 
 def _done(request: Request) -> Any:
     # Imported only here because it needs NumPy: signals have to be handled before.
-    from tune_jobs.sweeps.live_table import share_terminal
+    from tune_jobs.sweeps.live_view import share_terminal
 
     share_terminal()
     sys.path[:] = request.path

@@ -1,0 +1,124 @@
+"""Show a running sweep: a table that is redrawn on a terminal, or else a line from time to time."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import IO
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live import Live
+from rich.spinner import Spinner
+
+from analysis.wording import duration
+from tune_jobs.process.streams import patient_stream, quiet
+from tune_jobs.sweeps.live_table import render, summary_line
+from tune_jobs.sweeps.monitor import SweepMonitor
+
+_REFRESH_PER_S = 4
+_LINE_INTERVAL_S = 10.0
+
+_shares_terminal = False
+
+
+def share_terminal() -> None:
+    """Print lines on a terminal too from now on, because another process writes there and would break a table."""
+    global _shares_terminal  # noqa: PLW0603 (a process has one standard error)
+    _shares_terminal = True
+
+
+class _Lines:
+    """Prints a line at regular intervals, and at the end if asked to."""
+
+    def __init__(self, line: Callable[[], str], stream: IO[str], *, at_the_end: bool) -> None:
+        self._line = line
+        self._stream = stream
+        self._at_the_end = at_the_end
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        if self._at_the_end:
+            self._print()
+
+    def _run(self) -> None:
+        while not self._over.wait(_LINE_INTERVAL_S):
+            self._print()
+
+    def _print(self) -> None:
+        print(self._line(), file=self._stream, flush=True)
+
+
+class _Screen:
+    """Gives rich the present table each time it redraws."""
+
+    def __init__(self, monitor: SweepMonitor) -> None:
+        self._monitor = monitor
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield render(self._monitor, options.max_width, console.height)
+
+
+@contextlib.contextmanager
+def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] = ()) -> Iterator[None]:
+    """Show a sweep on standard error while the block runs; what libraries print there goes to a file instead.
+
+    Args:
+        monitor: The monitor of the sweep to show.
+        progress: `auto`: a table on a terminal, else lines; `none`: nothing.
+        log: File for everything else that this process prints.
+        notes: Notes of the plan, which are shown first.
+    """
+    with quiet(log) as stream:
+        if progress != "none":
+            for note in notes:
+                print(f"note: {note}", file=stream, flush=True)
+        with contextlib.ExitStack() as stack:
+            if progress != "none":
+                stack.enter_context(_view(monitor, stream))
+            # What is left on the screen afterwards is the result.
+            stack.callback(setattr, monitor, "phase", "")
+            yield
+
+
+def _view(monitor: SweepMonitor, stream: IO[str]) -> AbstractContextManager[object]:
+    if stream.isatty() and not _shares_terminal:
+        return Live(_Screen(monitor), console=Console(file=stream), refresh_per_second=_REFRESH_PER_S)
+    return _Lines(lambda: summary_line(monitor), stream, at_the_end=True)
+
+
+@contextlib.contextmanager
+def working(name: str, what: str, progress: str) -> Iterator[None]:
+    """Show on standard error what is done after the trials while the block does it; nothing of it stays on a terminal.
+
+    Args:
+        name: The sweep's name.
+        what: What is done, such as "writing the report". Without a terminal, a line says it if it takes long.
+        progress: The same as for `shown`.
+    """
+    started = time.monotonic()
+
+    def line() -> str:
+        return f"{name}: {what}, {duration(time.monotonic() - started, tenths=False)}"
+
+    if progress == "none":
+        yield
+        return
+    # Unlike `shown`, this leaves the streams alone: warnings of libraries are seen.
+    with patient_stream() as stream:
+        if stream.isatty() and not _shares_terminal:
+            spinner = Spinner("line", text=f"{name}: {what} ...", style="cyan")
+            with Live(spinner, console=Console(file=stream), refresh_per_second=_REFRESH_PER_S, transient=True):
+                yield
+        else:
+            with _Lines(line, stream, at_the_end=False):
+                yield
