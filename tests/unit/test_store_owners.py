@@ -13,6 +13,7 @@ from stores import Harness
 from policies.acting.load import load_policy
 from policies.errors import CannotRunError, CheckpointError
 from policies.files import open_to_append
+from tests.narrowing import present
 from tune_jobs.store.contract import Assignment, Sweep, Trial
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.probe import answer
@@ -241,6 +242,24 @@ def test_a_report_is_written_over_the_one_before(harness: Harness, sweep: Sweep)
             folder.mkdir(exist_ok=True)
             (folder / "index.html").write_bytes(text)
         assert harness.content("mine", "report/index.html") == text
+
+
+def test_films_and_report_are_current_once_all_are_there(sweep: Sweep, another: Reopen) -> None:
+    assert another().current_films() == {}
+    assert another().current_report() is None
+    sweep.write_best(make_best(), make_portable("CartPole-v1"))
+    with sweep.writing_films() as paths:
+        *most, last = paths.values()
+        for path in most:
+            path.write_bytes(b"film")
+        assert another().current_films() == {}
+        last.write_bytes(b"film")
+    assert set(another().current_films()) == set(paths)
+    with sweep.writing_report() as folder:
+        folder.mkdir(exist_ok=True)
+        assert another().current_report() is None
+        (folder / "index.html").write_bytes(b"page")
+    assert present(another().current_report()).read_bytes() == b"page"
 
 
 def test_events_are_appended(harness: Harness, trial: Trial) -> None:

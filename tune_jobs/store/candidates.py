@@ -11,7 +11,7 @@ import functools
 import logging
 from collections.abc import Mapping, Sequence
 
-from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
+from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
 from analysis.selection import Selection, select_best
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from policies.portable.file import PortablePolicy, read_policy
@@ -78,6 +78,17 @@ def choose(store: Sweep, trials: Sequence[TrialRecord]) -> tuple[Selection, Port
         except NotFoundError as error:
             leave_out(error)
             remaining = [_without(record, selection.checkpoint) for record in remaining]
+
+
+def confirmed_best(store: Sweep) -> BestRecord | None:
+    """Return the winner that was confirmed before; None: it is missing or damaged, or another one would win now."""
+    try:
+        best = store.read_best()
+        read_policy(store.best_folder)
+        selection, _ = choose(store, read_trials(store))
+    except TuneJobsError:
+        return None
+    return best if best.checkpoint == selection.checkpoint else None
 
 
 def leave_out(error: TuneJobsError) -> None:

@@ -246,8 +246,16 @@ class Sweep(Protocol):
         """Return the films that exist, of before_mp4, after_mp4, after_gif and before_after_mp4, to read only."""
         ...
 
+    def current_films(self) -> Mapping[str, Path]:
+        """Return all films if they are there and were made after the present winner was written; else none."""
+        ...
+
     def writing_films(self) -> AbstractContextManager[Mapping[str, Path]]:
         """Yield the path for each of the films, to be written in the block; each file has to appear whole."""
+        ...
+
+    def current_report(self) -> Path | None:
+        """Return the report's page if it was written after the sweep's record, the winner and the films; else None."""
         ...
 
     def writing_report(self) -> AbstractContextManager[Path]:

@@ -34,7 +34,8 @@ FILMS = {
 """The films of the winner and of a random policy, in the folder of the best."""
 REPORT_FOLDER = "report"
 FIGURES_FOLDER = "figures"
-"""The report's page, in the report's folder."""
+REPORT_PAGE = "index.html"
+"""The report's page, in the report's folder; it is written after the other files there."""
 
 LOCK = ".lock"
 DRIVER_LOCK = ".driver-lock"

@@ -9,7 +9,7 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -211,11 +211,23 @@ class SweepStore:
         folder = self.best_folder
         return {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
 
+    def current_films(self) -> dict[str, Path]:
+        """Return all films, if they were made for the present winner; see `Sweep.current_films`."""
+        films = self.films()
+        whole = len(films) == len(names.FILMS)
+        return films if whole and _not_older(films.values(), [self.best_folder / names.BEST_RECORD]) else {}
+
     @contextlib.contextmanager
     def writing_films(self) -> Iterator[Mapping[str, Path]]:
         """Yield the paths to write films to, by the names that `films` has."""
         folder = self.best_folder
         yield {key: folder / name for key, name in names.FILMS.items()}
+
+    def current_report(self) -> Path | None:
+        """Return the report's page, if nothing that it shows was written since; see `Sweep.current_report`."""
+        page = within(self.report_folder, names.REPORT_PAGE)
+        shown = [self.record_path, self.best_folder / names.BEST_RECORD, *self.films().values()]
+        return page if _not_older([page], shown) else None
 
     @contextlib.contextmanager
     def writing_report(self) -> Iterator[Path]:
@@ -296,6 +308,15 @@ class SweepStore:
             f"A cluster still runs sweep {self.name}, for a process that has ended.",
             "Try again in a minute: the cluster is ending the run.",
         )
+
+
+def _not_older(files: Iterable[Path], others: Iterable[Path]) -> bool:
+    """Whether files exist that were written when others were, or later; others that do not exist do not count."""
+    try:
+        oldest = min(path.stat().st_mtime_ns for path in files)
+        return all(path.stat().st_mtime_ns <= oldest for path in others if path.exists())
+    except OSError:
+        return False
 
 
 def name_taken(folder: Path) -> SpecError:

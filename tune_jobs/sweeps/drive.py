@@ -201,7 +201,7 @@ def _run_sweep(
     result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
     if interrupted or not finish:
         return result
-    return replace(result, interrupted=True) if current().came else _finished(store, result, progress)
+    return replace(result, interrupted=True) if current().came else _finished(store, result, progress, keep=not todo)
 
 
 def _run_trials(
@@ -271,9 +271,17 @@ def _close_if_open(store: Sweep) -> None:
             close_run(store)
 
 
-def _finished(store: Sweep, result: SweepResult, progress: str = "none") -> SweepResult:
-    """Choose, confirm and film the winner, and write the report; what can't be made is noted, and raises no error."""
-    made = _Finish(store, progress)
+def _finished(store: Sweep, result: SweepResult, progress: str = "none", *, keep: bool = False) -> SweepResult:
+    """Choose, confirm and film the winner, and write the report; what can't be made is noted, and raises no error.
+
+    Args:
+        store: The sweep.
+        result: The trials.
+        progress: Whether it is told what is done, as for `launch`.
+        keep: Whether only what is missing or out of date is made: the records of a sweep that was finished before stay
+            as they are, whichever machine, version or number of episodes they came from.
+    """
+    made = _Finish(store, progress, keep=keep)
     with _noted():
         made.make_all()
     return replace(
@@ -290,9 +298,10 @@ def _finished(store: Sweep, result: SweepResult, progress: str = "none") -> Swee
 class _Finish:
     """Makes what comes after the trials, as far as possible."""
 
-    def __init__(self, store: Sweep, progress: str) -> None:
+    def __init__(self, store: Sweep, progress: str, *, keep: bool) -> None:
         self._store = store
         self._progress = progress
+        self._keep = keep
         self.best: BestRecord | None = None
         self._why: TuneJobsError | None = None
         self.artifacts: dict[str, Path] = {}
@@ -309,18 +318,31 @@ class _Finish:
 
     def make_all(self) -> None:
         """Make everything that can be made."""
+        from tune_jobs.store.candidates import confirmed_best
         from tune_jobs.sweeps import conclude as finish
 
+        store = self._store
+        if self._keep:
+            self.best = confirmed_best(store)
+        kept = self.best is not None
         try:
-            with self._working("confirming the best policy"):
-                self.best = finish.choose_best(self._store)
-            self.artifacts["policy"] = self._store.best_policy_path
+            if self.best is None:
+                with self._working("confirming the best policy"):
+                    self.best = finish.choose_best(store)
+            self.artifacts["policy"] = store.best_policy_path
         except TuneJobsError as error:
             self._why = error
         self.failed = self._why is not None
         if self.best is not None:
-            self._attempt("video", "filming the best policy", lambda: finish.make_videos(self._store))
-        self._attempt("report", "writing the report", lambda: {"report": finish.make_report(self._store, self._why)})
+            films = dict(store.current_films()) if kept else {}
+            self.artifacts.update(films)
+            if not films:
+                self._attempt("video", "filming the best policy", lambda: finish.make_videos(store))
+        page = store.current_report() if kept else None
+        if page is not None:
+            self.artifacts["report"] = page
+        else:
+            self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
 
     def _working(self, doing: str) -> AbstractContextManager[None]:
         from tune_jobs.sweeps.live_view import working
