@@ -88,11 +88,12 @@ def probability_of_being_best(
     True means are drawn from their posterior in a normal hierarchical model: settings come from a normal distribution,
     whose mean and spread are learnt from all of them, and seeds from a t-distribution around each setting. So the
     leader of many settings isn't believed too much: the best of twenty means is mostly a lucky one, and is drawn back
-    to the others, the more the less settings differ. Without that, of settings given 60 % about 50 % are the best.
+    to the others, the more the less settings differ.
 
-    It is calibrated within five points where settings are about normal, and a little cautious where few settings stand
-    out. It is too sure, by up to 25 points for the few it gives more than 50 %, where the best settings crowd below a
-    ceiling with hardly any difference. What is the best of settings that are exactly as good has no answer: they share.
+    It is calibrated within five points below 30 %, and above where settings differ about as much as their seeds or
+    more. Above 50 % it is too sure, by 15 to 35 points, where settings hardly differ or the best of them crowd below a
+    ceiling: what it gives more than 50 % there is rare, and `tie_groups` is to be asked. Settings that are exactly as
+    good share what the best of them has. Decision 28 has the figures.
 
     Args:
         settings: For each setting one score a training seed, the higher the better; they may differ in number.
@@ -116,7 +117,7 @@ def probability_of_being_best(
     means, num_settings = fit.means, fit.means.size
     spread = 0.0 if means.min() == means.max() else float(means.std(ddof=1))
     if spread == 0.0 or fit.standard_errors.max() == 0.0:
-        leaders = means == means.max()
+        leaders = (means == means.max()).astype(np.float64)
         return leaders / leaders.sum()
     spreads, weights = _spread_posterior(means, fit.standard_errors**2, spread)
     wins = np.zeros(num_settings, dtype=np.int64)

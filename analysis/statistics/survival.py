@@ -88,7 +88,7 @@ def steps_to_threshold(
     happened = np.array([step is not None for step in reached])
     steps, num_reached = np.unique(events[happened], return_counts=True)
     at_risk = events.size - np.searchsorted(np.sort(events), steps, side="left")
-    shares = np.cumprod(1.0 - num_reached / at_risk)
+    shares: NDArray[np.float64] = np.cumprod(1.0 - num_reached / at_risk, dtype=np.float64)
     lower, upper = _bands(shares, num_reached, at_risk, z)
     return SurvivalCurve(steps, shares, lower, upper, at_risk, num_reached, events.size)
 
