@@ -73,8 +73,7 @@ def test_a_run_at_the_threshold_is_not_above_it() -> None:
 
 
 def test_the_probability_of_improvement_is_that_of_rliable_and_scipy() -> None:
-    # rliable 1.2.0: metrics.probability_of_improvement of X and of Y with the fifth run that is left out here is
-    # 0.6083 too; ties count half in both.
+    # rliable 1.2.0: metrics.probability_of_improvement(X.T, Y.T); ties count half there too.
     assert probability_of_improvement(X, Y).mean == pytest.approx(0.608333, abs=1e-6)
     shares = [stats.mannwhitneyu(ours, theirs).statistic / 20.0 for ours, theirs in zip(X, Y, strict=True)]
     assert probability_of_improvement(X, Y).mean == pytest.approx(np.mean(shares))
