@@ -117,8 +117,8 @@ def probability_of_being_best(
     means, num_settings = fit.means, fit.means.size
     spread = 0.0 if means.min() == means.max() else float(means.std(ddof=1))
     if spread == 0.0 or fit.standard_errors.max() == 0.0:
-        leaders = (means == means.max()).astype(np.float64)
-        return leaders / leaders.sum()
+        leaders = means == means.max()
+        return np.where(leaders, 1.0 / np.count_nonzero(leaders), 0.0)
     spreads, weights = _spread_posterior(means, fit.standard_errors**2, spread)
     wins = np.zeros(num_settings, dtype=np.int64)
     for size in fit.blocks(num_draws):
