@@ -96,7 +96,7 @@ def test_the_running_sweep_is_shown_and_written_for_tensorboard(made: Synthetic,
     assert "1 completed" in summary_line(monitor)
     writer = ScalarWriter(SweepStore(tmp_path))
     for trial in made.trials:
-        writer.write(trial, evaluated=True)
+        writer.write(trial, made.results[trial.trial_id])
     writer.flush()
     assert list(tmp_path.glob("trials/*/tensorboard/*"))
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import odd_files
 import pytest
+from store_parts import make_iteration
 from sweep_folders import train
 
 from analysis import records
@@ -109,7 +110,7 @@ def write_films(store: SweepStore) -> None:
 
 def scalars(store: SweepStore) -> None:
     writer = ScalarWriter(store)
-    writer.write(store.trial("t0001").read_record(), evaluated=True)
+    writer.write(store.trial("t0001").read_record(), [make_iteration(1)])
     writer.flush()
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import odd_files
 import pytest
+from store_parts import make_iteration
 from sweep_folders import train
 
 from policies.acting.load import load_policy
@@ -96,7 +97,7 @@ def keep(folder: Path) -> None:
 
 def scalars(folder: Path) -> None:
     writer = ScalarWriter(SweepStore(folder))
-    writer.write(SweepStore(folder).trial("t0000").read_record(), evaluated=True)
+    writer.write(SweepStore(folder).trial("t0000").read_record(), [make_iteration(1)])
     writer.flush()
 
 

@@ -19,6 +19,8 @@ from tune_jobs.store.ownership import Owner
 from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
+WITHOUT_EPISODES: dict[str, Any] = {"episode_returns": (), "episode_lengths": ()}
+
 # -- together
 
 
@@ -35,10 +37,12 @@ def test_each_member_is_told_of_as_a_trial_of_its_own(tmp_path: Path) -> None:
         progress = pack.last(trial_id)
         assert (progress.status, progress.stop_reason) == ("completed", "evaluation_return 8 >= 8")
         assert [record.iteration for record in progress.checkpoints] == alone.kept
-        assert without_times(progress.model_copy(update={"checkpoints": ()})) == without_times(
-            expected.model_copy(update={"checkpoints": ()})
+        assert without_times(progress.model_copy(update={"checkpoints": (), "iterations": ()})) == without_times(
+            expected.model_copy(update={"checkpoints": (), "iterations": ()})
         )
         assert pack.store(trial_id).read_iterations() == alone.results
+        told = [item for report in pack.of(trial_id) for item in present(report.progress).iterations]
+        assert told == [item.model_copy(update=WITHOUT_EPISODES) for item in alone.results]
         assert [record.iteration for record in pack.store(trial_id).checkpoints()] == alone.kept
     assert pack.loop.trial_ids == ()
     assert pack.engine.members == {}

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from fake_engine import FakeClock
+from store_parts import make_iteration
 
 from analysis.records import CheckpointRecord, TrialRecord
 from tune_jobs.store.ownership import Owner, OwnershipLostError
@@ -44,7 +45,9 @@ def test_what_a_trial_tells_is_in_its_record(kept: tuple[SweepStore, RecordKeepe
     checkpoint = CheckpointRecord(trial_id="t0003", iteration=4, num_env_steps=400)
     keeper.started("t0003")
     assert told[-1].status == "running"
-    keeper.progressed("t0003", progress(4, checkpoints=(checkpoint,)), node="here", pid=12)
+    keeper.progressed(
+        "t0003", progress(4, checkpoints=(checkpoint,), iterations=(make_iteration(4),)), node="here", pid=12
+    )
     keeper.flush()
     record = on_disk(store, "t0003")
     assert record == keeper.record("t0003") == told[-1]

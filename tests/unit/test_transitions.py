@@ -50,7 +50,7 @@ def test_the_file_of_a_trial_is_as_it_was_before_its_record_was_made_of_parts() 
 
 def test_every_field_of_a_record_is_planned_or_of_the_state() -> None:
     assert list(TrialRecord.model_fields) == [*TrialPlan.model_fields, *TrialState.model_fields]
-    assert set(Progress.model_fields) == {*TrialState.model_fields, "evaluated"}
+    assert set(Progress.model_fields) == {*TrialState.model_fields, "evaluated", "iterations"}
 
 
 def test_a_planned_trial_waits_with_what_is_planned_of_it() -> None:

@@ -10,6 +10,7 @@ from trial_runs import Trial
 from policies.acting.evaluate import Evaluator
 from policies.portable.file import read_policy
 from tests.narrowing import present
+from tune_jobs.store.progress import Progress
 from tune_jobs.training.trial_loop import TrialLoop
 
 # -- stop rules
@@ -254,3 +255,23 @@ def test_a_checkpoint_between_evaluations_has_no_score(tmp_path: Path) -> None:
     record = trial.store.checkpoints()[0]
     assert (record.trial_id, record.num_env_steps, record.training_return) == ("t0000", 300, 20.0)
     assert record.path == "trials/t0000/checkpoints/000003"
+
+
+def test_every_iteration_is_told_once_without_its_episodes(tmp_path: Path) -> None:
+    trial = Trial(tmp_path, stop={"num_iterations": 8}, evaluation={"every_iterations": 3})
+    told = [trial.loop.advance(math.inf) for _ in range(3)]
+    assert [[item.iteration for item in progress.iterations] for progress in told] == [[1, 2, 3], [4, 5, 6], [7, 8]]
+    without = {"episode_returns": (), "episode_lengths": ()}
+    lean = [item.model_copy(update=without) for item in trial.results]
+    assert [item for progress in told for item in progress.iterations] == lean
+    assert trial.results[0].episode_returns
+    assert trial.loop.leave().iterations == ()
+
+
+def test_iterations_reach_the_driver_as_they_are(tmp_path: Path) -> None:
+    """A trial's process sends them as plain data, with numbers that JSON lacks."""
+    trial = Trial(tmp_path, engine=FakeEngine(lambda iteration: (math.nan,)), stop={"num_iterations": 2})
+    sent = trial.run()
+    received = Progress.model_validate(sent.model_dump())
+    assert [item.learner for item in received.iterations] == [item.learner for item in sent.iterations]
+    assert received.iterations[0].training_return is None

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import ConfigDict
+from collections.abc import Sequence
+from typing import Self
 
-from analysis.records import TrialState
+from pydantic import ConfigDict, Field
+
+from analysis.records import IterationRecord, TrialState
 
 
 class Progress(TrialState):
@@ -19,3 +22,11 @@ class Progress(TrialState):
 
     evaluated: bool
     """Whether `evaluation_return` is of this very iteration."""
+    iterations: tuple[IterationRecord, ...] = Field(
+        (), description="The iterations since the last report, oldest first, without their episodes."
+    )
+
+    def with_iterations(self, iterations: Sequence[IterationRecord]) -> Self:
+        """Return the progress with iterations; their episodes are only in results.jsonl."""
+        lean = [item.model_copy(update={"episode_returns": (), "episode_lengths": ()}) for item in iterations]
+        return self.model_copy(update={"iterations": tuple(lean)})

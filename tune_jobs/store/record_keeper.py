@@ -96,7 +96,7 @@ class RecordKeeper:
             self.running.discard(trial_id)
         record = transitions.told(self._records[trial_id], progress, node=node, pid=pid)
         self._update(trial_id, record)
-        self._scalars.write(record, evaluated=progress.evaluated)
+        self._scalars.write(record, progress.iterations)
 
     def paused(self, trial_id: str) -> None:
         """Note that a trial was paused without a report; it will continue from its latest checkpoint."""

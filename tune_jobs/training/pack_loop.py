@@ -226,7 +226,7 @@ class PackLoop:
             self._attempt({member: member.trial.flush for member in self._all if member.loop}, saves=False)
         for member in self._members.values():
             if member.unreported is not None:
-                self._reports.append(MemberReport(member.task.trial_id, member.unreported))
+                self._reports.append(MemberReport(member.task.trial_id, member.trial.told(member.unreported)))
                 member.unreported = None
         reports, self._reports = self._reports, []
         return reports
@@ -302,7 +302,7 @@ class PackLoop:
                 self._failed(member, error)
                 return
         member.unreported = None
-        self._reports.append(MemberReport(member.task.trial_id, progress))
+        self._reports.append(MemberReport(member.task.trial_id, member.trial.told(progress)))
         if progress.status != "running":
             self._let_go(member)
 

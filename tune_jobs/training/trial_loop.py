@@ -70,6 +70,7 @@ class TrialLoop:
         self._checkpoints: list[CheckpointRecord] = []
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
+        self._untold: list[IterationRecord] = []
         self._notes: list[str] = []
         # The iteration that is not concluded yet, and the stop rule that applies before its evaluation.
         self._taken = self._last
@@ -192,7 +193,7 @@ class TrialLoop:
             while True:
                 progress = self._one_iteration()
                 if progress.status != "running" or progress.evaluated or self._clock() >= deadline:
-                    return progress
+                    return self.told(progress)
         finally:
             self.flush()
 
@@ -248,6 +249,7 @@ class TrialLoop:
             text = f"{evaluation} (iteration {self._last.iteration + 1}{_learning_settings(self.task.hyperparams)})"
             if record.iteration > self._last.iteration:  # otherwise the training raised the error
                 self._unwritten.append(record)
+                self._untold.append(record)
             self._last, reached = record, self._tally.reached
             progress = self._progress("failed", evaluated=False, error=text)
             counts = {"num_env_steps": reached.num_env_steps, "num_episodes": reached.num_episodes}
@@ -259,6 +261,7 @@ class TrialLoop:
             reason = reason or self._stop_reason(record, score)
         self._last = record.model_copy(update={"time_s": self._clock() - self._started})
         self._unwritten.append(self._last)
+        self._untold.append(self._last)
         self._tally.set(_reached(self._last))
         score = record.evaluation_return
         if (
@@ -269,6 +272,11 @@ class TrialLoop:
             self._checkpoint(score)
         status: TrialStatus = "running" if reason is None else "completed"
         return self._progress(status, evaluated=evaluation is not None, reason=reason)
+
+    def told(self, progress: Progress) -> Progress:
+        """Return a progress that is reported now, with the iterations since the last one that was."""
+        untold, self._untold = self._untold, []
+        return progress.with_iterations(untold)
 
     def flush(self) -> None:
         """Write the concluded iterations to results.jsonl."""
