@@ -82,7 +82,7 @@ def _session(record: TrialRecord, now: float) -> Summary:
 
     TensorBoard finds out from the sessions of all trials which values each hyperparameter takes.
     """
-    # Not from `summary_v2`, which needs TensorFlow or a stand-in for it, and these messages alone.
+    # Not by summary_v2 of that plugin, which wants TensorFlow or a stand-in for it.
     from tensorboard.compat.proto.summary_pb2 import Summary
     from tensorboard.plugins.hparams import metadata, plugin_data_pb2
 
