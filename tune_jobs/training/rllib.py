@@ -13,7 +13,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 
 from policies import random_streams
 from policies.errors import CannotRunError
-from policies.hyperparams import Algorithm, DQNHyperparams, TrainedHyperparams, make_hyperparams
+from policies.hyperparams import Algorithm, DQNHyperparams, PPOHyperparams, TrainedHyperparams, make_hyperparams
 from policies.portable.file import PortablePolicy, read_policy
 from policies.rllib.config import build_algorithm_config
 from policies.rllib.dqn_algorithm import ReplayDQN
@@ -150,7 +150,7 @@ class RLlibEngine:
         return IterationStats(
             num_env_steps=self._before[0] + self._num_env_steps(),
             episodes=tuple(episode for runner in finished for episode in (runner or ())),
-            learner=_learner_stats(result),
+            learner=_learner_stats(result, self._hyperparams),
         )
 
     def policy(self) -> PortablePolicy:
@@ -186,6 +186,10 @@ def _is_of(task: TrialTask, saved: PortablePolicy) -> bool:
     return not task.changes or {name: saved.training.get(name) for name in own} == own
 
 
-def _learner_stats(result: dict[str, Any]) -> dict[str, float]:
+def _learner_stats(result: dict[str, Any], hyperparams: TrainedHyperparams | None) -> dict[str, float]:
     stats = result.get("learners", {}).get(DEFAULT_MODULE_ID, {})
-    return {ours: float(stats[theirs]) for theirs, ours in _LEARNER_STATS.items() if theirs in stats}
+    found = {ours: float(stats[theirs]) for theirs, ours in _LEARNER_STATS.items() if theirs in stats}
+    if isinstance(hyperparams, PPOHyperparams) and not hyperparams.use_kl_loss:
+        # RLlib measures the divergence for the penalty alone, and says 0 without one.
+        found.pop("kl", None)
+    return found
