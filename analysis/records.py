@@ -9,9 +9,12 @@ files have the strings "NaN", "Infinity" and "-Infinity" for them. Files of olde
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
+
+from analysis.notebook import Brief, facts_html
 
 FORMAT_VERSION = 2
 
@@ -42,6 +45,14 @@ Number = Annotated[float, BeforeValidator(_nan_for_null)]
 class _Record(BaseModel):
     # Unknown keys are ignored, so that an older version can read what a newer one wrote.
     model_config = ConfigDict(frozen=True, extra="ignore", ser_json_inf_nan="strings")
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Yield what the repr shows: what is not the default, and of long values their beginning."""
+        fields = type(self).model_fields
+        for name, value in super().__repr_args__():
+            field = fields.get(name or "")
+            if field is None or field.is_required() or value != field.get_default(call_default_factory=True):
+                yield name, Brief(value)
 
 
 class CheckpointRecord(_Record):
@@ -206,6 +217,24 @@ class BestRecord(_Record):
     def optimism_gap(self) -> float:
         """Selection score minus confirmation mean: how much choosing the maximum raised the score."""
         return self.selection_score - self.confirmation.mean_return
+
+    def _repr_html_(self) -> str:
+        from analysis.wording import difference_text, return_text, setting_text
+
+        point = ", ".join(f"{name} {setting_text(value)}" for name, value in self.point.items())
+        confirmed = self.confirmation
+        facts = {
+            "values": point or "no searched values",
+            "trial": f"{self.checkpoint.trial_id}, at {self.checkpoint.num_env_steps:,} env steps",
+            "chosen by": f"{return_text(self.selection_score)} mean evaluation return",
+            "confirmed at": f"{return_text(confirmed.mean_return)} over {confirmed.num_episodes} fresh episodes; "
+            f"gap {difference_text(self.optimism_gap)}",
+            "random policy": return_text(self.random.mean_return),
+        }
+        if confirmed.solved is not None:
+            solved = "solved" if confirmed.solved else "not solved"
+            facts[confirmed.env_id] = f"{solved} (threshold {confirmed.threshold:g})"
+        return facts_html("Best policy", facts)
 
 
 class SweepRecord(_Record):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from pydantic import BaseModel
 
-from analysis.wording import PLAIN_NONE, counted, difference_text, duration, return_text, setting_text
+from analysis.wording import PLAIN_NONE, counted, difference_text, return_text, setting_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from analysis.records import BestRecord, EvaluationRecord, TrialRecord, TrialStatus
     from tune_jobs.spec.file import Preset
-    from tune_jobs.sweeps.status import BestSoFar
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
 # Derived values, so that readers of the JSON need not compute them.
@@ -122,7 +121,7 @@ def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
         return
     table = make_table("sweep", "state", "trials", "created")
     for status in statuses:
-        table.add_row(status.sweep.name, _state(status), _counts(status), _local_time(status.sweep.created_at))
+        table.add_row(status.sweep.name, status.state, status.told_counts, _local_time(status.sweep.created_at))
     console.print(table)
 
 
@@ -138,69 +137,7 @@ def show_status(status: SweepStatus, *, storage: str | None = None, as_json: boo
     if as_json:
         print_json(status)
         return
-    facts = {
-        "sweep": status.sweep.name,
-        "state": _state(status),
-        "progress": _progress(status),
-        "trials": f"{status.sweep.num_trials:,}: {_counts(status)}",
-        "best so far": _best_so_far(status.best),
-        "speed": "" if status.env_steps_per_s is None else f"{status.env_steps_per_s:,.0f} env steps/s",
-        "time left": _time_left(status, storage),
-        "run time": _run_time(status),
-    }
-    print_facts(make_console(), {name: text for name, text in facts.items() if text})
-
-
-def _progress(status: SweepStatus) -> str:
-    if status.max_env_steps is None:
-        return counted(status.num_env_steps, "env step")
-    if status.num_env_steps >= status.max_env_steps:
-        return f"100 %: {counted(status.num_env_steps, 'env step')}"
-    # Rounded down, so that 100 % means done.
-    share = 100 * status.num_env_steps // status.max_env_steps
-    return f"{share} %: {status.num_env_steps:,} of at most {counted(status.max_env_steps, 'env step')}"
-
-
-def _best_so_far(best: BestSoFar | None) -> str:
-    if best is None:
-        return "no evaluation yet"
-    point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
-    where = f"{best.trial_id}, at {best.num_env_steps:,} env steps"
-    return f"{return_text(best.score)}  {point or 'no searched values'}  ({where})"
-
-
-def _time_left(status: SweepStatus, storage: str | None) -> str:
-    if not status.alive:
-        if status.sweep.state == "completed":
-            return ""
-        verb = "starts" if status.sweep.state == "created" else "continues"
-        where = shlex.quote(status.sweep.name) + _storage_option(storage)
-        return f"nothing runs; `tune-jobs resume {where}` {verb} it"
-    if status.sweep.state == "completed":
-        return "the trials are done; the best is being confirmed and filmed, and the report written"
-    if status.time_left_s is None:
-        return "not known before the first env steps are reported"
-    return f"about {duration(status.time_left_s, tenths=False, none=PLAIN_NONE)}"
-
-
-def _run_time(status: SweepStatus) -> str:
-    before, started = status.sweep.run_time_s, status.sweep.started_at
-    if not status.alive or status.sweep.state == "completed":
-        return duration(before, none=PLAIN_NONE)
-    if before == 0 and started is not None:
-        return duration(max(0.0, time.time() - started), tenths=False, none=PLAIN_NONE)
-    # When this run began is not recorded.
-    return f"{duration(before, none=PLAIN_NONE)} before this run"
-
-
-def _state(status: SweepStatus) -> str:
-    # The record of a sweep whose process was killed still says running.
-    gone = status.sweep.state == "running" and not status.alive
-    return "interrupted" if gone else status.sweep.state
-
-
-def _counts(status: SweepStatus) -> str:
-    return ", ".join(f"{number} {name}" for name, number in status.counts.items() if number) or "none"
+    print_facts(make_console(), status.facts(_storage_option(storage)))
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:

@@ -29,6 +29,7 @@ from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import PopulationScheduler
 from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
+from tune_jobs.ray_tune.reporter import reporter
 from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
@@ -188,6 +189,7 @@ class _Run:
             storage_path=str(self._store.tune_folder),
             stop=_StopWhenAsked(self._store, self.keeper, is_finished, self._watch),
             verbose=0,
+            progress_reporter=reporter(),
             failure_config=tune.FailureConfig(max_failures=max_failures),
             # Trials write their own checkpoints; Tune's are pointers, made when it pauses one.
             checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=0, checkpoint_at_end=False),

@@ -49,6 +49,9 @@ class Preset(NamedTuple):
     text: str
     """The whole file."""
 
+    def __repr__(self) -> str:
+        return f"Preset(name={self.name!r}, title={self.title!r}, expected={self.expected!r}, ...)"
+
 
 def list_presets() -> list[Preset]:
     """Return the presets, by name."""

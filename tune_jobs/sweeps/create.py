@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from analysis.notebook import facts_html
 from policies.errors import TuneJobsError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
@@ -23,6 +24,9 @@ class CreatedSweep:
 
     name: str
     folder: Path
+
+    def _repr_html_(self) -> str:
+        return facts_html(f"Sweep {self.name}: created", {"folder": self.folder, "run it with": "tune_jobs.drive(...)"})
 
 
 def write_created(spec: SweepSpec, name: str | None, stem: str, storage: Path, address: str | None) -> CreatedSweep:

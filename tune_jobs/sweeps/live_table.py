@@ -25,6 +25,7 @@ _ROOM_FOR_OTHERS = 9
 """Lines of a terminal that are not for trials: the facts above them, their titles, and what follows."""
 _GAP = 2
 _MAX_MEASURED = 200
+_MAX_POINT = 300
 
 
 def describe_point(record: TrialRecord, most: int | None = None) -> str:
@@ -39,8 +40,8 @@ def describe_point(record: TrialRecord, most: int | None = None) -> str:
     text = ""
     for name, value in record.point.items():
         more = f"{text}{', ' if text else ''}{name} {short_text(value)}"
-        if most is not None and text and len(more) > most:
-            return f"{text}, ..."
+        if most is not None and len(more) > most:
+            return f"{text}, ..." if text else f"{more[:most]} ..."
         text = more
     return text or "no searched values"
 
@@ -124,10 +125,8 @@ def _best_text(best: Selection | None) -> Text:
     if best is None:
         return Text("no evaluation yet", style="dim")
     text = Text(f"{return_text(best.point_score)}", style="bold green")
-    text.append(
-        f"  {describe_point(best.trial)}  ({best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps)",
-        style="default",
-    )
+    where = f"{best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps"
+    text.append(f"  {describe_point(best.trial, _MAX_POINT)}  ({where})", style="default")
     return text
 
 

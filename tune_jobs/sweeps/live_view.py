@@ -1,4 +1,4 @@
-"""Show a running sweep: a table that is redrawn on a terminal, or else a line from time to time."""
+"""Show a running sweep: a table that is redrawn on a terminal or in a notebook, or else a line from time to time."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from analysis.wording import duration
 from tune_jobs.process.streams import patient_stream, quiet
 from tune_jobs.sweeps.live_table import render, summary_line
 from tune_jobs.sweeps.monitor import SweepMonitor
+from tune_jobs.sweeps.notebook_view import WIDTH, NotebookView, kernel_shell
 
 _REFRESH_PER_S = 4
 _LINE_INTERVAL_S = 10.0
@@ -74,7 +75,7 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
 
     Args:
         monitor: The monitor of the sweep to show.
-        progress: `auto`: a table on a terminal, else lines; `none`: nothing.
+        progress: `auto`: a table on a terminal and in a notebook, else lines; `none`: nothing.
         log: File for everything else that this process prints.
         notes: Notes of the plan, which are shown first.
     """
@@ -91,6 +92,8 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
 
 
 def _view(monitor: SweepMonitor, stream: IO[str]) -> AbstractContextManager[object]:
+    if kernel_shell() is not None:
+        return NotebookView(monitor.name, lambda: render(monitor, WIDTH), is_line=False)
     if stream.isatty() and not _shares_terminal:
         return Live(_Screen(monitor), console=Console(file=stream), refresh_per_second=_REFRESH_PER_S)
     return _Lines(lambda: summary_line(monitor), stream, at_the_end=True)
@@ -112,6 +115,10 @@ def working(name: str, what: str, progress: str) -> Iterator[None]:
 
     if progress == "none":
         yield
+        return
+    if kernel_shell() is not None:
+        with NotebookView(name, lambda: f"{line()} ...", is_line=True):
+            yield
         return
     # Unlike `shown`, this leaves the streams alone: warnings of libraries are seen.
     with patient_stream() as stream:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from analysis.notebook import brief_repr, facts_html
 from analysis.records import BestRecord, SweepRecord, TrialRecord
+from analysis.wording import counted
 
 
 @dataclass(frozen=True)
@@ -31,3 +34,29 @@ class SweepResult:
         if self.interrupted:
             return 130
         return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
+
+    def __repr__(self) -> str:
+        counts = dict(Counter(trial.status for trial in self.trials))
+        best = self.best and f"{self.best.checkpoint.trial_id} scored {self.best.selection_score:.1f}"
+        return brief_repr(
+            "SweepResult", folder=self.folder, state=self.sweep.state, trials=counts, best=best,
+            why_no_best=self.why_no_best, artifacts=list(self.artifacts), exit_code=self.exit_code,
+        )  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        counts = Counter(trial.status for trial in self.trials)
+        told = ", ".join(f"{number} {status}" for status, number in counts.items())
+        steps = sum(trial.num_env_steps for trial in self.trials)
+        facts: dict[str, str | Path] = {
+            "trials": f"{counted(len(self.trials), 'trial')}: {told or 'none'}; {counted(steps, 'env step')}"
+        }
+        if self.why_no_best is not None:
+            facts["no best policy"] = self.why_no_best
+        failed = [trial for trial in self.trials if trial.status == "failed"]
+        if failed:
+            facts["first failure"] = f"{failed[0].trial_id}: {failed[0].error or 'no error recorded'}"
+        facts |= {"folder": self.folder} | {name.replace("_", " "): path for name, path in self.artifacts.items()}
+        facts |= {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
+        state = "interrupted" if self.interrupted else self.sweep.state
+        best = "" if self.best is None else self.best._repr_html_()
+        return facts_html(f"Sweep {self.sweep.name}: {state}", facts) + best

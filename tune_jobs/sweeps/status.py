@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import shlex
+import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from analysis.notebook import BriefList, brief_repr, facts_html, rows_html
 from analysis.records import SweepRecord, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, select_best
+from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
 from policies.arguments import checked
 from policies.errors import CheckpointError, TuneJobsError
 from tune_jobs.spec.file import stored_spec
@@ -53,6 +57,88 @@ class SweepStatus:
     best: BestSoFar | None = None
     """None: no trial has been evaluated yet, or none that was may win."""
 
+    @property
+    def state(self) -> str:
+        """The sweep's state; interrupted if it was running when its process was killed."""
+        return "interrupted" if self.sweep.state == "running" and not self.alive else self.sweep.state
+
+    @property
+    def told_counts(self) -> str:
+        """The number of trials by status, as text."""
+        return ", ".join(f"{number:,} {name}" for name, number in self.counts.items() if number) or "none"
+
+    def facts(self, option: str = "") -> dict[str, str]:
+        """Return what is known, each with its name, for a reader.
+
+        Args:
+            option: What a command needs besides the sweep's name to find it.
+        """
+        facts = {
+            "sweep": self.sweep.name,
+            "state": self.state,
+            "progress": self._progress(),
+            "trials": f"{self.sweep.num_trials:,}: {self.told_counts}",
+            "best so far": _best_text(self.best),
+            "speed": "" if self.env_steps_per_s is None else f"{self.env_steps_per_s:,.0f} env steps/s",
+            "time left": self._time_left(option),
+            "run time": self._run_time(),
+        }
+        return {name: text for name, text in facts.items() if text}
+
+    def _progress(self) -> str:
+        if self.max_env_steps is None:
+            return counted(self.num_env_steps, "env step")
+        if self.num_env_steps >= self.max_env_steps:
+            return f"100 %: {counted(self.num_env_steps, 'env step')}"
+        # Rounded down, so that 100 % means done.
+        share = 100 * self.num_env_steps // self.max_env_steps
+        return f"{share} %: {self.num_env_steps:,} of at most {counted(self.max_env_steps, 'env step')}"
+
+    def _time_left(self, option: str) -> str:
+        if not self.alive:
+            if self.sweep.state == "completed":
+                return ""
+            verb = "starts" if self.sweep.state == "created" else "continues"
+            return f"nothing runs; `tune-jobs resume {shlex.quote(self.sweep.name)}{option}` {verb} it"
+        if self.sweep.state == "completed":
+            return "the trials are done; the best is being confirmed and filmed, and the report written"
+        if self.time_left_s is None:
+            return "not known before the first env steps are reported"
+        return f"about {duration(self.time_left_s, tenths=False, none=PLAIN_NONE)}"
+
+    def _run_time(self) -> str:
+        before, started = self.sweep.run_time_s, self.sweep.started_at
+        if not self.alive or self.sweep.state == "completed":
+            return duration(before, none=PLAIN_NONE)
+        if before == 0 and started is not None:
+            return duration(max(0.0, time.time() - started), tenths=False, none=PLAIN_NONE)
+        # When this run began is not recorded.
+        return f"{duration(before, none=PLAIN_NONE)} before this run"
+
+    def __repr__(self) -> str:
+        told = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "sweep"}
+        return brief_repr("SweepStatus", name=self.sweep.name, state=self.state, **told)
+
+    def _repr_html_(self) -> str:
+        facts = self.facts()
+        return facts_html(f"Sweep {facts.pop('sweep')}", facts)
+
+
+class Sweeps(BriefList[SweepStatus]):
+    """The sweeps of a storage folder, by name."""
+
+    def _repr_html_(self) -> str:
+        rows = [(each.sweep.name, each.state, each.told_counts, _best_text(each.best).split("  ")[0]) for each in self]
+        return rows_html(("sweep", "state", "trials", "best so far"), rows)
+
+
+def _best_text(best: BestSoFar | None) -> str:
+    if best is None:
+        return "no evaluation yet"
+    point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
+    where = f"{best.trial_id}, at {best.num_env_steps:,} env steps"
+    return f"{return_text(best.score)}  {point or 'no searched values'}  ({where})"
+
 
 @checked
 def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStatus:
@@ -71,7 +157,7 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
     """Return the status of every sweep in a storage folder, by name; sweeps that cannot be read give a warning."""
     from tune_jobs.store.candidates import leave_out
 
-    found = []
+    found = Sweeps()
     for store in open_storage(storage_folder(storage)).sweeps():
         try:
             found.append(_status(store))

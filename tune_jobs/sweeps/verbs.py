@@ -24,7 +24,7 @@ from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
 from tune_jobs.sweeps.drive import connected, machine_here, run_sweep, settled, write_new
 from tune_jobs.sweeps.outcome import SweepResult
-from tune_jobs.sweeps.results import dataframe, report, trials
+from tune_jobs.sweeps.results import Films, dataframe, report, trials
 from tune_jobs.sweeps.status import SweepStatus, list_sweeps, status
 from tune_jobs.sweeps.storage import choose_store, create_store, expanded, stem_of, storage_folder
 
@@ -332,7 +332,7 @@ def video(
     seed: Seed | None = None,
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
-) -> dict[str, Path]:
+) -> Films:
     """Film a policy.
 
     Args:
@@ -356,10 +356,10 @@ def video(
 
     found = finish.find_policy(source, storage, env_id, action)
     if output is None and found.store is not None:
-        return finish.make_videos(found.store, seed)
+        return Films(finish.make_videos(found.store, seed))
     name = str(source).replace("/", "-").lstrip(".-") or "policy"
     target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
-    return finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed)
+    return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
 
 
 def _film_path(output: str | Path | None, name: str) -> Path:
