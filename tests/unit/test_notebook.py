@@ -223,6 +223,7 @@ def test_in_a_notebook_one_output_lives_through_the_trials_and_what_follows(note
     assert "50 %" in notebook.pages[0][-1]
     assert "7.0" in notebook.pages[0][-1]
     last = notebook.pages[0][-1]
+    assert "#000000" not in last  # it would not be seen on a dark page
     with live_view.working("mine", "writing the report", "auto"):
         assert notebook.pages[0][-1].startswith(last)
         assert "writing the report" in notebook.pages[0][-1]

@@ -124,10 +124,11 @@ def _status_line(counts: dict[TrialStatus, int]) -> Text:
 def _best_text(best: Selection | None) -> Text:
     if best is None:
         return Text("no evaluation yet", style="dim")
-    text = Text(f"{return_text(best.point_score)}", style="bold green")
     where = f"{best.trial.trial_id}, at {best.checkpoint.num_env_steps:,} env steps"
-    text.append(f"  {describe_point(best.trial, _MAX_POINT)}  ({where})", style="default")
-    return text
+    # The rest has no style of its own: in a notebook the style "default" is black, on a dark page too.
+    return Text.assemble(
+        (return_text(best.point_score), "bold green"), f"  {describe_point(best.trial, _MAX_POINT)}  ({where})"
+    )
 
 
 def _trials(monitor: SweepMonitor, rows: Sequence[Row], width: int) -> Table:
