@@ -26,7 +26,7 @@ from tests.benchmarks.measure import Run, run
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 CLI = str(BIN / "tune-jobs")
-FIRST_RESULT = r"\([1-9][\d,]* env steps in all"
+FIRST_RESULT = r"[1-9][\d,]* of at most"
 MANY = 1000
 Row = tuple[str, str, str]
 
