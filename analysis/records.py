@@ -18,6 +18,8 @@ from analysis.notebook import Brief, facts_html
 
 FORMAT_VERSION = 2
 
+Objective = Literal["final", "area", "best", "steps_to_threshold"]
+"""What a setting is judged by; see `analysis.objectives`."""
 TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
 SweepState = Literal["created", "running", "interrupted", "completed"]
 """`created` means written, but not begun."""
@@ -202,8 +204,40 @@ class EvaluationRecord(_Record):
         return None if self.threshold is None else self.mean_return >= self.threshold
 
 
+class SettingRecord(_Record):
+    """A point of a sweep as a setting to train with, judged over its training seeds."""
+
+    point_index: Count
+    point: dict[str, Any]
+    trial_ids: tuple[TrialId, ...] = Field(description="The trials it was trained in, one a training seed.")
+    scores: tuple[Number, ...] = Field(description="The objective's value of each of them, higher is better.")
+    num_failed: Count = Field(description="How many of them failed; their scores are the worst of the sweep.")
+    num_solved: Count | None = Field(None, description="How many reached the threshold; None: the env has none.")
+    score: Number = Field(description="Mean of the scores.")
+    expected: Number = Field(description="What it is expected to be over many seeds, by which settings are ranked.")
+    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: one seed a setting.")
+    upper: float | None = None
+    probability_best: float | None = Field(None, description="That no other is better; None: one seed a setting.")
+    may_be_best: bool = Field(default=True, description="Whether the data can't tell it from the best.")
+
+
+class SettingsRecord(_Record):
+    """The settings of a sweep, ranked: which to train with."""
+
+    objective: Objective = Field(description="What they are judged by.")
+    threshold: float | None = None
+    num_settings: Count = Field(description="All that were trained, not only those that are listed.")
+    num_may_be_best: Count = Field(description="How many of all the data can't tell from the best, itself included.")
+    ranking: tuple[SettingRecord, ...] = Field(min_length=1, description="The leading ones, best first.")
+
+    @property
+    def best(self) -> SettingRecord:
+        """The setting to train with."""
+        return self.ranking[0]
+
+
 class BestRecord(_Record):
-    """The winner: best/evaluation.json."""
+    """Both answers of a sweep, the policy to deploy and the setting to train with: best/evaluation.json."""
 
     format_version: int = FORMAT_VERSION
     checkpoint: CheckpointRecord
@@ -212,6 +246,9 @@ class BestRecord(_Record):
     selection_score: Number = Field(description="Mean evaluation return it was chosen by.")
     confirmation: EvaluationRecord = Field(description="The winner on seeds it was not chosen on.")
     random: EvaluationRecord = Field(description="A random policy on the confirmation seeds.")
+    settings: SettingsRecord | None = Field(
+        None, description="The settings, which are another question than the policy; None: of an older version."
+    )
 
     @property
     def optimism_gap(self) -> float:
@@ -237,6 +274,15 @@ class BestRecord(_Record):
         return facts_html("Best policy", facts)
 
 
+class ReplicationRecord(_Record):
+    """More seeds that some points of a sweep were given, one each; see `analysis.numbering`."""
+
+    num_points: Annotated[int, Field(ge=1, le=2**31)] = Field(description="The points that the sweep had then.")
+    points: tuple[Annotated[int, Field(ge=0, le=2**31)], ...] = Field(
+        description="Their indices, in the order of the trials."
+    )
+
+
 class SweepRecord(_Record):
     """The record of a sweep: sweep.json."""
 
@@ -255,3 +301,4 @@ class SweepRecord(_Record):
     git_commit: str | None = None
     address: str | None = None
     allowed_modules: tuple[str, ...] = Field((), description="Modules of the user's own that its trials may import.")
+    replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from tune_jobs.sweeps.verbs import extend as extend
     from tune_jobs.sweeps.verbs import launch as launch
     from tune_jobs.sweeps.verbs import list_sweeps as list_sweeps
+    from tune_jobs.sweeps.verbs import replicate as replicate
     from tune_jobs.sweeps.verbs import report as report
     from tune_jobs.sweeps.verbs import restore as restore
     from tune_jobs.sweeps.verbs import resume as resume
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 _SWEEPS = (
     "CreatedSweep", "SweepResult", "SweepStatus", "best", "create", "dataframe", "drive", "evaluate", "extend",
-    "launch", "list_sweeps", "report", "restore", "resume", "status", "stop", "trials", "video",
+    "launch", "list_sweeps", "replicate", "report", "restore", "resume", "status", "stop", "trials", "video",
 )  # fmt: skip
 _HOME = {
     "TuneJobsError": "policies.errors",

@@ -58,6 +58,8 @@ TAKES = {
     "finish": {"flag"},
     "retry_failed": {"flag"},
     "num_samples": {"whole", "huge"},
+    "top": {"whole", "huge"},
+    "seeds": {"whole", "huge"},
     "num_episodes": {"whole"},
     "first_seed": {"whole", "zero", "none"},
     "seed": {"whole", "zero", "none"},
@@ -85,7 +87,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_whole_api_is_looked_at() -> None:
-    assert len(FUNCTIONS) == 19
+    assert len(FUNCTIONS) == 20
     assert {argument for _, argument in CASES} == set(TAKES)
 
 

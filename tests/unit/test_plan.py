@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from analysis.records import ReplicationRecord
 from policies.errors import CannotRunError, EnvError, SpecError
 from tune_jobs.plan import machine as machine_module
 from tune_jobs.plan.machine import Machine, local_machine
@@ -276,3 +277,26 @@ def test_available_memory_is_read(tmp_path: Path, text: str, expected: int | Non
 def test_gpus_are_those_that_cuda_would_see(monkeypatch: pytest.MonkeyPatch, visible: str, expected: int) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     assert local_machine().num_gpus == expected
+
+
+def test_replications_add_seeds_to_points_and_change_no_trial() -> None:
+    spec = load_spec(
+        {"env": "CartPole-v1", "algorithm": "ppo", "space": {"lr": {"uniform": [1e-4, 1e-2]}}, "num_samples": 3}
+    )
+    before = make_plan(spec, Machine(1))
+    added = [ReplicationRecord(num_points=3, points=(2, 0, 2))]
+    after = make_plan(spec, Machine(1), replications=added)
+    assert after.trials[:3] == before.trials
+    new = after.trials[3:]
+    assert [(trial.trial_id, trial.point_index, trial.seed_index) for trial in new] == [
+        ("t0003", 2, 1), ("t0004", 0, 1), ("t0005", 2, 2),
+    ]  # fmt: skip
+    assert [trial.point for trial in new] == [before.trials[index].point for index in (2, 0, 2)]
+    assert [trial.hyperparams for trial in new] == [before.trials[index].hyperparams for index in (2, 0, 2)]
+    assert len({trial.seed for trial in after.trials}) == 6
+    assert after.max_env_steps == 2 * before.max_env_steps
+    # Points that are added later come behind them, and draw what they would have drawn.
+    more = make_plan(spec.model_copy(update={"num_samples": 5}), Machine(1), replications=added)
+    assert more.trials[:6] == after.trials
+    longer = make_plan(spec.model_copy(update={"num_samples": 5}), Machine(1))
+    assert [trial.point for trial in more.trials[6:]] == [trial.point for trial in longer.trials[3:]]

@@ -234,4 +234,4 @@ def test_the_schema_and_the_helps_name_fields_and_options_that_there_are(text: s
     fields = {name for model in [SweepSpec, *HYPERPARAMS_BY_ALGORITHM.values()] for name in model.model_fields}
     fields |= {name for inner in SECTIONS.values() for name in inner}
     words = set(re.findall(r"\b[a-z]+(?:_[a-z]+)+\b", text))
-    assert words <= fields | {"huber_loss", "rl_module", "he_uniform"}
+    assert words <= fields | {"huber_loss", "rl_module", "he_uniform", "steps_to_threshold"}

@@ -25,6 +25,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UNCHANGED = {
     "launch": "No trial had begun, and nothing was kept.",
     "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` continues it.",
+    "replicate": "No trial had begun, and nothing was changed.",
     "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
 }
 _JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"

@@ -187,6 +187,28 @@ def extend(
 
 @cli.command()
 @sweep_argument
+@click.option("--top", type=click.IntRange(min=2), default=5, show_default=True, help="How many leading settings race.")
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="More seeds that a setting gets at most."
+)
+@run_options
+@click.pass_context
+def replicate(
+    ctx: click.Context, /, *, sweep: str, top: int, seeds: int, storage: str | None, as_json: bool, **options: Any
+) -> None:
+    """Train the leading settings of a sweep again, with fresh seeds, to see which is the best."""
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        result = result_of(sweeps.replicate, sweep, top=top, seeds=seeds, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
+    ctx.exit(result.exit_code)
+
+
+@cli.command()
+@sweep_argument
 @storage_option
 @json_option
 def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from analysis.records import BestRecord, EvaluationRecord, TrialRecord, TrialStatus
+    from analysis.records import BestRecord, EvaluationRecord, SettingsRecord, TrialRecord, TrialStatus
     from tune_jobs.spec.file import Preset
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
@@ -152,12 +152,28 @@ def _print_best(console: Console, best: BestRecord) -> None:
     point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
     where = f"{best.checkpoint.trial_id}, iteration {best.checkpoint.iteration}"
     facts = {
-        "best": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
+        "policy": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
         "chosen by": f"{return_text(best.selection_score)} mean evaluation return",
         "confirmed at": f"{_returns(best.confirmation)}; gap {difference_text(best.optimism_gap)}",
         "random policy": _returns(best.random),
     }
-    print_facts(console, facts | _verdict(best.confirmation))
+    print_facts(console, facts | _verdict(best.confirmation) | _setting_facts(best.settings))
+
+
+def _setting_facts(settings: SettingsRecord | None) -> dict[str, str]:
+    """Return which setting to train with, which is another answer than the policy."""
+    if settings is None or settings.num_settings < 2:
+        return {}
+    from analysis.answers import certainty, setting_score
+
+    best = settings.best
+    point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
+    return {
+        "setting": f"{point}  ({counted(len(best.scores), 'seed')}: {', '.join(best.trial_ids[:3])}"
+        f"{', ...' if len(best.trial_ids) > 3 else ''})",
+        "scored": setting_score(settings),
+        "how sure": certainty(settings),
+    }
 
 
 def show_evaluation(policy: EvaluationRecord, random: EvaluationRecord, *, as_json: bool) -> None:

@@ -36,7 +36,7 @@ def check_env_args(spec: SweepSpec) -> None:
 
 
 def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperparams]) -> None:
-    """Check a sweep's penalty and networks against its environment.
+    """Check a sweep's objective, penalty and networks against its environment.
 
     Args:
         spec: The sweep.
@@ -45,9 +45,15 @@ def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperpa
 
     Raises:
         SpecError: There is a penalty but no failure; convolutions but no images, or images but no convolutions; or a
-            constant action that the environment does not have.
+            constant action that the environment does not have; or the objective is about a threshold that nobody knows.
     """
     _check_constant_actions(spec, env, hyperparams)
+    if spec.objective.type == "steps_to_threshold" and spec.objective.threshold is None and env.threshold is None:
+        raise SpecError(
+            f"objective.type is steps_to_threshold, but {env.env_id} has no reward threshold, and objective.threshold "
+            "is not set.",
+            "Set objective.threshold to the evaluation return that counts as solved.",
+        )
     if spec.env.failure_penalty is not None:
         try:
             check_failure_penalty(env.env_id, env.failure, spec.env.failure_penalty)

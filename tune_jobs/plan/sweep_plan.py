@@ -13,7 +13,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from analysis.records import FINISHED, TrialPlan, TrialRecord
+from analysis.numbering import planned_places
+from analysis.records import FINISHED, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
 from policies.envs.make import EnvInfo
 from policies.errors import CannotRunError, SpecError
@@ -98,7 +99,12 @@ def trial_id(index: int) -> str:
 
 @guarding()
 def make_plan(
-    spec: SweepSpec, machine: Machine, records: Sequence[TrialRecord] = (), *, retry_failed: bool = False
+    spec: SweepSpec,
+    machine: Machine,
+    records: Sequence[TrialRecord] = (),
+    *,
+    replications: Sequence[ReplicationRecord] = (),
+    retry_failed: bool = False,
 ) -> SweepPlan:
     """Plan a sweep for a machine.
 
@@ -106,6 +112,7 @@ def make_plan(
         spec: The sweep.
         machine: What it runs on.
         records: The records of trials that exist already, which keep their engines.
+        replications: More seeds of some points, oldest first.
         retry_failed: Whether the failed ones of them run again.
 
     Raises:
@@ -122,7 +129,7 @@ def make_plan(
     check_env_args(spec)
     env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
     check_rl_module(spec)
-    num_trials = _num_trials(spec)
+    num_trials = num_points_of(spec) * spec.seeds_per_point + sum(len(item.points) for item in replications)
     if num_trials > MAX_TRIALS:
         raise SpecError(
             f"The sweep has {num_trials:,} trials; at most {MAX_TRIALS:,} can be planned.",
@@ -132,8 +139,8 @@ def make_plan(
     points = _points(spec)
     known = [values for _, values in points if values is not None]
     check_env_rules(spec, env, known)
-    trials, engine_notes = _trials(spec, env, points, records)
-    first_trials = trials[:: spec.seeds_per_point]
+    trials, engine_notes = _trials(spec, env, points, records, replications)
+    first_trials = [trial for trial in trials if trial.seed_index == 0]
     idle = idle_notes(
         spec,
         env,
@@ -159,9 +166,8 @@ def make_plan(
         max_concurrent=concurrent,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
-        max_env_steps=spec.seeds_per_point * sum(_largest(sizes, lambda each: max_env_steps(spec, each))),
-        max_disk_bytes=_SWEEP_BYTES
-        + spec.seeds_per_point * sum(_largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
+        max_env_steps=_total(trials, _largest(sizes, lambda each: max_env_steps(spec, each))),
+        max_disk_bytes=_SWEEP_BYTES + _total(trials, _largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
         env=env,
         machine=machine,
         notes=(*_notes(spec, env, concurrent if packs is None else None), *idle_settings(spec), *idle, *engine_notes),
@@ -169,9 +175,9 @@ def make_plan(
     )
 
 
-def _num_trials(spec: SweepSpec) -> int:
-    points = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
-    return points * spec.seeds_per_point
+def num_points_of(spec: SweepSpec) -> int:
+    """Return the number of a sweep's points."""
+    return spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
 
 
 def _points(spec: SweepSpec) -> list[_Point]:
@@ -183,27 +189,35 @@ def _points(spec: SweepSpec) -> list[_Point]:
 
 
 def _trials(
-    spec: SweepSpec, env: EnvInfo, points: Sequence[_Point], records: Sequence[TrialRecord]
+    spec: SweepSpec,
+    env: EnvInfo,
+    points: Sequence[_Point],
+    records: Sequence[TrialRecord],
+    replications: Sequence[ReplicationRecord],
 ) -> tuple[tuple[TrialPlan, ...], tuple[str, ...]]:
     """Return the trials, and the notes on their engines."""
-    seeds = trial_seeds(spec.seed, len(points) * spec.seeds_per_point)
+    numbered = planned_places(len(points), spec.seeds_per_point, replications)
+    seeds = trial_seeds(spec.seed, len(numbered))
+    dumped = [{} if values is None else values.model_dump(mode="json") for _, values in points]
+    chosen = {record.point_index: record for record in records if record.has_point}
     trials: list[TrialPlan] = []
-    for point_index, (point, values) in enumerate(points):
-        dumped = {} if values is None else values.model_dump(mode="json")
-        for seed_index in range(spec.seeds_per_point):
-            index = len(trials)
-            trials.append(
-                TrialPlan(
-                    trial_id=trial_id(index),
-                    index=index,
-                    point_index=point_index,
-                    seed_index=seed_index,
-                    seed=seeds[index],
-                    point=point or {},
-                    hyperparams=dumped,
-                    has_point=point is not None,
-                )
+    for index, (point_index, seed_index) in enumerate(numbered):
+        point, hyperparams = points[point_index][0], dumped[point_index]
+        if point is None and seed_index >= spec.seeds_per_point and point_index in chosen:
+            # More seeds of a point that the search method has chosen meanwhile.
+            point, hyperparams = chosen[point_index].point, chosen[point_index].hyperparams
+        trials.append(
+            TrialPlan(
+                trial_id=trial_id(index),
+                index=index,
+                point_index=point_index,
+                seed_index=seed_index,
+                seed=seeds[index],
+                point=point or {},
+                hyperparams=hyperparams,
+                has_point=point is not None,
             )
+        )
     choice = choose_engines(
         spec,
         env,
@@ -242,6 +256,11 @@ def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]
         return [[values, *largest_hyperparams(spec, known)] for values in known]
     unknown = spec.num_samples - len(known) if spec.search.type == "tpe" else 0
     return [[values] for values in known] + ([largest_hyperparams(spec, known)] * unknown if unknown else [])
+
+
+def _total(trials: Sequence[TrialPlan], of_points: Sequence[int]) -> int:
+    """Return the sum over trials of a number that is known for each point."""
+    return sum(of_points[trial.point_index] for trial in trials)
 
 
 def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], int]) -> list[int]:
@@ -355,6 +374,10 @@ def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
             "trials may end before they solve it."
         )
     wanted = spec.resources.max_concurrent
-    if wanted is not None and concurrent is not None and concurrent < min(wanted, _num_trials(spec)):
+    if (
+        wanted is not None
+        and concurrent is not None
+        and concurrent < min(wanted, num_points_of(spec) * spec.seeds_per_point)
+    ):
         notes.append(f"resources.max_concurrent is {wanted}, but only {counted(concurrent, 'trial')} can run at once.")
     return notes

@@ -13,23 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 from ray import tune
-from ray.exceptions import RayActorError, RayTaskError
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
-from policies.errors import TuneJobsError, said_by
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
+from tune_jobs.ray_tune.failures import describe_failure, error_of, was_lost
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import PopulationScheduler
 from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
 from tune_jobs.ray_tune.reporter import reporter
+from tune_jobs.ray_tune.scheduling import EveryoneGoesOn
 from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
@@ -38,8 +37,6 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
 from tune_jobs.store.local_storage import open_sweep
-from tune_jobs.store.logs import died_by
-from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 
@@ -80,18 +77,11 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         store.clear_tune_folder()
         for trial_id in job.trial_ids:
             remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
-    wanted = set(job.trial_ids)
-    packed = [] if job.packs is None else [name for name in job.packs.trial_ids if name in wanted]
-    others = [name for name in job.trial_ids if name not in set(packed)]
     with RayWatch.of_this_process() as watch:
         run = _Run(job, store, listener, owner, watch)
         watch.when_stuck = functools.partial(_give_up, run)
         try:
-            if packed:
-                run.packs(packed)
-            # Packs first, then single trials, because a pack uses all its CPUs all the time.
-            if others and not (packed and store.stop_requested()):
-                run.single_trials(others)
+            run.all_trials()
         except (RayDiedError, Exception) as error:
             if isinstance(error, RayDiedError):
                 raise ray_died(store.name, error) from error
@@ -118,16 +108,40 @@ class _Run:
         self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
         self._spec = stored_spec(store.read_record())
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
-        self._scheduler = self._build_scheduler()
-        chooser = PointChooser(self._spec, self.keeper.all_records, self.keeper.change)
-        self._chooser = chooser if self._spec.search.type == "tpe" else None
+        self._scheduler: TrialScheduler = TuneScheduler(EveryoneGoesOn())
+        self._chooser: PointChooser | None = None
+
+    def all_trials(self) -> None:
+        """Run all trials: those of the search first, then the further seeds of some of its points."""
+        spec = self._spec
+        replicas = [name for name in self._job.trial_ids if self.keeper.record(name).seed_index >= spec.seeds_per_point]
+        searched = [name for name in self._job.trial_ids if name not in set(replicas)]
+        if searched:
+            self._scheduler = self._build_scheduler()
+            if spec.search.type == "tpe":
+                self._chooser = PointChooser(spec, self.keeper.all_records, self.keeper.change)
+            self._stage(searched, "")
+        if replicas and not (searched and self.store.stop_requested()):
+            # They show what a setting gives when it is trained to the end: none of them is compared and ended.
+            self._scheduler, self._chooser = TuneScheduler(EveryoneGoesOn()), None
+            self._stage(replicas, "-of-replicas")
+
+    def _stage(self, trial_ids: Sequence[str], suffix: str) -> None:
+        plan = self._job.packs
+        packed = [] if plan is None else [name for name in plan.trial_ids if name in set(trial_ids)]
+        others = [name for name in trial_ids if name not in set(packed)]
+        if packed:
+            self._packs(packed, f"packs{suffix}")
+        # Packs first, then single trials, because a pack uses all its CPUs all the time.
+        if others and not (packed and self.store.stop_requested()):
+            self._single_trials(others, f"run{suffix}")
 
     def _build_scheduler(self) -> TrialScheduler:
         if self._spec.scheduler.type == "pbt":
             return PopulationScheduler(self._spec, self._store, self.keeper.record, self.keeper.change)
         return build_tune_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
 
-    def packs(self, trial_ids: Sequence[str]) -> None:
+    def _packs(self, trial_ids: Sequence[str], folder: str) -> None:
         """Run trials in packs; for Tune, each pack is one trial."""
         plan = self._job.packs
         assert plan is not None
@@ -152,10 +166,10 @@ class _Run:
                 scheduler=PackScheduler(driver), trial_name_creator=_pack_id, trial_dirname_creator=_pack_id
             ),
             # The driver decides which of a dead pack's trials are retried, and the run ends when none is left.
-            run_config=self._run_config("packs", events, -1, lambda: driver.is_finished),
+            run_config=self._run_config(folder, events, -1, lambda: driver.is_finished),
         ).fit()
 
-    def single_trials(self, trial_ids: Sequence[str]) -> None:
+    def _single_trials(self, trial_ids: Sequence[str], folder: str) -> None:
         """Run single trials, as many at once as fit."""
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
@@ -178,7 +192,7 @@ class _Run:
                 trial_name_creator=_trial_id,
                 trial_dirname_creator=_trial_id,
             ),
-            run_config=self._run_config("run", events, spec.max_retries),
+            run_config=self._run_config(folder, events, spec.max_retries),
         ).fit()
 
     def _run_config(
@@ -289,8 +303,8 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         self._failed(trial, retried=False)
 
     def _failed(self, trial: Trial, *, retried: bool) -> None:
-        trial_id, error = _trial_id(trial), _error_of(trial)
-        if _was_lost(error):
+        trial_id, error = _trial_id(trial), error_of(trial)
+        if was_lost(error):
             self._keeper.lost(trial_id)
             return
         self._watch.check_after(error)
@@ -336,8 +350,8 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Note that the pack's process died; Tune starts another one."""
-        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), _error_of(trial)
-        if _was_lost(error):
+        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), error_of(trial)
+        if was_lost(error):
             self._driver.lost(pack_id)
             return
         self._watch.check_after(error)
@@ -361,37 +375,3 @@ def _give_up(run: _Run, death: RayDiedError) -> None:
 
     run.keeper.close()
     end_process(run.store, ray_died(run.store.name, death))
-
-
-def _error_of(trial: Trial) -> BaseException | None:
-    # Trial.get_pickled_error looks where Tune syncs to, but nothing has been synced yet; Tune writes the error here.
-    path = trial.pickled_error_file
-    if not path or not Path(path).is_file():
-        return None
-    error: BaseException = cloudpickle.loads(Path(path).read_bytes())
-    return error
-
-
-def _was_lost(error: BaseException | None) -> bool:
-    """Whether a process ended because another one took over its work, which is no failure of a trial."""
-    return isinstance(getattr(error, "cause", None), OwnershipLostError)
-
-
-def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float, what: str = "trial") -> str:
-    """Describe why a trial or a pack failed, in one line, followed by the end of its log.
-
-    Args:
-        error: The error that Ray Tune reports.
-        tail: The end of the log, from `logs.log_tail`.
-        timeout_s: The sweep's `iteration_timeout_s`.
-        what: What the process ran, a trial or a pack.
-    """
-    if isinstance(error, RayTaskError):
-        cause = error.cause if isinstance(error.cause, BaseException) else error
-        message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {said_by(cause)}"
-    elif isinstance(error, RayActorError):
-        why = died_by(tail, timeout_s) or ("its node was taken away" if error.preempted else "")
-        message = f"The process of the {what} died{f': {why}' if why else ''}."
-    else:
-        message = said_by(error) if error is not None else "Unknown error."
-    return f"{message}\n{tail}".strip()

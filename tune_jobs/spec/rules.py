@@ -92,6 +92,20 @@ def check_extendable(spec: SweepFields) -> None:
         )
 
 
+def check_replicable(spec: SweepFields) -> None:
+    """Check that the sweep's points can be trained again with other seeds.
+
+    Raises:
+        SpecError: Trials of a population change their values while they train.
+    """
+    if spec.scheduler.type == "pbt":
+        raise SpecError(
+            "The sweep cannot be replicated: with population based training (scheduler.type pbt) a trial's values "
+            "change while it trains, so that none of them is a setting that could be trained again.",
+            "Launch a sweep of the values that the best trial ended with, fixed, with a larger seeds_per_point.",
+        )
+
+
 def _tpe_problems(spec: SweepFields) -> Found:
     if is_baseline(spec):
         return [("search.type", f"tpe needs an algorithm that learns, and {spec.algorithm} does not: use random")]

@@ -15,6 +15,7 @@ from pydantic import (
     field_serializer,
 )
 
+from analysis.records import Objective
 from policies.hyperparams import Algorithm
 from tune_jobs.spec.domains import Domain, Number, WholeNumber
 from tune_jobs.spec.engines import ENGINES
@@ -133,6 +134,18 @@ class SchedulerSpec(Section):
     )
 
 
+class ObjectiveSpec(Section):
+    """What a setting is judged by; the best policy is chosen by its evaluations, whatever this says."""
+
+    type: Objective = Field(
+        "final",
+        description="final: its last 100 training episodes, and the evaluations since they began; area: the mean "
+        "evaluation over all of them; best: its best evaluation; steps_to_threshold: the env steps to the first "
+        "evaluation that reaches the threshold.",
+    )
+    threshold: Number | None = Field(None, description="steps_to_threshold: the return to reach; null: the env's own.")
+
+
 class EvaluationSpec(Section):
     """Greedy episodes during training, on seeds that are the same for all trials."""
 
@@ -213,6 +226,9 @@ class SweepFields(Section):
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
     )
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
+    objective: Annotated[ObjectiveSpec, _from_text("type")] = Field(
+        default_factory=ObjectiveSpec, description="What a setting is judged by: its type, or a mapping."
+    )
     checkpoints: CheckpointSpec = Field(
         default_factory=CheckpointSpec, description="Which checkpoints of a trial are kept."
     )

@@ -11,12 +11,13 @@ import functools
 import logging
 from collections.abc import Mapping, Sequence
 
+from analysis.numbering import place_of
 from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
 from analysis.selection import Selection, select_best
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from policies.portable.file import PortablePolicy, read_policy
 from tune_jobs.store.contract import Sweep, Trial
-from tune_jobs.store.names import RESULTS
+from tune_jobs.store.names import RESULTS, SWEEP_RECORD
 from tune_jobs.store.results_file import Scored
 from tune_jobs.store.transitions import with_checkpoints
 
@@ -112,7 +113,12 @@ def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:
     if type(seeds) is not int or seeds < 1:
         return {}
     index = int(record.trial_id[1:])
-    return {"index": index, "point_index": index // seeds, "seed_index": index % seeds}
+    try:
+        return {"index": index, **place_of(index, seeds, sweep.replications)._asdict()}
+    except ValueError as error:
+        raise CheckpointError(
+            f"The record of sweep {sweep.name} is damaged: {error}.", f"Restore {SWEEP_RECORD} from a backup."
+        ) from error
 
 
 def _agrees(trial: Trial, checkpoint: CheckpointRecord, lines: Sequence[Scored]) -> bool:

@@ -28,6 +28,7 @@ from tune_jobs.store.candidates import choose, leave_out, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.local_storage import open_storage, open_sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
+from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.storage import expanded, storage_folder
 from tune_jobs.training.registry import engine_of_checkpoint
 
@@ -78,18 +79,21 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
     """
     sweep = _trusted(store).read_record()
     spec = stored_spec(sweep)
-    selection, portable = choose(store, read_trials(store))
+    trials = read_trials(store)
+    selection, portable = choose(store, trials)
     seeds = confirmation_seeds(spec.seed, num_episodes)
     policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
     env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
     random = random_policy(env_id, env_args, timeout_s)
+    confirmation = run_evaluation(policy, env_id, env_args, seeds, timeout_s)
     record = BestRecord(
         checkpoint=selection.checkpoint,
         point=selection.trial.point_at(selection.checkpoint.iteration),
         seed=selection.trial.seed,
         selection_score=selection.score,
-        confirmation=run_evaluation(policy, env_id, env_args, seeds, timeout_s),
+        confirmation=confirmation,
         random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
+        settings=judged(spec, trials, read_results(store), confirmation.threshold),
     )
     store.write_best(record, portable)
     return record

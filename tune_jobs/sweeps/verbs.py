@@ -1,20 +1,18 @@
 """Everything one can do with a sweep: the functions behind both the command line and the Python API.
 
 Words: *create* writes a new sweep, *drive* runs it, *launch* does both, *resume* continues an interrupted one,
-*extend* adds trials to one, *stop* ends one that another process or thread runs. A sweep is named by its folder, or by
-its name in the storage folder.
+*extend* adds points to one, *replicate* trains its leading points with more seeds, *stop* ends one that another process
+or thread runs. A sweep is named by its folder, or by its name in the storage folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from analysis.records import BestRecord, EvaluationRecord
-from policies.arguments import NumEpisodes, PositiveInt, Seed, checked
+from policies.arguments import PositiveInt, checked
 from policies.envs.modules import allowed_again
 from policies.guard.guard import guarding
 from tune_jobs.plan.sweep_plan import make_plan
@@ -24,16 +22,14 @@ from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
 from tune_jobs.sweeps.drive import connected, machine_here, run_sweep, settled, write_new
 from tune_jobs.sweeps.outcome import SweepResult
-from tune_jobs.sweeps.results import Films, dataframe, report, trials
+from tune_jobs.sweeps.policies import best, evaluate, restore, video
+from tune_jobs.sweeps.results import dataframe, report, trials
 from tune_jobs.sweeps.status import SweepStatus, list_sweeps, status
-from tune_jobs.sweeps.storage import choose_store, create_store, expanded, stem_of, storage_folder
-
-if TYPE_CHECKING:
-    from ray.rllib.algorithms.algorithm import Algorithm
+from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storage_folder
 
 __all__ = [
     "CreatedSweep", "SweepResult", "SweepStatus", "best", "create", "dataframe", "drive", "evaluate", "extend",
-    "launch", "list_sweeps", "report", "restore", "resume", "status", "stop", "trials", "video",
+    "launch", "list_sweeps", "replicate", "report", "restore", "resume", "status", "stop", "trials", "video",
 ]  # fmt: skip
 
 Progress = Literal["auto", "none"]
@@ -260,6 +256,44 @@ def extend(
 
 
 @checked
+@run_alone
+def replicate(
+    sweep: str | Path,
+    *,
+    top: PositiveInt = 5,
+    seeds: PositiveInt = 5,
+    storage: str | Path | None = None,
+    address: str | None = None,
+    finish: bool = True,
+    progress: Progress = "auto",
+) -> SweepResult:
+    """Train the leading settings of a sweep again with fresh seeds, and rank them anew.
+
+    The settings race: one that the seeds so far show to be worse than another gets no more of them. Whatever is missing
+    of the sweep is run first. A scheduler of the sweep ends none of the new trials.
+
+    Args:
+        sweep: Name or folder.
+        top: How many of the leading settings race.
+        seeds: How many more seeds a setting gets at most.
+        storage: Folder for sweeps.
+        address: Ray cluster to run on.
+        finish: The same as for `launch`.
+        progress: The same as for `launch`.
+
+    Raises:
+        SpecError: The sweep is one of population based training, whose trials have no setting.
+        NotFoundError: There is no such sweep.
+        CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
+        SweepInterrupted: In the same cases as `launch`; `resume` trains what is missing of the seeds that were given.
+    """
+    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.replicate import run_race
+
+    return run_race(find_sweep(sweep, storage), address, top=top, seeds=seeds, finish=finish, progress=progress)
+
+
+@checked
 def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
     """Ask the process that runs a sweep to stop; its running trials save a checkpoint first.
 
@@ -273,123 +307,3 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
         return False
     store.request_stop()
     return True
-
-
-@allowed_again()
-@checked
-def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: NumEpisodes = 100) -> BestRecord:
-    """Choose a sweep's winner, confirm it on fresh seeds, and copy its policy to best/.
-
-    Raises:
-        NotFoundError: There is no such sweep, or none of its trials can win (the message says why).
-    """
-    from tune_jobs.sweeps.conclude import choose_best, find_sweep
-
-    return choose_best(find_sweep(sweep, storage), num_episodes)
-
-
-@allowed_again()
-@checked
-@guarding(start=True)
-def evaluate(
-    source: str | Path,
-    *,
-    storage: str | Path | None = None,
-    num_episodes: NumEpisodes = 100,
-    first_seed: Seed | None = None,
-    env_id: str | None = None,
-    action: int | Sequence[float] | None = None,
-) -> tuple[EvaluationRecord, EvaluationRecord]:
-    """Run greedy episodes of a policy, and of a random one on the same seeds.
-
-    Args:
-        source: A sweep (its best), `SWEEP/TRIAL`, a checkpoint folder, a policy file, `random` or `constant`.
-        storage: Folder for sweeps.
-        num_episodes: How many episodes.
-        first_seed: Seeds are this and the next ones; None: seeds that no training or selection uses.
-        env_id: An environment other than the policy's own; needed for a baseline.
-        action: The action of `constant`; None: 0.
-
-    Returns:
-        The policy's record, and the random policy's.
-
-    Raises:
-        NotFoundError: There is no such policy.
-    """
-    from tune_jobs.sweeps import conclude as finish
-
-    return finish.evaluate(finish.find_policy(source, storage, env_id, action), num_episodes, first_seed)
-
-
-@allowed_again()
-@checked
-@guarding()
-def video(
-    source: str | Path,
-    *,
-    storage: str | Path | None = None,
-    output: str | Path | None = None,
-    seed: Seed | None = None,
-    env_id: str | None = None,
-    action: int | Sequence[float] | None = None,
-) -> Films:
-    """Film a policy.
-
-    Args:
-        source: The same as for `evaluate`.
-        storage: Folder for sweeps.
-        output: File to write, as .mp4 and as .gif; or a folder, that exists or whose name ends with `/`, for files
-            called after policy and environment. None: into a sweep's best/ (with the random policy before, and both
-            side by side), else into the current folder.
-        seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
-        env_id: An environment other than the policy's own; needed for a baseline.
-        action: The action of `constant`; None: 0.
-
-    Returns:
-        The files.
-
-    Raises:
-        NotFoundError: There is no such policy.
-        EnvError: The environment cannot be drawn.
-    """
-    from tune_jobs.sweeps import conclude as finish
-
-    found = finish.find_policy(source, storage, env_id, action)
-    if output is None and found.store is not None:
-        return Films(finish.make_videos(found.store, seed))
-    name = str(source).replace("/", "-").lstrip(".-") or "policy"
-    target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
-    return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
-
-
-def _film_path(output: str | Path | None, name: str) -> Path:
-    """Return the path of a film; it gets the name `name` if `output` names no file."""
-    if output is None:
-        return Path(name)
-    path = expanded(output)
-    if str(output).endswith("/") or path.is_dir():
-        return path / name
-    # Another suffix, such as that of `cartpole-v0.5`, is kept.
-    return path if path.suffix.lower() in (".mp4", ".gif") else path.with_name(f"{path.name}.mp4")
-
-
-@checked
-def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorithm:
-    """Restore a checkpoint as an RLlib `Algorithm` that can continue training.
-
-    Checkpoints of the rllib engine are pickles: restore only sweeps you trust.
-
-    Args:
-        source: A sweep (its best checkpoint), `SWEEP/TRIAL` (the trial's best), or a checkpoint folder.
-        storage: Folder for sweeps.
-
-    Raises:
-        NotFoundError: There is no such checkpoint.
-        CheckpointError: It is damaged, of a baseline, or cannot be restored with exactly the weights that were saved.
-    """
-    from tune_jobs.sweeps.conclude import find_trained_checkpoint
-    from tune_jobs.training.registry import restore_checkpoint
-
-    folder, engine = find_trained_checkpoint(source, storage)
-    algorithm: Algorithm = restore_checkpoint(folder, engine)
-    return algorithm

@@ -1,0 +1,53 @@
+"""Say in words which setting to train with, what it scored, and how sure that is."""
+
+from __future__ import annotations
+
+from analysis.records import Objective, SettingsRecord
+from analysis.wording import counted, return_text
+
+_MEANS: dict[Objective, str] = {
+    "final": "at the end of training",
+    "area": "over all of training",
+    "best": "in its best evaluation",
+    "steps_to_threshold": "env steps to the threshold",
+}
+
+
+def setting_score(settings: SettingsRecord) -> str:
+    """Return what the leading setting scored, with its interval over training seeds and how many solved the env."""
+    best = settings.best
+    # Fewer env steps are better, so that they are scored below zero.
+    sign = -1.0 if settings.objective == "steps_to_threshold" else 1.0
+    said = return_text if sign > 0 else _steps_text
+    parts = [f"{said(sign * best.score)} {_MEANS[settings.objective]}"]
+    if best.lower is not None and best.upper is not None:
+        low, high = sorted((sign * best.lower, sign * best.upper))
+        parts[0] += f" ({said(low)} to {said(high)} with 95 %, over training seeds)"
+    if best.num_solved is not None:
+        parts.append(f"{best.num_solved} of {counted(len(best.scores), 'seed')} solved it")
+    if best.num_failed:
+        parts.append(f"{best.num_failed} failed")
+    return "; ".join(parts)
+
+
+def certainty(settings: SettingsRecord) -> str:
+    """Return how sure it is that the leading setting is the best."""
+    best = settings.best
+    if best.probability_best is None:
+        return "one seed a setting names a good policy, not a good setting: see `tune-jobs replicate`"
+    text = f"the best of {settings.num_settings:,} with {_percent(best.probability_best)}"
+    others = settings.num_may_be_best - 1
+    if others <= 0:
+        return f"{text}; the data tell it from all others"
+    return f"{text}; {counted(others, 'other')} can't be told from it"
+
+
+def _steps_text(steps: float) -> str:
+    return f"{max(0.0, steps):,.0f}"
+
+
+def _percent(probability: float) -> str:
+    """Return a probability that is computed from draws: never as certain."""
+    if probability > 0.99:
+        return "over 99 %"
+    return "under 1 %" if probability < 0.01 else f"{100 * probability:.0f} %"

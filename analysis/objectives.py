@@ -1,0 +1,192 @@
+"""What a setting is judged by: one score a training seed, from all that its trial showed.
+
+A *setting* is a point of the sweep: values to train with. That is another question than which checkpoint is the best
+*policy* (`analysis.selection`): a setting is good if training with it goes well again, on seeds nobody has seen. So its
+score is never the best of many evaluations, which is mostly luck, unless that is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.records import IterationRecord, Objective, TrialRecord
+from analysis.statistics import area_under_curve, moderated_means
+
+_LEAST_BETWEEN = 1e-3
+_NUM_LAST_EPISODES = 100
+"""`final` is about a trial's last training episodes, so many or all."""
+
+
+@dataclass(frozen=True)
+class SettingScores:
+    """A point of a sweep, and the scores of its trials."""
+
+    point_index: int
+    point: dict[str, Any]
+    scores: tuple[float, ...]
+    """One a training seed, higher is better; a seed that failed has the worst score of the sweep."""
+    trial_ids: tuple[str, ...]
+    """The trials, in the order of the scores."""
+    num_failed: int
+    expected: float
+    """What its mean over many seeds is expected to be, see `expected_means`; settings are ranked by this."""
+
+    @property
+    def mean(self) -> float:
+        """Mean over the seeds."""
+        return math.fsum(self.scores) / len(self.scores)
+
+
+def rank_settings(
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    objective: Objective = "final",
+    *,
+    num_env_steps: int,
+    threshold: float | None = None,
+) -> list[SettingScores]:
+    """Return the settings of a sweep, the one with the best expected mean first; of equal ones, the lower index.
+
+    Trials that have not ended are left out, and so are settings that have no others. A trial that failed, or ended
+    without any whole episode, counts as the worst of all: to leave it out would raise the mean of its setting.
+
+    Args:
+        trials: The trials of one sweep.
+        results: Iterations by trial id, oldest first.
+        objective: What a trial is judged by.
+        num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
+        threshold: The return to reach, for `steps_to_threshold`.
+
+    Raises:
+        ValueError: `steps_to_threshold` without a threshold.
+    """
+    shown: dict[str, float | None] = {}
+    for trial in trials:
+        if trial.status == "failed":
+            shown[trial.trial_id] = None
+        elif trial.status in ("completed", "stopped"):
+            shown[trial.trial_id] = trial_score(
+                results.get(trial.trial_id, ()), objective, num_env_steps=num_env_steps, threshold=threshold
+            )
+    known = {trial_id: score for trial_id, score in shown.items() if score is not None}
+    if not known:
+        return []
+    worst = min(known.values())
+    members: defaultdict[int, list[TrialRecord]] = defaultdict(list)
+    for trial in sorted(trials, key=lambda item: item.index):
+        if trial.trial_id in shown:
+            members[trial.point_index].append(trial)
+    scores = {index: tuple(known.get(seed.trial_id, worst) for seed in seeds) for index, seeds in members.items()}
+    expected = expected_means(list(scores.values()))
+    settings = [
+        SettingScores(
+            point_index=index,
+            point=seeds[0].point,
+            scores=scores[index],
+            trial_ids=tuple(seed.trial_id for seed in seeds),
+            num_failed=sum(seed.status == "failed" for seed in seeds),
+            expected=value,
+        )
+        for (index, seeds), value in zip(members.items(), expected, strict=True)
+    ]
+    return sorted(settings, key=lambda item: (-item.expected, -item.mean, item.point_index))
+
+
+def trial_score(
+    iterations: Sequence[IterationRecord],
+    objective: Objective,
+    *,
+    num_env_steps: int,
+    threshold: float | None = None,
+) -> float | None:
+    """Return what a trial scored; None: it showed nothing that can be scored.
+
+    - `final`: how well it does at the end. The mean return of its last 100 or more training episodes (whole iterations
+      of them) and the mean of the greedy evaluations since the first of those ended, in equal parts: evaluations are of
+      the policy that one gets, but few; training episodes explore, but there are many (decision 29).
+    - `area`: the mean evaluation return over all its env steps, `statistics.area_under_curve`.
+    - `best`: its best evaluation.
+    - `steps_to_threshold`: minus the env steps to the first evaluation that reaches the threshold, and minus twice
+      `num_env_steps` if none does, as in PAR2, the penalised run time of algorithm configuration (Hutter et al. 2009,
+      "ParamILS", section 2).
+
+    Args:
+        iterations: Its iterations, oldest first.
+        objective: What it is judged by.
+        num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
+        threshold: The return to reach, for `steps_to_threshold`.
+
+    Raises:
+        ValueError: `steps_to_threshold` without a threshold.
+    """
+    evaluated = [(item.num_env_steps, item.evaluation_return) for item in iterations]
+    evaluations = [(steps, value) for steps, value in evaluated if value is not None and math.isfinite(value)]
+    if objective == "steps_to_threshold":
+        if threshold is None:
+            raise ValueError("steps_to_threshold needs a threshold")
+        reached = (steps for steps, value in evaluations if value >= threshold)
+        return -float(next(reached, 2 * num_env_steps)) if iterations else None
+    if objective == "final":
+        return _final(iterations, evaluations)
+    if not evaluations:
+        return None
+    if objective == "best":
+        return max(value for _, value in evaluations)
+    steps, values = zip(*evaluations, strict=True)
+    return area_under_curve(steps, values, num_env_steps=max(num_env_steps, steps[-1]))
+
+
+def _final(iterations: Sequence[IterationRecord], evaluations: Sequence[tuple[int, float]]) -> float | None:
+    exploring: list[float] = []
+    begun = 0
+    for item in reversed(iterations):
+        exploring += [value for value in item.episode_returns if math.isfinite(value)]
+        begun = item.num_env_steps
+        if len(exploring) >= _NUM_LAST_EPISODES:
+            break
+    greedy = [value for steps, value in evaluations if steps >= begun]
+    means = [math.fsum(values) / len(values) for values in (greedy, exploring) if values]
+    return math.fsum(means) / len(means) if means else None
+
+
+def expected_means(settings: Sequence[Sequence[float]]) -> list[float]:
+    """Return what each setting's mean over many seeds is expected to be: its mean, drawn back to that of all.
+
+    The fewer seeds a setting has, and the less settings differ beside how much seeds do, the further: the best of many
+    means over one seed is mostly a lucky one. It is the posterior mean where settings come from a normal distribution.
+    With one seed a setting nothing is known of how seeds differ, and the means are returned as they are.
+
+    Args:
+        settings: For each setting one score a training seed.
+
+    Source:
+        DerSimonian & Laird 1986, "Meta-Analysis in Clinical Trials", for the variance between settings; Morris 1983,
+        "Parametric Empirical Bayes Inference", for the means.
+    """
+    plain = [math.fsum(scores) / len(scores) for scores in settings]
+    if len(plain) < 2 or max(map(len, settings)) < 2:
+        return plain
+    means = np.array(plain)
+    try:
+        variances = moderated_means(settings).standard_errors ** 2
+    except ValueError:  # so large that their squares are not finite
+        return plain
+    if not variances.all():
+        return plain
+    weights = 1.0 / variances
+    centre = float((weights * means).sum() / weights.sum())
+    excess = float((weights * (means - centre) ** 2).sum()) - (len(means) - 1)
+    between = excess / float(weights.sum() - (weights**2).sum() / weights.sum())
+    # Where settings differ no more than chance would make them, they differ a little all the same: the better ones come
+    # first, those with more seeds further than a lucky one.
+    between = max(between, _LEAST_BETWEEN * float(variances.mean()))
+    weights = 1.0 / (variances + between)
+    centre = float((weights * means).sum() / weights.sum())
+    drawn: list[float] = (centre + (means - centre) * between / (variances + between)).tolist()
+    return drawn

@@ -1,0 +1,80 @@
+"""Race settings: which of a sweep's leading settings are trained with more seeds, and which no longer.
+
+A sweep with one seed a setting cannot tell which setting is best: its leaders led with their luck too. So the leading
+ones are trained with fresh seeds, in rounds. After each round the worse half is out, and the others get twice as many
+seeds in the next: sequential halving (Karnin, Koren & Somekh 2013, "Almost Optimal Exploration in Multi-Armed
+Bandits"), which spends most on the settings that are hard to tell apart. A setting is out earlier if it is hardly
+possible that it is the best. Decision 29 compares this with other ways to spend the same env steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from analysis.objectives import expected_means
+from analysis.statistics import probability_of_being_best
+from policies import random_streams
+
+HARDLY_POSSIBLE = 0.02
+"""A setting that is the best of all with less than this probability is out."""
+
+
+@dataclass(frozen=True)
+class Race:
+    """A race of some settings.
+
+    Args:
+        contenders: The indices of the points that race, best first.
+        num_seeds: How many more seeds a setting gets at most.
+    """
+
+    contenders: tuple[int, ...]
+    num_seeds: int
+
+    @property
+    def rounds(self) -> tuple[tuple[int, int], ...]:
+        """For each round, how many settings race in it at most, and how many more seeds each of them gets."""
+        num_rounds = max(1, math.ceil(math.log2(len(self.contenders)))) if self.contenders else 0
+        num_rounds = min(num_rounds, self.num_seeds)
+        weights = [2**index for index in range(num_rounds)]
+        # The seeds up to the end of each round, rounded; each round gives one at least.
+        ends = [0]
+        for index in range(num_rounds):
+            share = self.num_seeds * sum(weights[: index + 1]) / sum(weights)
+            ends.append(max(ends[-1] + 1, min(round(share), self.num_seeds - (num_rounds - 1 - index))))
+        sizes = [max(2, math.ceil(len(self.contenders) / 2**index)) for index in range(num_rounds)]
+        return tuple((size, ends[index + 1] - ends[index]) for index, size in enumerate(sizes))
+
+    @property
+    def max_trainings(self) -> int:
+        """How many trainings the race takes at most."""
+        return sum(min(size, len(self.contenders)) * seeds for size, seeds in self.rounds)
+
+    def next_points(self, scores: Mapping[int, Sequence[float]], num_done: int) -> tuple[int, ...]:
+        """Return the points that get one more seed each in the next round, the better first.
+
+        Args:
+            scores: For each contender one score a training seed, of all its trainings so far; higher is better.
+            num_done: How many rounds are over.
+
+        Returns:
+            The points, each as often as it gets a seed; none: the race is over.
+        """
+        if num_done >= len(self.rounds) or len(self.contenders) < 2:
+            return ()
+        size, seeds = self.rounds[num_done]
+        running = list(self.contenders) if num_done == 0 else self._still_in(scores, size)
+        if len(running) < 2:
+            return ()
+        # Seed after seed, so that a round that is interrupted has given about as many to each.
+        return tuple(index for _ in range(seeds) for index in running)
+
+    def _still_in(self, scores: Mapping[int, Sequence[float]], size: int) -> list[int]:
+        known = [scores[index] for index in self.contenders]
+        means = dict(zip(self.contenders, expected_means(known), strict=True))
+        # The same scores decide the same, whenever it is asked.
+        chances = probability_of_being_best(known, rng=random_streams.fixed())
+        possible = [index for index, chance in zip(self.contenders, chances, strict=True) if chance >= HARDLY_POSSIBLE]
+        return sorted(possible, key=lambda index: -means[index])[:size]

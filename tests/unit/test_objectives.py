@@ -1,0 +1,246 @@
+"""What settings are judged by, and how they are ranked and raced."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.answers import certainty, setting_score
+from analysis.objectives import SettingScores, expected_means, rank_settings, trial_score
+from analysis.racing import Race
+from analysis.records import IterationRecord, Objective, SettingsRecord, TrialRecord, TrialStatus
+from analysis.settings import judge_settings
+from tests.narrowing import present
+
+CAP = 10_000
+
+
+def iteration(steps: int, evaluation: float | None = None, episodes: Sequence[float] = ()) -> IterationRecord:
+    return IterationRecord(
+        iteration=max(1, steps // 1_000),
+        num_env_steps=steps,
+        num_episodes=0,
+        time_s=0.0,
+        evaluation_return=evaluation,
+        episode_returns=tuple(episodes),
+    )
+
+
+def score(iterations: Sequence[IterationRecord], objective: Objective, threshold: float | None = None) -> float | None:
+    return trial_score(iterations, objective, num_env_steps=CAP, threshold=threshold)
+
+
+RISING = [iteration(steps, steps / 100, [steps / 50] * 30) for steps in range(1_000, CAP + 1, 1_000)]
+
+
+def test_final_is_of_the_last_hundred_episodes_and_the_evaluations_since() -> None:
+    # 120 episodes in the last four iterations: 140, 160, 180, 200; evaluated at 70, 80, 90, 100.
+    assert score(RISING, "final") == pytest.approx((170 + 85) / 2)
+    assert score(RISING[:-1], "final") == pytest.approx((150 + 75) / 2)
+
+
+def test_final_of_what_has_only_one_kind_of_episodes() -> None:
+    assert score([iteration(1_000, None, [1, 2, 3])], "final") == 2
+    assert score([iteration(1_000, 7.0), iteration(2_000, 9.0)], "final") == 8
+    assert score([iteration(1_000)], "final") is None
+    assert score([], "final") is None
+    assert score([iteration(1_000, None, [math.nan, 4.0])], "final") == 4
+
+
+def test_a_trial_that_collapsed_is_not_judged_by_its_best_evaluation() -> None:
+    later = [iteration(steps, 20.0, [20] * 100) for steps in range(2_000, CAP + 1, 1_000)]
+    collapsed = [iteration(1_000, 200.0, [200] * 100), *later]
+    assert score(collapsed, "best") == 200
+    assert score(collapsed, "final") == 20
+
+
+def test_area_and_best_are_of_evaluations_alone() -> None:
+    assert score(RISING, "best") == 100
+    # Level until the first evaluation at 10, then straight up to 100.
+    assert score(RISING, "area") == pytest.approx((10 * 1_000 + 55 * 9_000) / CAP)
+    # A trial that ended early keeps its last evaluation.
+    assert score(RISING[:5], "area") == pytest.approx((10 * 1_000 + 30 * 4_000 + 50 * 5_000) / CAP)
+    assert score([iteration(1_000, None, [1])], "area") is None
+    assert score([iteration(1_000, None, [1])], "best") is None
+
+
+def test_steps_to_a_threshold_count_twice_the_cap_if_it_is_never_reached() -> None:
+    assert score(RISING, "steps_to_threshold", 65) == -7_000
+    assert score(RISING, "steps_to_threshold", 1_000) == -2 * CAP
+    assert score([], "steps_to_threshold", 1) is None
+    with pytest.raises(ValueError, match="needs a threshold"):
+        score(RISING, "steps_to_threshold")
+
+
+def trial(index: int, point_index: int, seed_index: int = 0, status: TrialStatus = "completed") -> TrialRecord:
+    return TrialRecord(
+        trial_id=f"t{index:04d}", index=index, point_index=point_index, seed_index=seed_index, seed=index,
+        point={"lr": point_index}, status=status,
+    )  # fmt: skip
+
+
+def ranked(scores: Sequence[Sequence[float | None]], **fields: Any) -> list[SettingScores]:
+    """Settings by the scores of their seeds; None: that seed failed."""
+    trials, results = made(scores)
+    return rank_settings(trials, results, num_env_steps=CAP, **fields)
+
+
+def made(scores: Sequence[Sequence[float | None]]) -> tuple[list[TrialRecord], dict[str, list[IterationRecord]]]:
+    trials: list[TrialRecord] = []
+    results = {}
+    for point_index, seeds in enumerate(scores):
+        for seed_index, value in enumerate(seeds):
+            record = trial(len(trials), point_index, seed_index, "failed" if value is None else "completed")
+            trials.append(record)
+            results[record.trial_id] = [] if value is None else [iteration(1_000, value)]
+    return trials, results
+
+
+def test_a_failed_seed_counts_as_the_worst_of_the_sweep() -> None:
+    first, second, third = ranked([[100, None], [80, 82], [10, 12]])
+    assert (first.point_index, second.point_index, third.point_index) == (1, 0, 2)
+    assert second.scores == (100, 10)
+    assert second.num_failed == 1
+
+
+def test_trials_that_have_not_ended_are_left_out() -> None:
+    trials, results = made([[1], [5], [3]])
+    trials[1] = trials[1].model_copy(update={"status": "running"})
+    assert [item.point_index for item in rank_settings(trials, results, num_env_steps=CAP)] == [2, 0]
+    assert ranked([[None], [None]]) == []
+    assert rank_settings([], {}, num_env_steps=CAP) == []
+
+
+def test_with_one_seed_a_setting_means_are_returned_as_they_are() -> None:
+    assert expected_means([[3.0], [1.0], [2.0]]) == [3, 1, 2]
+    assert expected_means([[3.0, 5.0]]) == [4]
+    assert expected_means([[3.0, 3.0], [1.0, 1.0]]) == [3, 1]
+
+
+def test_a_lucky_seed_is_drawn_back_further_than_many_good_ones() -> None:
+    rng = np.random.default_rng(0)
+    several = [list(100 + 10 * rng.standard_normal(6)) for _ in range(5)]
+    good = [*several, list(118 + 10 * rng.standard_normal(6)), [122.0]]
+    expected = expected_means(good)
+    assert max(range(len(good)), key=lambda index: expected[index]) == 5
+    assert 100 < expected[6] < 122
+    # Where seeds hardly differ, one is enough.
+    sure = expected_means([[100.0, 100.1, 99.9], [90.0, 90.1, 89.9], [122.0]])
+    assert sure[2] == pytest.approx(122, abs=0.1)
+
+
+# -- races
+
+
+@pytest.mark.parametrize("num_contenders", [2, 3, 5, 8, 20])
+@pytest.mark.parametrize("num_seeds", [1, 2, 3, 5, 7, 15])
+def test_rounds_give_the_last_two_as_many_seeds_as_were_asked_for(num_contenders: int, num_seeds: int) -> None:
+    race = Race(tuple(range(num_contenders)), num_seeds)
+    sizes, seeds = zip(*race.rounds, strict=True)
+    assert sum(seeds) == num_seeds
+    assert all(seed >= 1 for seed in seeds)
+    assert list(seeds) == sorted(seeds)
+    assert sizes[0] == num_contenders
+    assert all(later <= max(2, math.ceil(earlier / 2)) for earlier, later in itertools.pairwise(sizes))
+
+
+def test_the_better_half_goes_on_with_twice_as_many_seeds() -> None:
+    race = Race((4, 7, 1, 0), 3)
+    assert race.rounds == ((4, 1), (2, 2))
+    assert race.max_trainings == 8
+    scores = {4: [50.0, 30.0], 7: [60.0, 65.0], 1: [44.0, 41.0], 0: [50.0, 55.0]}
+    assert race.next_points(scores, 0) == (4, 7, 1, 0)
+    assert race.next_points(scores, 1) == (7, 0, 7, 0)
+    assert race.next_points(scores, 2) == ()
+
+
+def test_a_race_ends_when_only_one_can_still_win() -> None:
+    race = Race((0, 1, 2, 3), 7)
+    scores = {0: [100.0, 101.0], 1: [50.0, 51.0], 2: [52.0, 51.0], 3: [49.0, 51.0]}
+    assert race.next_points(scores, 1) == ()
+
+
+def test_no_race_of_less_than_two() -> None:
+    assert Race((3,), 5).next_points({3: [1.0]}, 0) == ()
+    assert Race((), 5).next_points({}, 0) == ()
+    assert Race((), 5).max_trainings == 0
+
+
+def test_races_find_the_best_setting_more_often_than_as_many_seeds_for_all() -> None:
+    """Twenty settings, of which one is best by one standard deviation of seeds: both ways cost 40 trainings."""
+    rng = np.random.default_rng(0)
+    truth = np.linspace(-2, 1, 20)
+    truth[19] = 1.7
+    by_race = by_all = 0
+    for _ in range(200):
+        seeds = truth[:, None] + rng.standard_normal((20, 12))
+        by_all += int(seeds[:, :2].mean(axis=1).argmax() == 19)
+        used = dict.fromkeys(range(20), 1)
+        contenders = tuple(int(index) for index in np.argsort(-seeds[:, 0])[:5])
+        race = Race(contenders, 7)
+        for num_done in range(3):
+            scores = {index: list(seeds[index, : used[index]]) for index in contenders}
+            for index in race.next_points(scores, num_done):
+                used[index] += 1
+        assert sum(used.values()) <= 40
+        expected = expected_means([list(seeds[index, : used[index]]) for index in range(20)])
+        by_race += int(np.argmax(expected) == 19)
+    # Of 200 sweeps, 162 by a race and 119 by two seeds for all; so the difference is no luck.
+    assert by_race > by_all + 20
+
+
+# -- what is said
+
+
+def judged(scores: Sequence[Sequence[float | None]], objective: Objective = "final", **fields: Any) -> SettingsRecord:
+    trials, results = made(scores)
+    return present(judge_settings(trials, results, objective, num_env_steps=CAP, **{"threshold": None} | fields))
+
+
+def test_with_one_seed_a_setting_nothing_is_said_to_be_sure() -> None:
+    settings = judged([[100.0], [90.0], [80.0]])
+    assert settings.best.point == {"lr": 0}
+    assert (settings.best.lower, settings.best.probability_best) == (None, None)
+    assert settings.num_may_be_best == 3
+    assert "one seed a setting" in certainty(settings)
+    assert setting_score(settings) == "100.0 at the end of training"
+
+
+def test_intervals_and_chances_come_with_more_seeds() -> None:
+    settings = judged([[100.0, 104.0, 99.0], [50.0, 52.0, 49.0], [60.0]])
+    best = settings.best
+    assert (best.point_index, best.trial_ids) == (0, ("t0000", "t0001", "t0002"))
+    assert present(best.lower) < 101 < present(best.upper)
+    assert present(best.probability_best) > 0.99
+    assert settings.num_may_be_best == 1
+    assert certainty(settings) == "the best of 3 with over 99 %; the data tell it from all others"
+    assert "over training seeds" in setting_score(settings)
+
+
+def test_settings_that_score_alike_are_not_told_apart() -> None:
+    settings = judged([[100.0, 60.0], [99.0, 61.0], [98.0, 63.0]])
+    assert settings.num_may_be_best == 3
+    assert certainty(settings).endswith("; 2 others can't be told from it")
+    constant = judged([[5.0, 5.0], [5.0, 5.0]])
+    assert constant.num_may_be_best == 2
+    assert constant.best.probability_best == 0.5
+
+
+def test_steps_are_said_as_steps() -> None:
+    trials, results = made([[100.0, 100.0], [10.0, 100.0]])
+    settings = present(judge_settings(trials, results, "steps_to_threshold", num_env_steps=CAP, threshold=50.0))
+    assert settings.best.scores == (-1_000, -1_000)
+    assert setting_score(settings).startswith("1,000 env steps to the threshold")
+
+
+def test_nothing_is_said_of_a_sweep_without_an_ended_trial() -> None:
+    assert judge_settings([], {}, num_env_steps=CAP, threshold=None) is None
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300])
+def test_huge_scores_have_no_interval(value: float) -> None:
+    settings = judged([[value, value / 2], [value / 3, value / 4]])
+    assert settings.best.lower is None

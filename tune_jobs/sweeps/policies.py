@@ -1,0 +1,141 @@
+"""What one can do with a sweep's policies: choose the best, evaluate, film, restore one.
+
+`tune_jobs.sweeps.verbs` has these functions too, beside those for whole sweeps.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from analysis.records import BestRecord, EvaluationRecord
+from policies.arguments import NumEpisodes, Seed, checked
+from policies.envs.modules import allowed_again
+from policies.guard.guard import guarding
+from tune_jobs.sweeps.results import Films
+from tune_jobs.sweeps.storage import expanded
+
+if TYPE_CHECKING:
+    from ray.rllib.algorithms.algorithm import Algorithm
+
+
+@allowed_again()
+@checked
+def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: NumEpisodes = 100) -> BestRecord:
+    """Choose a sweep's winner, confirm it on fresh seeds, and copy its policy to best/.
+
+    Raises:
+        NotFoundError: There is no such sweep, or none of its trials can win (the message says why).
+    """
+    from tune_jobs.sweeps.conclude import choose_best, find_sweep
+
+    return choose_best(find_sweep(sweep, storage), num_episodes)
+
+
+@allowed_again()
+@checked
+@guarding(start=True)
+def evaluate(
+    source: str | Path,
+    *,
+    storage: str | Path | None = None,
+    num_episodes: NumEpisodes = 100,
+    first_seed: Seed | None = None,
+    env_id: str | None = None,
+    action: int | Sequence[float] | None = None,
+) -> tuple[EvaluationRecord, EvaluationRecord]:
+    """Run greedy episodes of a policy, and of a random one on the same seeds.
+
+    Args:
+        source: A sweep (its best), `SWEEP/TRIAL`, a checkpoint folder, a policy file, `random` or `constant`.
+        storage: Folder for sweeps.
+        num_episodes: How many episodes.
+        first_seed: Seeds are this and the next ones; None: seeds that no training or selection uses.
+        env_id: An environment other than the policy's own; needed for a baseline.
+        action: The action of `constant`; None: 0.
+
+    Returns:
+        The policy's record, and the random policy's.
+
+    Raises:
+        NotFoundError: There is no such policy.
+    """
+    from tune_jobs.sweeps import conclude as finish
+
+    return finish.evaluate(finish.find_policy(source, storage, env_id, action), num_episodes, first_seed)
+
+
+@allowed_again()
+@checked
+@guarding()
+def video(
+    source: str | Path,
+    *,
+    storage: str | Path | None = None,
+    output: str | Path | None = None,
+    seed: Seed | None = None,
+    env_id: str | None = None,
+    action: int | Sequence[float] | None = None,
+) -> Films:
+    """Film a policy.
+
+    Args:
+        source: The same as for `evaluate`.
+        storage: Folder for sweeps.
+        output: File to write, as .mp4 and as .gif; or a folder, that exists or whose name ends with `/`, for files
+            called after policy and environment. None: into a sweep's best/ (with the random policy before, and both
+            side by side), else into the current folder.
+        seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
+        env_id: An environment other than the policy's own; needed for a baseline.
+        action: The action of `constant`; None: 0.
+
+    Returns:
+        The files.
+
+    Raises:
+        NotFoundError: There is no such policy.
+        EnvError: The environment cannot be drawn.
+    """
+    from tune_jobs.sweeps import conclude as finish
+
+    found = finish.find_policy(source, storage, env_id, action)
+    if output is None and found.store is not None:
+        return Films(finish.make_videos(found.store, seed))
+    name = str(source).replace("/", "-").lstrip(".-") or "policy"
+    target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
+    return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
+
+
+def _film_path(output: str | Path | None, name: str) -> Path:
+    """Return the path of a film; it gets the name `name` if `output` names no file."""
+    if output is None:
+        return Path(name)
+    path = expanded(output)
+    if str(output).endswith("/") or path.is_dir():
+        return path / name
+    # Another suffix, such as that of `cartpole-v0.5`, is kept.
+    return path if path.suffix.lower() in (".mp4", ".gif") else path.with_name(f"{path.name}.mp4")
+
+
+@checked
+def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorithm:
+    """Restore a checkpoint as an RLlib `Algorithm` that can continue training.
+
+    Checkpoints of the rllib engine are pickles: restore only sweeps you trust.
+
+    Args:
+        source: A sweep (its best checkpoint), `SWEEP/TRIAL` (the trial's best), or a checkpoint folder.
+        storage: Folder for sweeps.
+
+    Raises:
+        NotFoundError: There is no such checkpoint.
+        CheckpointError: It is damaged, of a baseline, or cannot be restored with exactly the weights that were saved.
+    """
+    from tune_jobs.sweeps.conclude import find_trained_checkpoint
+    from tune_jobs.training.registry import restore_checkpoint
+
+    folder, engine = find_trained_checkpoint(source, storage)
+    algorithm: Algorithm = restore_checkpoint(folder, engine)
+    return algorithm

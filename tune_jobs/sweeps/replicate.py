@@ -1,0 +1,47 @@
+"""Replicate a sweep: train its leading settings again with fresh seeds, until it is clear which is the best."""
+
+from __future__ import annotations
+
+from analysis.racing import Race
+from policies.errors import NotFoundError
+from policies.guard.guarded import check_env
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.rules import check_replicable
+from tune_jobs.store.candidates import read_trials
+from tune_jobs.store.contract import Sweep
+from tune_jobs.sweeps.conclude import read_results
+from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.resume import replicate
+from tune_jobs.sweeps.settings import ranked
+
+
+def run_race(store: Sweep, address: str | None, *, top: int, seeds: int, finish: bool, progress: str) -> SweepResult:
+    """Run what is missing of a sweep, then a race of its leading settings.
+
+    Raises:
+        SpecError: The sweep cannot be replicated.
+        NotFoundError: It has no setting that was trained and evaluated.
+        CannotRunError: Another process runs the sweep, or it cannot run here.
+    """
+    spec = stored_spec(store.read_record())
+    check_replicable(spec)
+    threshold = check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
+    race: Race | None = None
+    num_done = 0
+
+    def next_points() -> tuple[int, ...]:
+        nonlocal race, num_done
+        ranking = ranked(spec, read_trials(store), read_results(store), threshold)
+        if not ranking:
+            raise NotFoundError(
+                f"No setting of sweep {store.name} can be replicated: none of its trials was evaluated.",
+                f"See why with `tune-jobs trials {store.name}`.",
+            )
+        if race is None:
+            race = Race(tuple(item.point_index for item in ranking[:top]), seeds)
+        scores = {item.point_index: item.scores for item in ranking}
+        points = race.next_points(scores, num_done)
+        num_done += 1
+        return points
+
+    return replicate(store, address, next_points, finish=finish, progress=progress)

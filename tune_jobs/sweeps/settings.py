@@ -1,0 +1,46 @@
+"""Judge the settings of a sweep by its objective."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from analysis.objectives import SettingScores, rank_settings
+from analysis.records import IterationRecord, SettingsRecord, TrialRecord
+from analysis.settings import judge_settings
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+def judged(
+    spec: SweepSpec,
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    threshold: float | None,
+) -> SettingsRecord | None:
+    """Rank the settings of a sweep; None in a population, whose trials change theirs while they train.
+
+    Args:
+        spec: The sweep.
+        trials: Its trials.
+        results: Iterations by trial id, oldest first.
+        threshold: The env's own threshold; None: it has none.
+    """
+    if spec.scheduler.type == "pbt":
+        return None
+    goal = goal_of(spec, threshold)
+    return judge_settings(trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal)
+
+
+def ranked(
+    spec: SweepSpec,
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    threshold: float | None,
+) -> list[SettingScores]:
+    """Return all settings of a sweep with their scores, best first; the arguments are those of `judged`."""
+    goal = goal_of(spec, threshold)
+    return rank_settings(trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal)
+
+
+def goal_of(spec: SweepSpec, threshold: float | None) -> float | None:
+    """Return the return to reach: the objective's, else the env's own."""
+    return threshold if spec.objective.threshold is None else spec.objective.threshold
