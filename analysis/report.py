@@ -146,6 +146,7 @@ def _content(source: _Sweep) -> dict[str, Any]:
         "goal": goal,
         "headline": report_data.headline(sweep, trials, results, goal),
         "winner": None if best is None else report_data.winner_card(best, trials, sweep, source.folder),
+        "setting": None if best is None else report_data.setting_card(best, source.folder),
         "why_no_best": None
         if best is not None
         else source.why_no_best or report_data.why_no_best(trials, source.folder),

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from analysis.answers import certainty, setting_score
 from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord, finite_or_none
 from analysis.selection import NoUsableTrialError, error_summary, select_best
 from analysis.statistics import mean_with_ci, paired_difference
@@ -113,6 +114,21 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
         "evaluate_command": f"tune-jobs evaluate {shlex.quote(policy)}",
         "policy_path": repr(policy),
         "stale": _is_stale(best, trials),
+    }
+
+
+def setting_card(best: BestRecord, folder: Path) -> dict[str, Any] | None:
+    """Return the data of the setting to train with; None if the sweep has one setting, or an older version wrote it."""
+    settings = best.settings
+    if settings is None or settings.num_settings < 2:
+        return None
+    return {
+        "point": [(name, number(cell_value(value))) for name, value in settings.best.point.items()],
+        "score": setting_score(settings),
+        "certainty": "" if settings.best.probability_best is None else certainty(settings),
+        "trial_ids": ", ".join(settings.best.trial_ids),
+        "is_the_winners": best.checkpoint.trial_id in settings.best.trial_ids,
+        "replicate_command": f"tune-jobs replicate {shlex.quote(shown_path(folder))}",
     }
 
 

@@ -108,8 +108,9 @@ def rank_points(trials: Sequence[TrialRecord]) -> list[PointScore]:
     by_point: defaultdict[int, list[TrialRecord]] = defaultdict(list)
     for trial in trials:
         by_point[trial.point_index].append(trial)
-    # A seed without a record counts like one that failed: all points should have the same number of seeds.
-    num_seeds = max((len(members) for members in by_point.values()), default=0)
+    # A seed without a record counts like one that failed: a point has the number of seeds of the sweep, and more if it
+    # was replicated.
+    least = _seeds_per_point(trials)
     points = []
     for point_index, members in by_point.items():
         scored = [score for score in map(score_trial, members) if score is not None]
@@ -122,12 +123,21 @@ def rank_points(trials: Sequence[TrialRecord]) -> list[PointScore]:
                 point=scored[0].trial.point_at(scored[0].checkpoint.iteration),
                 score=sum(item.score for item in scored) / len(scored),
                 num_env_steps=sum(item.checkpoint.num_env_steps for item in scored) / len(scored),
-                num_seeds=num_seeds,
+                num_seeds=max(least, *(trial.seed_index + 1 for trial in members)),
                 trial_scores=tuple(scored),
             )
         )
     points.sort(key=_point_order)
     return points
+
+
+def _seeds_per_point(trials: Sequence[TrialRecord]) -> int:
+    """Return how many seeds each point has at least, by the indices of the trials (see `analysis.numbering`).
+
+    Trial s of point p has the index p x seeds per point + s, or a higher one, behind replications.
+    """
+    seeds = [(trial.index - trial.seed_index) // trial.point_index for trial in trials if trial.point_index > 0]
+    return max(1, min(seeds, default=1))
 
 
 def select_best(trials: Sequence[TrialRecord]) -> Selection:

@@ -13,12 +13,15 @@ from sweep_folders import make_sweep_folder
 from analysis.records import CheckpointRecord
 from analysis.selection import NoUsableTrialError
 from policies.errors import CheckpointError
+from policies.portable.file import read_policy
+from tests.narrowing import present
 from tune_jobs.store.candidates import read_trials
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.settings import with_present_settings
 
 SAMPLE = Path(__file__).parents[1] / "unit" / "samples" / "sweep_format_1"
 
@@ -173,3 +176,14 @@ def test_a_checkpoint_that_is_pruned_meanwhile_is_no_reason_to_warn(
     monkeypatch.setattr(type(trial), "checkpoint", pruned)
     assert [record.iteration for record in read_trials(store)[3].checkpoints] == [6]
     assert warnings_of(caplog) == []
+
+
+def test_settings_that_are_others_by_now_are_written_to_the_winner(store: SweepStore) -> None:
+    """As after a replication that leaves the winner as it is."""
+    best = finish.choose_best(store, 2)
+    settings = present(best.settings)
+    assert with_present_settings(store, best) is best
+    old = best.model_copy(update={"settings": settings.model_copy(update={"num_settings": 1})})
+    assert with_present_settings(store, old) == best
+    store.write_best(old, read_policy(store.best_folder))
+    assert with_present_settings(store, store.read_best()) == store.read_best() == best

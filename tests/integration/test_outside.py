@@ -19,7 +19,7 @@ from analysis import records
 from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
-from tune_jobs.store.candidates import choose, read_trials
+from tune_jobs.store.candidates import choose, read_results, read_trials
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.locks import held
 from tune_jobs.store.ownership import Owner
@@ -128,7 +128,7 @@ def use(folder: Path) -> None:
         lambda: sweeps.status(folder),
         lambda: choose(store, read_trials(store)),
         lambda: load_policy(finish.find_checkpoint(folder)),
-        lambda: finish.read_results(store),
+        lambda: read_results(store),
         lambda: finish.find_policy(folder),
         lambda: PackFiles(folder, "p00").read(),
         lambda: PackFiles(folder, "p00").write(Assignment(("t0000",))),

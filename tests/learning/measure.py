@@ -15,8 +15,9 @@ from analysis.tables import env_steps_to
 from tests.learning.targets import NUM_EPISODES, Target, Task
 from tune_jobs.spec.file import Preset, find_preset
 from tune_jobs.spec.seeds import confirmation_seeds
+from tune_jobs.store.candidates import read_results
 from tune_jobs.sweeps import verbs as sweeps
-from tune_jobs.sweeps.conclude import find_sweep, read_results
+from tune_jobs.sweeps.conclude import find_sweep
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,8 @@ def test_leading_settings_get_fresh_seeds_and_train_to_the_end(tmp_path: Path, e
 
 
 def test_the_better_setting_is_named_with_its_seeds(tmp_path: Path) -> None:
-    launch(tmp_path, spec())
+    before = present(launch(tmp_path, spec(), finish=True).best)
+    assert all(len(item.scores) == 1 for item in present(before.settings).ranking)
     result = replicate(tmp_path, top=2, seeds=2, finish=True)
     settings = present(present(result.best).settings)
     assert settings.best.point["lr"] >= 5e-3

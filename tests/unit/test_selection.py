@@ -143,6 +143,25 @@ def test_a_lost_seed_does_not_flatter_its_point(lost: TrialRecord | None) -> Non
     assert [point.score for point in best.ranking] == [75.0, 200.0]
 
 
+def test_more_seeds_of_some_points_make_no_other_incomplete() -> None:
+    """Replicated twice: first both points, then the second one; behind them comes a point that was added."""
+    trials = [
+        trial(0, 90.0, point=0),
+        trial(1, 70.0, point=1),
+        trial(2, 50.0, point=0, seed_index=1),
+        trial(3, 60.0, point=1, seed_index=1),
+        trial(4, 65.0, point=1, seed_index=2),
+        trial(5, 80.0, point=2),
+    ]
+    ranking = rank_points(trials)
+    assert [(point.point_index, point.num_seeds, point.complete) for point in ranking] == [
+        (2, 1, True), (0, 2, True), (1, 3, True),
+    ]  # fmt: skip
+    # A replicated seed that failed is a lost one.
+    lost = trial(4, point=1, seed_index=2, status="failed")
+    assert not next(point for point in rank_points([*trials[:4], lost]) if point.point_index == 1).complete
+
+
 def test_incomplete_points_win_where_no_point_is_complete() -> None:
     trials = [
         trial(0, 200.0, point=0, seed_index=0),

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Mapping, Sequence
 
 from analysis.numbering import place_of
-from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
+from analysis.records import BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from analysis.selection import Selection, select_best
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from policies.portable.file import PortablePolicy, read_policy
@@ -40,6 +40,18 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
         for record in store.read_trials()
     ]
     return sorted(records, key=lambda record: record.index)
+
+
+def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
+    """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
+    found = {}
+    for record in store.read_trials():
+        try:
+            found[record.trial_id] = store.trial(record.trial_id).read_iterations()
+        except CheckpointError as error:
+            leave_out(error)
+            found[record.trial_id] = []
+    return found
 
 
 def candidates(trial: Trial) -> list[CheckpointRecord]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, IterationRecord
+from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord
 from analysis.selection import NoUsableTrialError
 from analysis.selection import best_checkpoint as best_of
 from policies.acting.baselines import BASELINES, ConstantPolicy
@@ -24,7 +24,7 @@ from policies.suggestions import did_you_mean
 from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
-from tune_jobs.store.candidates import choose, leave_out, read_trials
+from tune_jobs.store.candidates import choose, leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.local_storage import open_storage, open_sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
@@ -54,18 +54,6 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
         f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
         "List the sweeps with `tune-jobs list`; name another storage folder with --storage.",
     )
-
-
-def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
-    """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
-    found = {}
-    for record in store.read_trials():
-        try:
-            found[record.trial_id] = store.trial(record.trial_id).read_iterations()
-        except CheckpointError as error:
-            leave_out(error)
-            found[record.trial_id] = []
-    return found
 
 
 @guarding()

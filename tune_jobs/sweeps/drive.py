@@ -320,13 +320,16 @@ class _Finish:
         """Make everything that can be made."""
         from tune_jobs.store.candidates import confirmed_best
         from tune_jobs.sweeps import conclude as finish
+        from tune_jobs.sweeps.settings import with_present_settings
 
         store = self._store
         if self._keep:
             self.best = confirmed_best(store)
         kept = self.best is not None
         try:
-            if self.best is None:
+            if self.best is not None:
+                self.best = with_present_settings(store, self.best)
+            else:
                 with self._working("confirming the best policy"):
                     self.best = finish.choose_best(store)
             self.artifacts["policy"] = store.best_policy_path

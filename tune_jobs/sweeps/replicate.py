@@ -7,9 +7,8 @@ from policies.errors import NotFoundError
 from policies.guard.guarded import check_env
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_replicable
-from tune_jobs.store.candidates import read_trials
+from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.sweeps.conclude import read_results
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.resume import replicate
 from tune_jobs.sweeps.settings import ranked

@@ -71,8 +71,8 @@ def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.Dat
     """
     from analysis.report_data import goal_of
     from analysis.tables import trials_frame
-    from tune_jobs.store.candidates import read_trials
-    from tune_jobs.sweeps.conclude import find_sweep, read_results
+    from tune_jobs.store.candidates import read_results, read_trials
+    from tune_jobs.sweeps.conclude import find_sweep
 
     store = find_sweep(sweep, storage)
     try:

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from analysis.objectives import SettingScores, rank_settings
-from analysis.records import IterationRecord, SettingsRecord, TrialRecord
+from analysis.records import BestRecord, IterationRecord, SettingsRecord, TrialRecord
 from analysis.settings import judge_settings
+from policies.portable.file import read_policy
+from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.candidates import read_results, read_trials
+from tune_jobs.store.contract import Sweep
 
 
 def judged(
@@ -44,3 +48,21 @@ def ranked(
 def goal_of(spec: SweepSpec, threshold: float | None) -> float | None:
     """Return the return to reach: the objective's, else the env's own."""
     return threshold if spec.objective.threshold is None else spec.objective.threshold
+
+
+def with_present_settings(store: Sweep, best: BestRecord) -> BestRecord:
+    """Return the confirmed winner with the settings as they are judged now; it is written if they are others by now.
+
+    They are after a replication, which may leave the winner as it is.
+
+    Raises:
+        CheckpointError: The record of the sweep or of a trial, or the winner's policy, is damaged.
+        CannotRunError: The record cannot be written.
+    """
+    spec = stored_spec(store.read_record())
+    settings = judged(spec, read_trials(store), read_results(store), best.confirmation.threshold)
+    if settings == best.settings:
+        return best
+    record = best.model_copy(update={"settings": settings})
+    store.write_best(record, read_policy(store.best_folder))
+    return record
