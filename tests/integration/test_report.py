@@ -14,6 +14,7 @@ import pytest
 import yaml
 from synthetic_sweep import Synthetic, make_points, make_sweep
 
+from analysis.answers import certainty
 from analysis.records import CheckpointRecord
 from analysis.report import build_report
 from analysis.report_data import goal_of, winner_card
@@ -75,6 +76,21 @@ def test_the_winner_stands_on_the_page(typical: Made) -> None:
     assert f"hidden_sizes {best.point['hidden_sizes'][0]}" in page.words
     assert f"lr {best.point['lr']:.4g}" in page.words
     assert '<span class="badge good">solved</span>' in html
+
+
+def test_the_setting_stands_beside_the_policy(typical: Made, tmp_path: Path) -> None:
+    _, path, _, page = typical
+    assert "Setting to train with" in page.words
+    assert f"To decide: tune-jobs replicate {path.parent.parent}" in page.words
+    several = make_sweep(seeds_per_point=5, points=make_points(1, np.random.default_rng(0)))
+    settings = present(present(several.best).settings)
+    _, _, page = report(tmp_path, several)
+    assert ", ".join(settings.best.trial_ids) in page.words
+    assert f"How sure {certainty(settings)}" in page.words
+    assert "over training seeds" in page.words
+    assert "tune-jobs replicate" not in page.words
+    one = make_sweep(points=make_points(1, np.random.default_rng(0))[:1])
+    assert "Setting to train with" not in report(tmp_path / "one", one)[2].words
 
 
 def test_the_loading_command_names_the_policy_file(typical: Made) -> None:

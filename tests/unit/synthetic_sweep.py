@@ -18,6 +18,7 @@ from analysis.records import (
     TrialStatus,
 )
 from analysis.selection import NoUsableTrialError, select_best
+from analysis.settings import judge_settings
 
 ERROR = """RuntimeError: env.step raised ZeroDivisionError: the cart left the track
 Traceback (most recent call last):
@@ -90,6 +91,8 @@ def make_sweep(
     if with_best:
         try:
             best = make_best(trials, env_id, threshold, cap, rng)
+            settings = judge_settings(trials, results, num_env_steps=max_steps, threshold=threshold)
+            best = best.model_copy(update={"settings": settings})
         except NoUsableTrialError:
             best = None
     return Synthetic(sweep, trials, results, best)
