@@ -110,6 +110,13 @@ def test_what_cannot_be_replicated_is_refused(tmp_path: Path) -> None:
         replicate(tmp_path)
 
 
+def test_one_setting_has_none_to_race_with(tmp_path: Path) -> None:
+    launch(tmp_path, make_spec(num_samples=1))
+    with pytest.raises(SpecError, match="one setting that was trained"):
+        replicate(tmp_path)
+    assert SweepStore(tmp_path / "mine").read_record().replications == ()
+
+
 def test_a_sweep_whose_trials_all_failed_has_nothing_to_replicate(tmp_path: Path) -> None:
     troubles = {str(seed): {"how": "raise"} for seed in trial_seeds(0, 2)}
     launch(tmp_path, make_spec(env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, max_retries=0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from analysis.racing import Race
-from policies.errors import NotFoundError
+from policies.errors import NotFoundError, SpecError
 from policies.guard.guarded import check_env
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_replicable
@@ -18,7 +18,7 @@ def run_race(store: Sweep, address: str | None, *, top: int, seeds: int, finish:
     """Run what is missing of a sweep, then a race of its leading settings.
 
     Raises:
-        SpecError: The sweep cannot be replicated.
+        SpecError: The sweep cannot be replicated, or has one setting only.
         NotFoundError: It has no setting that was trained and evaluated.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
@@ -35,6 +35,11 @@ def run_race(store: Sweep, address: str | None, *, top: int, seeds: int, finish:
             raise NotFoundError(
                 f"No setting of sweep {store.name} can be replicated: none of its trials was evaluated.",
                 f"See why with `tune-jobs trials {store.name}`.",
+            )
+        if len(ranking) == 1:
+            raise SpecError(
+                f"Sweep {store.name} has one setting that was trained: there is no other to race it with.",
+                "Extend the sweep by more samples, or launch it anew with seeds_per_point for more seeds of the one.",
             )
         if race is None:
             race = Race(tuple(item.point_index for item in ranking[:top]), seeds)
