@@ -8,6 +8,7 @@ import pytest
 from test_sweeps import launch, make_spec, snapshot
 
 from analysis.numbering import place_of
+from policies.envs import modules as env_modules
 from policies.errors import NotFoundError, SpecError
 from tests.narrowing import present
 from tune_jobs.spec.seeds import trial_seeds
@@ -96,6 +97,17 @@ def test_points_that_tpe_chose_are_trained_again(tmp_path: Path) -> None:
         assert trial.point == result.trials[trial.point_index].point
         assert trial.hyperparams == result.trials[trial.point_index].hyperparams
         assert trial.status == "completed"
+
+
+def test_the_modules_of_the_sweep_are_allowed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(env_modules, "_allowed", {"tune_jobs_test_envs"})
+    launch(tmp_path, make_spec(env={"id": "tune_jobs_test_envs:Trouble"}))
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    # So many that they cannot be planned, or be listed one by one.
+    with pytest.raises(SpecError, match="up to 2,000,000,000,000 trainings"):
+        replicate(tmp_path, top=2, seeds=10**12)
+    result = replicate(tmp_path, top=2, seeds=1)
+    assert [trial.status for trial in result.trials] == ["completed"] * 4
 
 
 def test_what_cannot_be_replicated_is_refused(tmp_path: Path) -> None:

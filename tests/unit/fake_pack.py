@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
+from analysis.records import IterationRecord
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import Policy
 from policies.portable.file import PortablePolicy
@@ -153,6 +154,10 @@ def statuses(pack: Pack) -> dict[str, str]:
 
 def without_times(progress: Progress) -> Progress:
     return progress.model_copy(update={"started_at": None, "ended_at": None})
+
+
+def without_episodes(record: IterationRecord) -> IterationRecord:
+    return record.model_copy(update={"episode_returns": (), "episode_lengths": ()})
 
 
 def results(pack: Pack, trial_id: str) -> list[int]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from fake_engine import FakeClock, FakeEngine
-from fake_pack import Pack, results, statuses, without_times
+from fake_pack import Pack, results, statuses, without_episodes, without_times
 from trial_runs import Trial
 
 from policies.errors import CheckpointError, EnvError
@@ -18,8 +18,6 @@ from tests.narrowing import present
 from tune_jobs.store.ownership import Owner
 from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.protocol import IterationStats, TrialTask
-
-WITHOUT_EPISODES: dict[str, Any] = {"episode_returns": (), "episode_lengths": ()}
 
 # -- together
 
@@ -42,7 +40,7 @@ def test_each_member_is_told_of_as_a_trial_of_its_own(tmp_path: Path) -> None:
         )
         assert pack.store(trial_id).read_iterations() == alone.results
         told = [item for report in pack.of(trial_id) for item in present(report.progress).iterations]
-        assert told == [item.model_copy(update=WITHOUT_EPISODES) for item in alone.results]
+        assert told == [without_episodes(item) for item in alone.results]
         assert [record.iteration for record in pack.store(trial_id).checkpoints()] == alone.kept
     assert pack.loop.trial_ids == ()
     assert pack.engine.members == {}

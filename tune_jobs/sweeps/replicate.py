@@ -5,8 +5,8 @@ from __future__ import annotations
 from analysis.racing import Race
 from policies.errors import NotFoundError, SpecError
 from policies.guard.guarded import check_env
+from tune_jobs.plan.sweep_plan import MAX_TRIALS
 from tune_jobs.spec.file import stored_spec
-from tune_jobs.spec.rules import check_replicable
 from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.outcome import SweepResult
@@ -23,13 +23,13 @@ def run_race(store: Sweep, address: str | None, *, top: int, seeds: int, finish:
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
     spec = stored_spec(store.read_record())
-    check_replicable(spec)
-    threshold = check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
     race: Race | None = None
     num_done = 0
 
     def next_points() -> tuple[int, ...]:
         nonlocal race, num_done
+        # Only now, as the modules that the sweep's environment may need are allowed by the run.
+        threshold = check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
         ranking = ranked(spec, read_trials(store), read_results(store), threshold)
         if not ranking:
             raise NotFoundError(
@@ -43,6 +43,12 @@ def run_race(store: Sweep, address: str | None, *, top: int, seeds: int, finish:
             )
         if race is None:
             race = Race(tuple(item.point_index for item in ranking[:top]), seeds)
+            if race.max_trainings > MAX_TRIALS:
+                raise SpecError(
+                    f"The race has up to {race.max_trainings:,} trainings (top {top:,}, seeds {seeds:,}); at most "
+                    f"{MAX_TRIALS:,} can be planned.",
+                    "Lower seeds or top.",
+                )
         scores = {item.point_index: item.scores for item in ranking}
         points = race.next_points(scores, num_done)
         num_done += 1
