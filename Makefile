@@ -4,6 +4,7 @@
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table
 # make bench   the benchmarks, beside their peers, in one table
+# make bench-choice   what each way to choose a setting loses, from trainings that were done before (docs/choice.md)
 # make docs    the site of all documentation, into site/: open site/index.html
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test unit lint types learn kills bench docs clean
+.PHONY: install sweep test unit lint types learn kills bench bench-choice docs clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -79,6 +80,9 @@ kills: $(VENV)/installed-test
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m tests.benchmarks
+
+bench-choice: $(VENV)/installed-test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.benchmarks.choice
 
 # Warnings, links that lead nowhere among them, are errors; with --quiet they would not be.
 docs: $(VENV)/installed-docs

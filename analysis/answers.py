@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from analysis.records import Objective, SettingsRecord
+from collections import Counter
+from collections.abc import Sequence
+
+from analysis.records import Objective, SettingsRecord, SweepRecord, TrialRecord
 from analysis.wording import counted, return_text
 
 _MEANS: dict[Objective, str] = {
-    "final": "at the end of training",
+    "final": "in the later half of training",
     "area": "over all of training",
     "best": "in its best evaluation",
     "steps_to_threshold": "env steps to the threshold",
@@ -35,11 +38,26 @@ def certainty(settings: SettingsRecord) -> str:
     best = settings.best
     if best.probability_best is None:
         return "one seed a setting names a good policy, not a good setting: see `tune-jobs replicate`"
-    text = f"the best of {settings.num_settings:,} with {_percent(best.probability_best)}"
+    text = f"the best of {settings.num_settings:,} with a probability of {_percent(best.probability_best)}"
     others = settings.num_may_be_best - 1
     if others <= 0:
         return f"{text}; the data tell it from all others"
     return f"{text}; {counted(others, 'other')} can't be told from it"
+
+
+def replicas_text(sweep: SweepRecord, trials: Sequence[TrialRecord]) -> str:
+    """Return which trials gave leading settings more seeds, their cost, and what the race saved; empty: none did."""
+    rounds = [item for item in sweep.replications if item.points]
+    num_added = sum(len(item.points) for item in rounds)
+    if not num_added:
+        return ""
+    seeds = Counter(index for item in rounds for index in item.points)
+    added = [trial for trial in trials if trial.seed_index >= int(sweep.spec.get("seeds_per_point") or 1)]
+    steps, all_steps = (sum(trial.num_env_steps for trial in group) for group in (added, trials))
+    share = f" with {100 * steps / all_steps:.0f} % of the env steps" if all_steps else ""
+    text = f"{counted(num_added, 'trial')} gave {counted(len(seeds), 'leading setting')} more seeds{share}"
+    without = len(seeds) * max(seeds.values())
+    return f"{text}; as many for each would take {without}" if without > num_added else text
 
 
 def _steps_text(steps: float) -> str:

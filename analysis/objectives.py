@@ -20,7 +20,11 @@ from analysis.statistics import area_under_curve, moderated_means
 
 _LEAST_BETWEEN = 1e-3
 _NUM_LAST_EPISODES = 100
-"""`final` is about a trial's last training episodes, so many or all."""
+"""What a trial that ended early is taken to go on with, where `final` looks at training episodes."""
+_SHARE_OF_EVALUATIONS = 0.75
+"""How much of `final` is greedy evaluations; the rest is training episodes."""
+_GOALS = ("training_return", "evaluation_return")
+"""The stop rules that are goals; the others say how long a trial trains."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +75,8 @@ def rank_settings(
         if trial.status == "failed":
             shown[trial.trial_id] = None
         elif trial.status in ("completed", "stopped"):
-            shown[trial.trial_id] = trial_score(
-                results.get(trial.trial_id, ()), objective, num_env_steps=num_env_steps, threshold=threshold
-            )
+            items = results.get(trial.trial_id, ())
+            shown[trial.trial_id] = score_of(trial, items, objective, num_env_steps=num_env_steps, threshold=threshold)
     known = {trial_id: score for trial_id, score in shown.items() if score is not None}
     if not known:
         return []
@@ -98,6 +101,41 @@ def rank_settings(
     return sorted(settings, key=lambda item: (-item.expected, -item.mean, item.point_index))
 
 
+def reached_goal(trial: TrialRecord) -> bool:
+    """Whether a trial ended because it reached the return that its sweep stops at."""
+    return (trial.stop_reason or "").startswith(_GOALS)
+
+
+def score_of(
+    trial: TrialRecord,
+    iterations: Sequence[IterationRecord],
+    objective: Objective,
+    *,
+    num_env_steps: int,
+    threshold: float | None = None,
+) -> float | None:
+    """Return what a trial scored, see `trial_score`, over the env steps that it was to have.
+
+    Those are its own where it ended by a number of episodes or iterations, or by time: it trained as long as it was to.
+    One that reached its goal, or that a scheduler ended, was to have `num_env_steps`.
+
+    Args:
+        trial: The trial.
+        iterations: Its iterations, oldest first.
+        objective: What it is judged by.
+        num_env_steps: The env steps that a trial has at most.
+        threshold: The return to reach, for `steps_to_threshold`.
+
+    Raises:
+        ValueError: `steps_to_threshold` without a threshold.
+    """
+    ended_itself = trial.status == "completed" and trial.stop_reason is not None and not reached_goal(trial)
+    # What never reached the threshold counts as the same number of env steps, however long it tried.
+    if ended_itself and trial.num_env_steps and objective != "steps_to_threshold":
+        num_env_steps = min(num_env_steps, trial.num_env_steps)
+    return trial_score(iterations, objective, num_env_steps=num_env_steps, threshold=threshold)
+
+
 def trial_score(
     iterations: Sequence[IterationRecord],
     objective: Objective,
@@ -107,9 +145,11 @@ def trial_score(
 ) -> float | None:
     """Return what a trial scored; None: it showed nothing that can be scored.
 
-    - `final`: how well it does at the end. The mean return of its last 100 or more training episodes (whole iterations
-      of them) and the mean of the greedy evaluations since the first of those ended, in equal parts: evaluations are of
-      the policy that one gets, but few; training episodes explore, but there are many (decision 29).
+    - `final`: how well it does in the later half of `num_env_steps`: three parts mean greedy evaluation, one part mean
+      return of the training episodes. Evaluations are of the policy that one gets, but few; training episodes explore,
+      but there are many (decision 29). A trial that ended earlier, as it reached its goal or as a scheduler ended it,
+      is taken to go on as it was at last: its last evaluation, and its last 100 or more training episodes (whole
+      iterations of them).
     - `area`: the mean evaluation return over all its env steps, `statistics.area_under_curve`.
     - `best`: its best evaluation.
     - `steps_to_threshold`: minus the env steps to the first evaluation that reaches the threshold, and minus twice
@@ -133,7 +173,7 @@ def trial_score(
         reached = (steps for steps, value in evaluations if value >= threshold)
         return -float(next(reached, 2 * num_env_steps)) if iterations else None
     if objective == "final":
-        return _final(iterations, evaluations)
+        return _final(iterations, evaluations, num_env_steps)
     if not evaluations:
         return None
     if objective == "best":
@@ -142,17 +182,68 @@ def trial_score(
     return area_under_curve(steps, values, num_env_steps=max(num_env_steps, steps[-1]))
 
 
-def _final(iterations: Sequence[IterationRecord], evaluations: Sequence[tuple[int, float]]) -> float | None:
-    exploring: list[float] = []
-    begun = 0
-    for item in reversed(iterations):
-        exploring += [value for value in item.episode_returns if math.isfinite(value)]
-        begun = item.num_env_steps
-        if len(exploring) >= _NUM_LAST_EPISODES:
-            break
-    greedy = [value for steps, value in evaluations if steps >= begun]
-    means = [math.fsum(values) / len(values) for values in (greedy, exploring) if values]
-    return math.fsum(means) / len(means) if means else None
+def _final(
+    iterations: Sequence[IterationRecord], evaluations: Sequence[tuple[int, float]], num_env_steps: int
+) -> float | None:
+    greedy = _greedy_of_later_half(evaluations, num_env_steps)
+    exploring = _exploring_of_later_half(iterations, num_env_steps)
+    if greedy is None or exploring is None:
+        return exploring if greedy is None else greedy
+    return _SHARE_OF_EVALUATIONS * greedy + (1.0 - _SHARE_OF_EVALUATIONS) * exploring
+
+
+def _greedy_of_later_half(evaluations: Sequence[tuple[int, float]], num_env_steps: int) -> float | None:
+    """Return the mean evaluation of the later half; each counts for the env steps since the one before, the last on."""
+    if not evaluations:
+        return None
+    begin, last = num_env_steps / 2, evaluations[-1][1]
+    end = max(num_env_steps, evaluations[-1][0])
+    parts, before = [], begin
+    for steps, value in evaluations:
+        if steps > before:
+            parts.append((value, steps - before))
+            before = steps
+    return _weighted_mean([*parts, (last, end - before)])
+
+
+def _exploring_of_later_half(iterations: Sequence[IterationRecord], num_env_steps: int) -> float | None:
+    """Return the mean return of the episodes of the later half; after a trial's end its last hundred go on."""
+    later = [item for item in iterations if item.num_env_steps > num_env_steps / 2]
+    mean = _mean_return(later)
+    trained = iterations[-1].num_env_steps if iterations else 0
+    if mean is not None and trained >= num_env_steps:
+        return mean
+    last = _last_episodes(iterations)
+    if mean is None or last is None:
+        return last
+    known = (trained - num_env_steps / 2) / (num_env_steps / 2)
+    return known * mean + (1.0 - known) * last
+
+
+def _last_episodes(iterations: Sequence[IterationRecord]) -> float | None:
+    """Return the mean return of the last hundred episodes, in whole iterations, or of all that there are."""
+    count = 0
+    for index in range(len(iterations) - 1, -1, -1):
+        count += sum(map(math.isfinite, iterations[index].episode_returns))
+        if count >= _NUM_LAST_EPISODES:
+            return _mean_return(iterations[index:])
+    return _mean_return(iterations)
+
+
+def _mean_return(iterations: Sequence[IterationRecord]) -> float | None:
+    values = [value for item in iterations for value in item.episode_returns if math.isfinite(value)]
+    return _weighted_mean([(value, 1.0) for value in values]) if values else None
+
+
+def _weighted_mean(values: Sequence[tuple[float, float]]) -> float:
+    """Return the mean of pairs of value and weight; of equal values it is that value, to the bit."""
+    weight = math.fsum(weight for _, weight in values)
+    try:
+        mean = math.fsum(value * weight for value, weight in values) / weight
+    except OverflowError:
+        mean = math.inf
+    # The sum of returns near the largest number that there is would be no number.
+    return mean if math.isfinite(mean) else math.fsum(value * (part / weight) for value, part in values)
 
 
 def expected_means(settings: Sequence[Sequence[float]]) -> list[float]:

@@ -32,21 +32,41 @@ ACCENT = "#c2410c"
 """The colour of the goal line."""
 # Okabe & Ito's colours, which can be told apart with any colour vision; yellow is left out, as it is faint on white.
 PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+RAMP = ("#440154", "#3e4989", "#26828e", "#35b779", "#7ad151")
+"""The colours of numbers from low to high: viridis without its yellow, which is faint on white."""
+_DARK_RAMP = ("#31688e", "#21918c", "#35b779", "#90d743", "#fde725")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", "-.", ":")
 _MAX_GROUP_VALUES = len(PALETTE)
-_MAX_DRAWN = 1e100
+MAX_DRAWN = 1e100
 _CSS_NAMES = {INK: "ink", MUTED: "muted", GRID: "grid", ACCENT: "accent"} | {
     color: f"series-{i}" for i, color in enumerate(PALETTE)
 }
-CSS_LIGHT = {f"--{name}": color for color, name in _CSS_NAMES.items()}
+CSS_LIGHT = {
+    "--page": "#f6f8fa",
+    "--card": "#ffffff",
+    "--chip": "#eef1f4",
+    "--soft": "#59636e",
+    "--link": "#0969da",
+    "--good": "#1a7f37",
+    **{f"--{name}": color for color, name in _CSS_NAMES.items()},
+    **{f"--ramp-{i}": color for i, color in enumerate(RAMP)},
+}
+"""The colours of the page in its light theme."""
 CSS_DARK = CSS_LIGHT | {
+    "--page": "#0d1117",
+    "--card": "#151b23",
+    "--chip": "#212830",
+    "--soft": "#9198a1",
+    "--link": "#4493f8",
+    "--good": "#3fb950",
     "--ink": "#e6edf3",
     "--muted": "#7d8590",
     "--grid": "#30363d",
     "--accent": "#fb923c",
     "--series-0": "#4da3e0",
     "--series-5": "#ff7b45",
+    **{f"--ramp-{i}": color for i, color in enumerate(_DARK_RAMP)},
 }
 
 
@@ -139,13 +159,26 @@ def steps_axis(axes: Axes) -> None:
 
 def drawable(values: ArrayLike) -> NDArray[np.float64]:
     """Return finite values, limited so that matplotlib's axes don't overflow near the largest floats."""
-    return np.clip(np.asarray(values, dtype=np.float64), -_MAX_DRAWN, _MAX_DRAWN)
+    return np.clip(np.asarray(values, dtype=np.float64), -MAX_DRAWN, MAX_DRAWN)
 
 
 def goal_line(axes: Axes, threshold: float | None) -> None:
     """Draw the return to reach as a dashed line, if there is one."""
     if threshold is not None:
         axes.axhline(
+            float(drawable([threshold])[0]),
+            color=ACCENT,
+            linewidth=1.6,
+            linestyle=(0, (6, 3)),
+            label=f"goal {threshold:g}",
+            zorder=1.5,
+        )
+
+
+def goal_line_across(axes: Axes, threshold: float | None) -> None:
+    """Draw the return to reach on a horizontal axis, if there is one."""
+    if threshold is not None:
+        axes.axvline(
             float(drawable([threshold])[0]),
             color=ACCENT,
             linewidth=1.6,
@@ -185,27 +218,47 @@ def to_png(figure: Figure, *, dpi: int = 160) -> bytes:
     return buffer.getvalue()
 
 
+def to_pdf(figure: Figure) -> bytes:
+    """Return the figure as PDF; the same figure gives the same bytes.
+
+    Its letters are Type 3 fonts, which take a tenth of the time; some journals want others (`analysis.exports.paper`).
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
+    return buffer.getvalue()
+
+
+def to_svg_file(figure: Figure) -> str:
+    """Return the figure as a whole SVG file, transparent; the same figure gives the same text.
+
+    Letters become shapes, which look the same whatever fonts the reader has.
+    """
+    import matplotlib as mpl
+
+    buffer = io.StringIO()
+    # The salt makes the ids reproducible.
+    with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": "figure"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    return buffer.getvalue()
+
+
 def to_svg(figure: Figure, *, label: str, prefix: str) -> str:
-    """Return the figure as an `<svg>` element for a page, transparent, with colours that the page may override.
+    """Return the figure as an `<svg>` element for a page, see `page_svg`."""
+    return page_svg(to_svg_file(figure), label=label, prefix=prefix)
+
+
+def page_svg(svg: str, *, label: str, prefix: str) -> str:
+    """Return a figure's SVG file as an `<svg>` element for a page, with colours that the page may override.
 
     Every colour of this module becomes `var(--name, #rrggbb)`: the page's theme sets the variables
     (`CSS_LIGHT`, `CSS_DARK`) and the picture is right without them.
 
     Args:
-        figure: The figure to draw.
+        svg: What `to_svg_file` returned.
         label: The text for screen readers.
         prefix: Put before every id, or two figures in one page would take each other's clip paths.
     """
-    import matplotlib as mpl
-
-    buffer = io.StringIO()
-    # Letters become shapes, which look the same whatever fonts the reader has. The salt makes the ids
-    # reproducible.
-    with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": prefix}):
-        figure.savefig(buffer, format="svg", transparent=True)
-    svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
-    # The metadata contain the date; without them the same figure gives the same text.
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     # Comments contain label texts, which come from sweep files and errors and must not reach the page unescaped.
     svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)

@@ -65,7 +65,9 @@ class Race:
         if num_done >= len(self.rounds) or len(self.contenders) < 2:
             return ()
         size, seeds = self.rounds[num_done]
-        running = list(self.contenders) if num_done == 0 else self._still_in(scores, size)
+        # With one seed each nothing says yet who cannot win.
+        several = max(len(scores[index]) for index in self.contenders) > 1
+        running = self._still_in(scores, size) if several else list(self.contenders)
         if len(running) < 2:
             return ()
         # Seed after seed, so that a round that is interrupted has given about as many to each.
@@ -78,3 +80,22 @@ class Race:
         chances = probability_of_being_best(known, rng=random_streams.fixed())
         possible = [index for index, chance in zip(self.contenders, chances, strict=True) if chance >= HARDLY_POSSIBLE]
         return sorted(possible, key=lambda index: -means[index])[:size]
+
+
+def race_within(contenders: Sequence[int], *, top: int, num_seeds: int, max_trainings: int) -> Race | None:
+    """Return the largest race that takes no more trainings than allowed; None: not even two settings can race.
+
+    It has as many of the leading settings as possible, up to `top`, before it has more seeds of each.
+
+    Args:
+        contenders: The indices of all points that could race, best first.
+        top: How many race at most.
+        num_seeds: How many more seeds a setting gets at most.
+        max_trainings: How many trainings it may take.
+    """
+    # With one seed each, a race takes as many trainings as settings.
+    size = min(top, len(contenders), max_trainings)
+    if size < 2:
+        return None
+    races = (Race(tuple(contenders[:size]), seeds) for seeds in range(min(num_seeds, max_trainings), 0, -1))
+    return next(race for race in races if race.max_trainings <= max_trainings)

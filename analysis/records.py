@@ -146,6 +146,10 @@ class TrialState(_Record):
     notes: tuple[str, ...] = Field((), description="What was damaged in it, and what it continued from instead.")
     node: str | None = Field(None, description="Address or name of the node it last ran on.")
     pid: int | None = Field(None, description="Process it last ran in.")
+    ran_with: dict[str, str] = Field(
+        default_factory=dict,
+        description="CPU, versions and environment variables that its numbers may depend on, where it last ran.",
+    )
     started_at: float | None = Field(None, description="Unix time, seconds.")
     ended_at: float | None = None
     checkpoints: tuple[CheckpointRecord, ...] = Field((), description="The kept ones, oldest first.")
@@ -236,6 +240,55 @@ class SettingsRecord(_Record):
         return self.ranking[0]
 
 
+class CandidateRecord(_Record):
+    """A kept checkpoint that might have been the policy to deploy, and how it fared."""
+
+    checkpoint: CheckpointRecord
+    point: dict[str, Any]
+    num_episodes: Count = Field(description="Greedy episodes that it was judged by, those of its evaluation included.")
+    score: Number = Field(description="Mean return over them.")
+    lower: float | None = Field(
+        None, description="The 95 % interval over episodes of this policy; None: none were played."
+    )
+    upper: float | None = None
+    rejected_in: Count | None = Field(
+        None, description="The round after which it was rejected; 0: it played in none; None: it won."
+    )
+    reason: str = Field("", description="Why it was rejected; empty: for its score.")
+    confirmation: EvaluationRecord | None = Field(
+        None, description="A runner-up on the confirmation seeds; the winner's is the record's own."
+    )
+
+
+class ChoiceRecord(_Record):
+    """How the policy to deploy was chosen: by successive rejects among the leading checkpoints of all trials."""
+
+    candidates: tuple[CandidateRecord, ...] = Field(min_length=1, description="The winner first.")
+    num_known: Count = Field(description="All kept checkpoints that had an evaluation.")
+    num_evaluation_episodes: Count = Field(description="The episodes of an evaluation during training.")
+    first_seed: Count | None = Field(None, description="The seed of the first further episode; None: there was none.")
+    num_rounds: Count = 0
+    num_episodes: Count = Field(0, description="Further episodes that were played, of all candidates together.")
+    num_env_steps: Count = Field(0, description="Env steps of these.")
+    max_env_steps: Count = Field(0, description="How many env steps they might take.")
+    note: str = Field("", description="Why the rounds ended before the last one; empty: they did not.")
+
+    @property
+    def winner(self) -> CandidateRecord:
+        """The policy to deploy."""
+        return self.candidates[0]
+
+    @property
+    def played(self) -> tuple[CandidateRecord, ...]:
+        """The candidates that could play, the winner first."""
+        return tuple(item for item in self.candidates if item.rejected_in != 0)
+
+    @property
+    def runners_up(self) -> tuple[CandidateRecord, ...]:
+        """Those that were confirmed beside the winner."""
+        return tuple(item for item in self.candidates if item.confirmation is not None)
+
+
 class BestRecord(_Record):
     """Both answers of a sweep, the policy to deploy and the setting to train with: best/evaluation.json."""
 
@@ -243,11 +296,14 @@ class BestRecord(_Record):
     checkpoint: CheckpointRecord
     point: dict[str, Any]
     seed: int
-    selection_score: Number = Field(description="Mean evaluation return it was chosen by.")
+    selection_score: Number = Field(description="Mean return of the greedy episodes it was chosen by.")
     confirmation: EvaluationRecord = Field(description="The winner on seeds it was not chosen on.")
     random: EvaluationRecord = Field(description="A random policy on the confirmation seeds.")
     settings: SettingsRecord | None = Field(
         None, description="The settings, which are another question than the policy; None: of an older version."
+    )
+    choice: ChoiceRecord | None = Field(
+        None, description="What the policy was chosen from, and how; None: of an older version."
     )
 
     @property
@@ -263,7 +319,8 @@ class BestRecord(_Record):
         facts = {
             "values": point or "no searched values",
             "trial": f"{self.checkpoint.trial_id}, at {self.checkpoint.num_env_steps:,} env steps",
-            "chosen by": f"{return_text(self.selection_score)} mean evaluation return",
+            "chosen by": f"{return_text(self.selection_score)} mean evaluation return"
+            + (f" over {self.choice.winner.num_episodes:,} episodes" if self.choice is not None else ""),
             "confirmed at": f"{return_text(confirmed.mean_return)} over {confirmed.num_episodes} fresh episodes; "
             f"gap {difference_text(self.optimism_gap)}",
             "random policy": return_text(self.random.mean_return),
@@ -274,12 +331,22 @@ class BestRecord(_Record):
         return facts_html("Best policy", facts)
 
 
+class FilmsRecord(_Record):
+    """Whose films lie in best/: films.json, written once they are whole."""
+
+    format_version: int = FORMAT_VERSION
+    checkpoint: CheckpointRecord = Field(description="The winner that they show.")
+
+
 class ReplicationRecord(_Record):
     """More seeds that some points of a sweep were given, one each; see `analysis.numbering`."""
 
     num_points: Annotated[int, Field(ge=1, le=2**31)] = Field(description="The points that the sweep had then.")
     points: tuple[Annotated[int, Field(ge=0, le=2**31)], ...] = Field(
         description="Their indices, in the order of the trials."
+    )
+    by: Literal["replicate", "confirm"] = Field(
+        "replicate", description="Who asked for them: a person, or the sweep's own `confirm`."
     )
 
 

@@ -7,20 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from analysis.records import BestRecord, IterationRecord, TrialRecord
-from analysis.selection import PointScore, rank_points
-from analysis.statistics import iqm, mean_with_ci, small_sample_note
-from analysis.tables import cell_value, groups_frame, point_names, steps_to_solve_frame, trials_frame
-from analysis.wording import NONE, interval_text, is_number, number, return_text
-from policies import random_streams
+from analysis.selection import rank_points
+from analysis.tables import groups_frame, point_names, steps_to_solve_frame, trials_frame
+from analysis.wording import NONE, is_number, number, return_text
 
 MAX_STEPS_ROWS = 20
 """How many points the table of env steps to solve shows; the CSV file beside the report has them all."""
-_ONE_DECIMAL = {"score", "training_return", "time_s", "best_score", "mean_score"}
+_ONE_DECIMAL = {"score", "training_return", "core_seconds", "best_score", "mean_score"}
 
 
 class Cell(NamedTuple):
@@ -31,6 +28,8 @@ class Cell(NamedTuple):
     text: str
     kind: str = ""
     """CSS class: "winner", a trial status, or "wide" for text that may wrap."""
+    href: str = ""
+    """Where in the page the cell leads; empty: nowhere."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Table:
     headings: list[str]
     rows: list[list[Cell]]
 
-    @property
+    @cached_property
     def numeric(self) -> list[bool]:
         """For each column, whether its known values are numbers, which are aligned to the right."""
         known = [[row[i].value for row in self.rows if row[i].value is not None] for i in range(len(self.headings))]
@@ -53,23 +52,38 @@ def trial_table(
     *,
     goal: float | None,
     best: BestRecord | None,
+    core_seconds: Mapping[str, float],
+    errors: Mapping[str, str],
 ) -> Table:
-    """Return all trials, first those that can win, in the order of the selection."""
+    """Return all trials, first those that can win, in the order of the selection; the score is the first column.
+
+    Args:
+        trials: The trials of one sweep.
+        results: Iterations by trial id, oldest first.
+        goal: The return that counts as solved; None: there is none.
+        best: The confirmed winner, which is marked.
+        core_seconds: The core-seconds of each trial of which they are known.
+        errors: The anchor of the error of each failed trial, where the page has it.
+    """
     frame = trials_frame(trials, results, threshold=goal)
+    frame["core_seconds"] = frame["trial_id"].map(core_seconds).astype("float64")
     ranked = [item.trial.trial_id for point in rank_points(trials) for item in point.trial_scores]
     order = {trial_id: rank for rank, trial_id in enumerate(ranked)}
     winner = best.checkpoint.trial_id if best is not None else None
-    columns = {"trial_id": "trial", "status": "status"} | {name: name for name in point_names(trials)}
-    columns |= {"score": "score", "training_return": "training return"}
+    columns = {"score": "score", "trial_id": "trial", "status": "status"}
+    columns |= {name: name for name in point_names(trials)}
+    columns |= {"training_return": "training return"}
     if goal is not None:
         columns["num_env_steps_to_solve"] = "env steps to solve"
-    columns |= {"num_env_steps": "env steps", "time_s": "time (s)", "stop_reason": "ended by"}
+    columns |= {"num_env_steps": "env steps", "core_seconds": "core-seconds", "seed": "seed"}
+    columns |= {"stop_reason": "ended by"}
     rows = []
     for row in sorted(frame.to_dict("records"), key=lambda row: order.get(row["trial_id"], len(order))):
         cells = [_cell(str(name), row[name]) for name in columns]
         if row["trial_id"] == winner:
-            cells[0] = cells[0]._replace(kind="winner")
-        cells[1] = cells[1]._replace(kind=str(row["status"]))
+            cells[1] = cells[1]._replace(kind="winner")
+        anchor = errors.get(str(row["trial_id"]))
+        cells[2] = cells[2]._replace(kind=str(row["status"]), href="" if anchor is None else f"#{anchor}")
         rows.append(cells)
     return Table(list(columns.values()), rows)
 
@@ -119,36 +133,11 @@ def steps_table(
     return Table([*names, "seeds that solve", "median env steps", "env steps of each seed"], rows)
 
 
-def point_table(trials: Sequence[TrialRecord]) -> Table:
-    """Return the points, best first, if they have several seeds, else an empty table."""
-    points = rank_points(trials)
-    if all(point.num_seeds < 2 for point in points):
-        return Table([], [])
-    names = point_names(trials)
-    rng = random_streams.fixed()
-    headings = ["rank", *names, "seeds usable", "mean score", "IQM", "95 % interval", "note"]
-    return Table(headings, [_point_row(rank, point, names, rng) for rank, point in enumerate(points, start=1)])
-
-
-def _point_row(rank: int, point: PointScore, names: Sequence[str], rng: np.random.Generator) -> list[Cell]:
-    scores = [item.score for item in point.trial_scores]
-    notes = [] if point.complete else ["seeds missing: ranked after complete points"]
-    notes += [note] if (note := small_sample_note(len(scores))) else []
-    interval = interval_text(mean_with_ci(scores, rng=rng)) if len(scores) > 1 else NONE
-    return [
-        Cell(rank, str(rank)),
-        *(_cell(name, cell_value(point.point.get(name))) for name in names),
-        Cell(len(scores), f"{len(scores)} of {point.num_seeds}"),
-        Cell(point.score, return_text(point.score)),
-        Cell(iqm(scores), return_text(iqm(scores))),
-        Cell(interval, interval),
-        Cell("; ".join(notes), "; ".join(notes), "wide"),
-    ]
-
-
 def _cell(name: str, value: Any) -> Cell:
     import pandas as pd
 
     if pd.isna(value):
         return Cell(None, NONE)
+    if name == "seed":  # a name more than a number
+        return Cell(value, str(value))
     return Cell(value, return_text(value) if name in _ONE_DECIMAL else number(value))

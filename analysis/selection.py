@@ -1,4 +1,7 @@
-"""The one place that decides which checkpoint of a sweep is "best".
+"""The one place that decides which checkpoints of a sweep are ahead by their evaluations.
+
+The policy to deploy is chosen among the leading ones of all trials (`policy_candidates`) by more episodes, which
+`analysis.successive_rejects` describes. What follows is who leads while a sweep runs, and the order of points.
 
 Words: a *usable* trial did not fail and keeps at least one checkpoint with a finite evaluation return; its
 *score* is the highest of them. The score of a *point* is the mean score of its usable trials, one per seed. A
@@ -14,12 +17,13 @@ The rule, in order:
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.records import FINISHED, CheckpointRecord, TrialRecord, finite_or_none
+from analysis.records import FINISHED, BestRecord, CheckpointRecord, TrialRecord, finite_or_none
 from policies.errors import NotFoundError
 
 _MAX_ERROR_CHARS = 300
@@ -62,7 +66,7 @@ class PointScore:
 
 @dataclass(frozen=True)
 class Selection:
-    """The winner of a sweep."""
+    """Who leads in a sweep, by evaluations alone."""
 
     checkpoint: CheckpointRecord
     trial: TrialRecord
@@ -92,6 +96,50 @@ def best_checkpoint(checkpoints: Iterable[CheckpointRecord]) -> CheckpointRecord
     """
     best = _best_of(checkpoints)
     return None if best is None else best[1]
+
+
+def policy_candidates(trials: Sequence[TrialRecord]) -> list[TrialScore]:
+    """Return every checkpoint that may be deployed, of all trials and points, the highest evaluation return first.
+
+    A trial that failed has none: what was wrong with it may be wrong with its checkpoints. A point that has a failed
+    seed has, because that says something of training with it, but nothing of a policy that was trained.
+
+    Where evaluations are equal, the higher training return is first, as it was measured over other and more episodes.
+    """
+    scored = [
+        TrialScore(trial, checkpoint, score)
+        for trial in trials
+        if trial.status != "failed"
+        for checkpoint in trial.checkpoints
+        if (score := finite_or_none(checkpoint.evaluation_return)) is not None
+    ]
+    return sorted(scored, key=_candidate_order)
+
+
+def is_current(best: BestRecord, trials: Sequence[TrialRecord]) -> bool:
+    """Whether a policy was chosen from those checkpoints that it would be chosen from now.
+
+    They are others where the sweep was extended or trained on since.
+    """
+    if best.choice is None:  # of an older version, whose rule was `select_best`
+        try:
+            return select_best(trials).checkpoint == best.checkpoint
+        except NoUsableTrialError:
+            return False
+    known = [item.checkpoint for item in policy_candidates(trials)]
+    chosen = {item.checkpoint.path: item.checkpoint for item in best.choice.candidates}
+    # They are the first of all, whether they could be read or not.
+    return len(known) == best.choice.num_known and {item.path: item for item in known[: len(chosen)]} == chosen
+
+
+def _candidate_order(item: TrialScore) -> tuple[float, float, int, int, int]:
+    training = finite_or_none(item.checkpoint.training_return)
+    return (-item.score, math.inf if training is None else -training, *tie_key(item))
+
+
+def tie_key(item: TrialScore) -> tuple[int, int, int]:
+    """Return what decides between policies that nothing else tells apart; the lowest wins."""
+    return item.checkpoint.num_env_steps, item.trial.index, item.checkpoint.iteration
 
 
 def _best_of(checkpoints: Iterable[CheckpointRecord]) -> tuple[float, CheckpointRecord] | None:
@@ -141,14 +189,14 @@ def _seeds_per_point(trials: Sequence[TrialRecord]) -> int:
 
 
 def select_best(trials: Sequence[TrialRecord]) -> Selection:
-    """Choose the checkpoint that wins the sweep.
+    """Return the checkpoint that leads in the sweep, by its evaluations alone.
 
     Raises:
         NoUsableTrialError: No trial is usable.
     """
     ranking = rank_points(trials)
     if not ranking:
-        raise NoUsableTrialError(*_why_none(trials))
+        raise no_usable_trial(trials)
     winner = ranking[0].trial_scores[0]
     return Selection(winner.checkpoint, winner.trial, winner.score, tuple(ranking))
 
@@ -160,6 +208,11 @@ def _trial_order(item: TrialScore) -> tuple[float, int, int]:
 def _point_order(item: PointScore) -> tuple[bool, float, float, int]:
     lowest_index = min(score.trial.index for score in item.trial_scores)
     return (not item.complete, -item.score, item.num_env_steps, lowest_index)
+
+
+def no_usable_trial(trials: Sequence[TrialRecord]) -> NoUsableTrialError:
+    """Return the error for a sweep without a usable trial."""
+    return NoUsableTrialError(*_why_none(trials))
 
 
 def _why_none(trials: Sequence[TrialRecord]) -> tuple[str, str]:

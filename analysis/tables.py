@@ -24,11 +24,14 @@ SOLVED_OVER_NUM_EPISODES = 100
 
 _AFTER_POINT = [
     "seed",
+    "point_index",
+    "seed_index",
     "score",
     "score_num_env_steps",
     "training_return",
     "evaluation_return",
     "num_env_steps_to_solve",
+    "num_env_steps_to_threshold",
     "num_iterations",
     "num_env_steps",
     "num_episodes",
@@ -82,6 +85,25 @@ def env_steps_to(
     return None
 
 
+def env_steps_to_evaluation(threshold: float | None, iterations: Sequence[IterationRecord]) -> int | None:
+    """Return the env steps until an evaluation first reached a threshold; None if none did.
+
+    An evaluation is of few episodes, so a lucky one may reach it: `env_steps_to` asks for more.
+
+    Args:
+        threshold: Mean evaluation return to reach; None: there is nothing to reach.
+        iterations: The iterations of one trial, oldest first.
+    """
+    if threshold is None:
+        return None
+    reached = (
+        item.num_env_steps
+        for item in iterations
+        if item.evaluation_return is not None and item.evaluation_return >= threshold
+    )
+    return next(reached, None)
+
+
 def trials_frame(
     trials: Sequence[TrialRecord],
     results: Mapping[str, Sequence[IterationRecord]] | None = None,
@@ -90,14 +112,19 @@ def trials_frame(
 ) -> pd.DataFrame:
     """Return a table with one row per trial, in order of index.
 
-    Columns: trial_id, status, one for each searched hyperparameter, seed, score (which the selection compares;
-    missing if the trial cannot win), score_num_env_steps (when it was reached), training_return,
-    evaluation_return (the newest), num_env_steps_to_solve (see `env_steps_to`; all missing without results
-    and a threshold), num_iterations, num_env_steps, num_episodes, time_s, stop_reason, num_failures, error
-    (its first line). In a population, the searched values are those that the score was reached with, and the last
-    column is changes (see `describe_changes`).
+    Columns: trial_id, status, one for each searched hyperparameter, seed, point_index, seed_index (trials of one
+    point differ in their seeds alone), score (which the selection compares; missing if the trial cannot win),
+    score_num_env_steps (when it was reached), training_return, evaluation_return (the newest),
+    num_env_steps_to_solve (see `env_steps_to`; all missing without results and a threshold),
+    num_env_steps_to_threshold (see `env_steps_to_evaluation`; filled also where trials end before their training
+    return reaches it, as with `stop.evaluation_return`), num_iterations, num_env_steps, num_episodes, time_s,
+    stop_reason, num_failures, error (its first line). In a population, the searched values are those that the score was
+    reached with, and the last column is changes (see `describe_changes`).
     """
     import pandas as pd
+
+    def rows_of(trial: TrialRecord) -> Sequence[IterationRecord]:
+        return (results or {}).get(trial.trial_id, ())
 
     names = point_names(trials)
     rows = []
@@ -110,11 +137,14 @@ def trials_frame(
                 "status": trial.status,
                 **{name: cell_value(point.get(name)) for name in names},
                 "seed": trial.seed,
+                "point_index": trial.point_index,
+                "seed_index": trial.seed_index,
                 "score": best.score if best is not None else None,
                 "score_num_env_steps": best.checkpoint.num_env_steps if best is not None else None,
                 "training_return": trial.training_return,
                 "evaluation_return": trial.evaluation_return,
-                "num_env_steps_to_solve": env_steps_to(threshold, (results or {}).get(trial.trial_id, ())),
+                "num_env_steps_to_solve": env_steps_to(threshold, rows_of(trial)),
+                "num_env_steps_to_threshold": env_steps_to_evaluation(threshold, rows_of(trial)),
                 "num_iterations": trial.num_iterations,
                 "num_env_steps": trial.num_env_steps,
                 "num_episodes": trial.num_episodes,
@@ -129,7 +159,7 @@ def trials_frame(
     frame = pd.DataFrame(rows, columns=["trial_id", "status", *names, *_AFTER_POINT, *changes])
     floats = ["score", "training_return", "evaluation_return", "time_s"]
     # Int64 (capital I) is pandas' integer that can be missing: env steps stay whole numbers in the CSV.
-    counts = ["score_num_env_steps", "num_env_steps_to_solve"]
+    counts = ["score_num_env_steps", "num_env_steps_to_solve", "num_env_steps_to_threshold"]
     return frame.astype({**dict.fromkeys(floats, "float64"), **dict.fromkeys(counts, "Int64")})
 
 

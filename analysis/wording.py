@@ -114,6 +114,13 @@ def return_text(value: float | None, *, none: str = NONE) -> str:
     return none if value is None else f"{value:z.1f}"
 
 
+def known_return_text(value: float) -> str:
+    """Format a return or a score that may be no finite number, which is said in words."""
+    if math.isfinite(value):
+        return return_text(value)
+    return "not a number" if math.isnan(value) else "infinite"
+
+
 def difference_text(value: float) -> str:
     """Format a difference of two returns, with its sign and one decimal; what rounds to zero is "+0.0"."""
     return f"{value:+z.1f}"

@@ -26,7 +26,7 @@ _LONGEST_NAME, _LONGEST_PATH = 255, 4096
 
 
 class Range(NamedTuple):
-    """The range of a whole number, both ends included; for use in `Annotated`."""
+    """The range of a number, both ends included; for use in `Annotated`."""
 
     low: int
     high: int | None = None
@@ -35,6 +35,7 @@ class Range(NamedTuple):
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 PositiveInt = Annotated[int, Range(1)]
 NumEpisodes = Annotated[int, Range(1, 2**18)]
+Inches = Annotated[float, Range(1, 100)]
 
 
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -167,7 +168,8 @@ def _words(kind: Any) -> str:
         return " or ".join(map(repr, parts))
     if origin is Annotated:
         low, high = parts[1]
-        return f"a whole number from {low:,} to {high:,}" if high is not None else f"a whole number of at least {low:,}"
+        number = _words(parts[0])
+        return f"{number} from {low:,} to {high:,}" if high is not None else f"{number} of at least {low:,}"
     if origin in (Sequence, Iterable):
         return f"a list, each of its items {_words(parts[0])}"
     known = origin or kind

@@ -31,6 +31,7 @@ class ForeignName(NamedTuple):
 
 
 _LR = "a schedule from a to b over n env steps is lr a, lr_final b, lr_decay_steps n"
+_CLIP = "a number; a schedule from a to b over n env steps is clip_param a, clip_param_final b, clip_decay_steps n"
 _ENTROPY = "a schedule from a to b over n env steps is entropy_coeff a, entropy_coeff_final b, entropy_decay_steps n"
 _FROM_PLAN = "it follows from the other settings"
 
@@ -41,8 +42,7 @@ _SHARED: tuple[ForeignName, ...] = (
     ForeignName(SB3, "n_envs", ("num_envs",)),
     ForeignName(SB3, "net_arch", ("hidden_sizes",), "a list of sizes; there are none for one of two networks alone"),
     ForeignName(SB3, "activation_fn", ("activation",), "by its name: nn.ReLU is relu, nn.Tanh is tanh"),
-    ForeignName(SB3, "norm_obs", ("normalize_observations",), "of VecNormalize; rewards are not normalised here"),
-    ForeignName(SB3, "normalize", ("normalize_observations",), "of RL Zoo; rewards are not normalised here"),
+    ForeignName(SB3, "norm_obs", ("normalize_observations",), "of VecNormalize"),
     ForeignName(SB3, "policy_kwargs", (), "set hidden_sizes for its net_arch, activation for its activation_fn"),
     ForeignName(SB3, "total_timesteps", (), "set stop.num_env_steps"),
     ForeignName(SB3, "n_timesteps", (), "of RL Zoo: set stop.num_env_steps"),
@@ -74,10 +74,13 @@ _PPO: tuple[ForeignName, ...] = (
         ("train_batch_size",),
         "it counts each environment's steps: train_batch_size is n_steps x n_envs",
     ),
+    ForeignName(SB3, "norm_reward", ("normalize_rewards",), "of VecNormalize; scaled anew once per iteration"),
+    ForeignName(SB3, "normalize", ("normalize_observations", "normalize_rewards"), "of RL Zoo; true is both"),
+    ForeignName(SB3, "clip_reward", (), "of VecNormalize: normalised rewards are always clipped at -/+ 10"),
     ForeignName(SB3, "batch_size", ("minibatch_size",)),
     ForeignName(SB3, "n_epochs", ("num_epochs",)),
     ForeignName(SB3, "gae_lambda", ("gae_lambda",)),
-    ForeignName(SB3, "clip_range", ("clip_param",), "a number; there is no schedule for it here"),
+    ForeignName(SB3, "clip_range", ("clip_param",), _CLIP),
     ForeignName(
         SB3,
         "clip_range_vf",
@@ -126,6 +129,7 @@ _PPO: tuple[ForeignName, ...] = (
 
 _EPSILON = "epsilon: [[0, a], [n, b]] is epsilon_initial a, epsilon_decay n, epsilon_final b"
 _DQN: tuple[ForeignName, ...] = (
+    ForeignName(SB3, "normalize", ("normalize_observations",), "of RL Zoo; rewards are normalised with ppo alone"),
     ForeignName(SB3, "buffer_size", ("replay_capacity",)),
     ForeignName(SB3, "learning_starts", ("learning_starts",)),
     ForeignName(SB3, "batch_size", ("train_batch_size",)),

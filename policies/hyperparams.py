@@ -98,6 +98,10 @@ class PPOHyperparams(_Hyperparams):
 
     gae_lambda: Fraction = Field(0.95, description="Lambda of generalised advantage estimation, in [0, 1].")
     clip_param: PositiveFloat = Field(0.2, description="Clip the policy ratio to 1 -/+ this.")
+    clip_param_final: NonNegativeFloat | None = Field(
+        None, description="Move clip_param linearly to this over clip_decay_steps; null: it stays."
+    )
+    clip_decay_steps: PositiveInt | None = Field(None, description="Env steps from clip_param to clip_param_final.")
     vf_clip_param: PositiveFloat | None = Field(
         None,
         description="Clip the squared value error at this; null: no clipping. RLlib's own default, 10, stops the value "
@@ -115,6 +119,11 @@ class PPOHyperparams(_Hyperparams):
     use_kl_loss: bool = Field(False, description="Add RLlib's adaptive KL penalty to the loss.")
     kl_coeff: NonNegativeFloat = Field(0.2, description="First weight of the KL penalty, if used.")
     kl_target: PositiveFloat = Field(0.01, description="KL divergence the penalty aims at, if used.")
+    normalize_rewards: bool = Field(
+        False,
+        description="Divide rewards in training by the running deviation of the discounted return, and clip them at "
+        "-/+ 10; returns are reported as the environment gives them.",
+    )
     train_batch_size: PositiveInt = Field(1024, description="Env steps per iteration, over all env runners.")
     minibatch_size: PositiveInt = Field(256, description="Env steps per gradient step; at most train_batch_size.")
     num_epochs: PositiveInt = Field(6, description="Passes over each train batch.")
@@ -126,6 +135,7 @@ class PPOHyperparams(_Hyperparams):
                 f"minibatch_size {self.minibatch_size} is larger than train_batch_size {self.train_batch_size}: "
                 "lower the one or raise the other"
             )
+        _check_schedule("clip_param_final", self.clip_param_final, "clip_decay_steps", self.clip_decay_steps)
         _check_schedule(
             "entropy_coeff_final", self.entropy_coeff_final, "entropy_decay_steps", self.entropy_decay_steps
         )

@@ -23,25 +23,32 @@ if TYPE_CHECKING:
     from tune_jobs.sweeps.verbs import SweepResult as SweepResult
     from tune_jobs.sweeps.verbs import SweepStatus as SweepStatus
     from tune_jobs.sweeps.verbs import best as best
+    from tune_jobs.sweeps.verbs import compare as compare
     from tune_jobs.sweeps.verbs import create as create
     from tune_jobs.sweeps.verbs import dataframe as dataframe
     from tune_jobs.sweeps.verbs import drive as drive
     from tune_jobs.sweeps.verbs import evaluate as evaluate
+    from tune_jobs.sweeps.verbs import export as export
     from tune_jobs.sweeps.verbs import extend as extend
+    from tune_jobs.sweeps.verbs import figure as figure
+    from tune_jobs.sweeps.verbs import importance as importance
     from tune_jobs.sweeps.verbs import launch as launch
     from tune_jobs.sweeps.verbs import list_sweeps as list_sweeps
     from tune_jobs.sweeps.verbs import replicate as replicate
     from tune_jobs.sweeps.verbs import report as report
+    from tune_jobs.sweeps.verbs import reproduce as reproduce
     from tune_jobs.sweeps.verbs import restore as restore
     from tune_jobs.sweeps.verbs import resume as resume
     from tune_jobs.sweeps.verbs import status as status
     from tune_jobs.sweeps.verbs import stop as stop
+    from tune_jobs.sweeps.verbs import study as study
     from tune_jobs.sweeps.verbs import trials as trials
     from tune_jobs.sweeps.verbs import video as video
 
 _SWEEPS = (
-    "CreatedSweep", "SweepResult", "SweepStatus", "best", "create", "dataframe", "drive", "evaluate", "extend",
-    "launch", "list_sweeps", "replicate", "report", "restore", "resume", "status", "stop", "trials", "video",
+    "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
+    "export", "extend", "figure", "importance", "launch", "list_sweeps", "replicate", "report", "reproduce", "restore",
+    "resume", "status", "stop", "study", "trials", "video",
 )  # fmt: skip
 _HOME = {
     "TuneJobsError": "policies.errors",

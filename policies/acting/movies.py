@@ -25,6 +25,7 @@ _GIF_MAX_FRAMES = 500
 _GIF_COLORS = 128
 # Pairs (scale, n): every n-th frame is kept, at this scale; tried in turn until the GIF is small enough.
 _GIF_ATTEMPTS = ((1.0, 1), (1.0, 2), (0.75, 2), (0.75, 4), (0.5, 4), (0.5, 8), (0.25, 8))
+_STILL_TIMEOUT_S = 30.0
 
 
 class Mp4Writer:
@@ -138,6 +139,23 @@ class Mp4Writer:
         if self._process is not None and self._process.poll() is None:
             self._process.kill()
             self._process.wait()
+
+
+def still_of(film: Path) -> bytes | None:
+    """Return a telling picture of a film, as JPEG, for where films don't play; None: it can't be read."""
+    import imageio_ffmpeg
+
+    # The filter chooses the picture that is most like the others of the film's first 200.
+    choose = ["-vf", "thumbnail=200", "-frames:v", "1", "-f", "image2pipe", "-c:v", "mjpeg", "-q:v", "4", "-"]
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+        command = [program, "-v", "error", "-i", str(film), *choose]
+        done = subprocess.run(  # noqa: S603  (a fixed command; the path is no shell text)
+            command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=_STILL_TIMEOUT_S
+        )
+    except (OSError, RuntimeError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 and done.stdout else None
 
 
 class GifWriter:

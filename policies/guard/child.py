@@ -156,6 +156,37 @@ def evaluate_policy(
     )  # fmt: skip
 
 
+def evaluate_policies(
+    env_id: str,
+    env_args: dict[str, Any],
+    policies: Sequence[dict[str, str]],
+    seeds: Sequence[int],
+    max_episode_steps: int | None,
+) -> list[dict[str, Any]]:
+    """Run `policies.packed.evaluation.evaluate_many` with saved policies; return their episodes, or their errors."""
+    from policies.acting.evaluate import Evaluator
+    from policies.packed.evaluation import evaluate_many
+
+    def play(some: list[Policy]) -> list[Episodes | Exception]:
+        with Evaluator(env_id, env_args, seeds, max_episode_steps=max_episode_steps) as evaluator:
+            return evaluate_many(evaluator, some)
+
+    loaded = [_load(policy) for policy in policies]
+    results = play(loaded)
+    if any(isinstance(result, Exception) for result in results):
+        # An env that has raised an error may not be as it was for whoever acts in it next: each gets one of its own.
+        results = [play([policy])[0] for policy in loaded]
+    return [_episodes_or_error(result) for result in results]
+
+
+def _episodes_or_error(result: Episodes | Exception) -> dict[str, Any]:
+    if not isinstance(result, Exception):
+        return vars(result)
+    if not isinstance(result, TuneJobsError):
+        raise result
+    return {"error": {"message": result.message, "hint": result.hint}}
+
+
 def record_video(env_id: str, policy: dict[str, str], files: dict[str, str | None], **options: Any) -> dict[str, Any]:
     """Run `policies.acting.video.record_video` with a saved policy and return the episodes."""
     from policies.acting.video import record_video as record
@@ -190,5 +221,7 @@ def _paths(files: Mapping[str, str | None]) -> dict[str, Any]:
 
 _JOBS: dict[str, Callable[..., Any]] = {
     job.__name__: job
-    for job in (check_env, check_seedable, measure_step, evaluate_policy, record_video, record_comparison)
-}
+    for job in (
+        check_env, check_seedable, measure_step, evaluate_policy, evaluate_policies, record_video, record_comparison,
+    )
+}  # fmt: skip

@@ -22,7 +22,7 @@ from policies.acting.policy import Policy, RandomPolicy, WeightsPolicy
 from policies.envs.failures import FailureRule
 from policies.envs.make import EnvInfo
 from policies.envs.spaces import space_from_description
-from policies.errors import EnvError
+from policies.errors import EnvError, TuneJobsError
 from policies.files import write_atomic, write_plain
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.hyperparams import Algorithm, ConstantHyperparams, RandomHyperparams
@@ -91,6 +91,31 @@ def evaluate_policy(
             seeds=[int(seed) for seed in seeds], max_episode_steps=max_episode_steps, timeout_s=timeout_s,
         )  # fmt: skip
     return _episodes(told)
+
+
+def evaluate_policies(
+    policies: Sequence[Policy],
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any] | None = None,
+    seeds: Sequence[int],
+    max_episode_steps: int | None = None,
+    timeout_s: float = CALL_TIMEOUT_S,
+) -> list[Episodes | TuneJobsError]:
+    """Play one greedy episode for each seed and each policy, as many at once as the env allows, in the guard's child.
+
+    Returns:
+        For each policy its episodes, which are those of `evaluate_policy`, or the error that this would raise.
+
+    Raises:
+        EnvError: The environment cannot be made, hung, or ended its process, for whichever policy.
+    """
+    with guarding() as guard, _saved(*policies) as saved:
+        told = guard.run(
+            "evaluate_policies", env_id, env_args=_as_json(env_id, env_args), policies=saved,
+            seeds=[int(seed) for seed in seeds], max_episode_steps=max_episode_steps, timeout_s=timeout_s,
+        )  # fmt: skip
+    return [TuneJobsError(**each["error"]) if "error" in each else _episodes(each) for each in told]
 
 
 def record_video(

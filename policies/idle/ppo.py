@@ -66,7 +66,9 @@ PPO_RULES: dict[str, Rules] = {
     "grad_clip": ALWAYS,
     "num_envs": ALWAYS,
     "gae_lambda": (Rule("gamma is 0, and no later reward counts", lambda h, _: h.gamma == 0.0, ("gamma",)),),
-    "clip_param": (_ONE_UPDATE,),
+    "clip_param": (_ONE_UPDATE, *_start_of_schedule("clip_decay_steps", "clip_param_final")),
+    "clip_param_final": (_ONE_UPDATE,),
+    "clip_decay_steps": (_ONE_UPDATE, *_decay_of_schedule("clip_decay_steps", "clip_param", "clip_param_final")),
     "vf_clip_param": (
         Rule(
             "vf_loss_coeff is 0, and the value error has no weight",
@@ -82,6 +84,7 @@ PPO_RULES: dict[str, Rules] = {
     "use_kl_loss": (_NO_KL_COEFF, _ONE_UPDATE),
     "kl_coeff": (_NO_KL_LOSS, _ONE_UPDATE),
     "kl_target": (_NO_KL_LOSS, _NO_KL_COEFF, _ONE_UPDATE, _ONE_ITERATION),
+    "normalize_rewards": ALWAYS,
     "train_batch_size": ALWAYS,
     "minibatch_size": ALWAYS,
     "num_epochs": ALWAYS,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.return_statistics import ReturnStatistics
 
 Weights = dict[str, NDArray[Any]]
 
@@ -49,6 +50,8 @@ class Member(Generic[H_co]):
     num_updates: int = 0
     kl_coeff: float = 0.0
     """PPO: the present weight of the KL penalty."""
+    return_statistics: ReturnStatistics = field(default_factory=ReturnStatistics)
+    """PPO with `normalize_rewards`: those of the discounted return so far."""
     due: float = 0.0
     """DQN: the number of updates that are due but not made."""
     target_updates_at: float = 0.0

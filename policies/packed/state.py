@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,8 +11,9 @@ import numpy as np
 
 from policies.errors import MALFORMED, CheckpointError
 from policies.files import write_plain
-from policies.hyperparams import Algorithm, PPOHyperparams, TrainedHyperparams, make_hyperparams
+from policies.hyperparams import Algorithm, Hyperparams, PPOHyperparams, TrainedHyperparams, make_hyperparams
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, AnyMember, Member, Weights
+from policies.return_statistics import ReturnStatistics
 
 STATE_FOLDER = "packed"
 _FORMAT_VERSION = 1
@@ -21,6 +23,7 @@ _COUNTERS = (
     "target_updates_at", "num_target_updates",
 )  # fmt: skip
 _WEIGHTS = "weights"
+_RETURNS = "return_statistics"
 _STATISTICS = (OBS_MEAN, OBS_VAR, OBS_COUNT)
 _MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"})
 """The names of the moments of Adam and of RMSprop."""
@@ -48,6 +51,7 @@ def save_member(member: AnyMember, folder: Path) -> None:
         "seed": member.seed,
         "counters": {name: getattr(member, name) for name in _COUNTERS},
         "failure_penalty": member.failure_penalty,
+        **({_RETURNS: vars(member.return_statistics)} if _normalizes_rewards(member.hyperparams) else {}),
         "rng": member.rng.bit_generator.state,
     }
     write_plain(folder / _TENSORS, save(tensors))
@@ -91,10 +95,23 @@ def load_member(folder: Path, member_id: str) -> AnyMember:
             moments=parts,
             rng=rng,
             failure_penalty=None if description["failure_penalty"] is None else _number(description["failure_penalty"]),
+            return_statistics=_return_statistics(description, hyperparams),
             **cast("Any", {name: _number(description["counters"][name]) for name in _COUNTERS}),
         )
     except (OSError, SafetensorError, *MALFORMED) as error:
         raise CheckpointError(f"{folder} does not hold a member's state: {repr(error)[:400]}.", _HINT) from error
+
+
+def _normalizes_rewards(hyperparams: Hyperparams) -> bool:
+    return isinstance(hyperparams, PPOHyperparams) and hyperparams.normalize_rewards
+
+
+def _return_statistics(description: dict[str, Any], hyperparams: Hyperparams) -> ReturnStatistics:
+    """Return the statistics that rewards are normalised by; without them the policy's rewards would change scale."""
+    if not _normalizes_rewards(hyperparams):
+        return ReturnStatistics()
+    saved = description[_RETURNS]
+    return ReturnStatistics(**{item.name: float(_number(saved[item.name])) for item in fields(ReturnStatistics)})
 
 
 def _number(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,7 @@ def _take_over(algorithm: Algorithm, member: AnyMember) -> None:
     else:
         # This dict makes its values when they are first asked for, so there are none to loop over yet.
         learner.curr_kl_coeffs_per_module[DEFAULT_MODULE_ID].data.fill_(member.kl_coeff)
+        learner.return_statistics = replace(member.return_statistics)
 
 
 def _count_env_steps(algorithm: Algorithm, num_env_steps: int) -> None:

@@ -20,7 +20,7 @@ from policies.networks.rl_modules import module_spec
 from policies.rllib.dqn_algorithm import ReplayDQNConfig
 from policies.rllib.dqn_learner import DQNLearner
 from policies.rllib.env_runner import ArrayEnvRunner
-from policies.rllib.ppo_learner import PPOLearner
+from policies.rllib.ppo_learner import CLIP_SCHEDULE, NORMALIZE_REWARDS, PPOLearner
 
 
 def build_algorithm_config(
@@ -101,6 +101,14 @@ def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
         minibatch_size=hyperparams.minibatch_size,
         num_epochs=hyperparams.num_epochs,
     )
+    # What RLlib has no settings for.
+    own: dict[str, Any] = {}
+    if hyperparams.clip_param_final is not None:
+        own[CLIP_SCHEDULE] = (hyperparams.clip_param_final, hyperparams.clip_decay_steps)
+    if hyperparams.normalize_rewards:
+        own[NORMALIZE_REWARDS] = True
+    if own:
+        config.training(learner_config_dict=own)
     return config.learners(learner_class=PPOLearner)
 
 

@@ -1,21 +1,46 @@
-"""RLlib's PPO learner, with schedules that act from the first update on, and with observation statistics."""
+"""RLlib's PPO learner, with schedules that act from the first update on, and statistics of observations and returns."""
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
+from ray.rllib.core import COMPONENT_OPTIMIZER
 from ray.rllib.core.columns import Columns
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 
+from policies.errors import CheckpointError
+from policies.return_statistics import ReturnStatistics, discounted_returns
 from policies.rllib.ruined import check_gradients, check_outputs
+from policies.schedules import linear
 
-_KL_COEFFS = "kl_coeffs"
+CLIP_SCHEDULE = "clip_schedule"
+"""The key in an algorithm's `learner_config_dict` of the last clip and the env steps until then."""
+NORMALIZE_REWARDS = "normalize_rewards"
+"""The key in an algorithm's `learner_config_dict` that is true if rewards are normalised."""
+_KL_COEFFS, _RETURNS = "kl_coeffs", "return_statistics"
+
+
+class _Clipped:
+    """A config with another clip; RLlib's own is frozen, and slow to copy."""
+
+    def __init__(self, config: Any, clip_param: float) -> None:
+        self._config = config
+        self.clip_param = clip_param
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._config, name)
 
 
 class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
-    """A PPO learner whose update phase at t env steps uses the learning rate and entropy weight of t.
+    """A PPO learner whose update phase at t env steps uses the learning rate, entropy weight and ratio clip of t.
 
     RLlib sets both after a phase, for the next one, and saves only the learning rate: after a restore, its entropy
     weight starts at the schedule's first value again, and its KL weight at the config's (2.60). Here both are set
@@ -25,11 +50,18 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
 
     Modules that normalise observations add a phase's observations to their statistics after its updates: a batch is
     trained with the statistics it was sampled with, so that PPO's ratio begins at 1.
+
+    Rewards are normalised here, where the episodes of all env runners come together: see
+    `policies.return_statistics`. The episodes that env runners keep for RLlib's own metrics have the rewards as before.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._new_observations: dict[str, Tensor] = {}
+        self._num_env_steps = 0
+        self.return_statistics = ReturnStatistics()
+        self._returns: dict[str, NDArray[np.float64]] = {}
+        """The discounted return of each running episode, (1,), by the episode's id."""
 
     def compute_loss_for_module(self, *, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Any]) -> Any:
         """Return RLlib's loss.
@@ -38,11 +70,21 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
             NonFiniteWeightsError: The policy's outputs are not finite.
         """
         try:
-            return super().compute_loss_for_module(module_id=module_id, config=config, batch=batch, fwd_out=fwd_out)
+            return super().compute_loss_for_module(
+                module_id=module_id, config=self._with_clip(config), batch=batch, fwd_out=fwd_out
+            )
         except (ValueError, RuntimeError):
             # A distribution's: what it says of its parameters names no cause.
             check_outputs(fwd_out[Columns.ACTION_DIST_INPUTS], self.module[module_id].unwrapped())
             raise
+
+    def _with_clip(self, config: Any) -> Any:
+        """Return the config with the clip that its schedule has now; RLlib has no schedule for it."""
+        schedule = config.learner_config_dict.get(CLIP_SCHEDULE)
+        if schedule is None:
+            return config
+        final, num_env_steps = schedule
+        return _Clipped(config, linear(config.clip_param, final, num_env_steps, self._num_env_steps))
 
     def compute_gradients(self, loss_per_module: dict[str, Any], **kwargs: Any) -> dict[Any, Tensor]:
         """Return RLlib's gradients.
@@ -58,6 +100,7 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         """Set the scheduled values for the env steps sampled so far, including this phase's batch."""
         super().before_gradient_based_update(timesteps=timesteps)
         num_env_steps = timesteps.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
+        self._num_env_steps = num_env_steps
         for optimizer, schedule in self._optimizer_lr_schedules.items():
             self._set_optimizer_lr(optimizer, lr=schedule.update(timestep=num_env_steps))
         for module_id in self.module.keys():  # noqa: SIM118 (an RLlib container, which iterates otherwise)
@@ -77,11 +120,26 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
             module_id: (self._first_kl_coeff(module_id), float(value))
             for module_id, value in self.curr_kl_coeffs_per_module.items()
         }
+        if self._normalizes_rewards:
+            state[_RETURNS] = dict(vars(self.return_statistics))
         return state
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Set a state of `get_state`, but not its KL weight if a search has changed kl_coeff since."""
+        """Set a state of `get_state`, but not its KL weight if a search has changed kl_coeff since.
+
+        Raises:
+            CheckpointError: Rewards are normalised, and the state of a whole learner has no statistics for that.
+        """
         super().set_state(state)
+        if self._normalizes_rewards and COMPONENT_OPTIMIZER in state:
+            if _RETURNS not in state:
+                raise CheckpointError(
+                    "the saved learner has no statistics of the return, which normalize_rewards needs.",
+                    "Use another checkpoint of the trial; training cannot continue from this one.",
+                )
+            self.return_statistics = ReturnStatistics(**state[_RETURNS])
+            # Environments begin new episodes after a restore.
+            self._returns.clear()
         for module_id, (first, value) in state.get(_KL_COEFFS, {}).items():
             if first == self._first_kl_coeff(module_id):
                 self.curr_kl_coeffs_per_module[module_id].data.fill_(value)
@@ -89,7 +147,36 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
     def _first_kl_coeff(self, module_id: str) -> float:
         return float(self.config.get_config_for_module(module_id).kl_coeff)
 
+    @property
+    def _normalizes_rewards(self) -> bool:
+        return bool(self.config.learner_config_dict.get(NORMALIZE_REWARDS))
+
+    def _with_normalized_rewards(self, episodes: list[SingleAgentEpisode]) -> list[SingleAgentEpisode]:
+        """Add the discounted returns of episode chunks to the statistics; return copies with normalised rewards."""
+        running: dict[str, NDArray[np.float64]] = {}
+        found = []
+        for episode in episodes:
+            rewards = np.asarray(episode.get_rewards(), dtype=np.float32)[:, None]
+            ended = np.zeros(rewards.shape, dtype=np.bool_)
+            ended[-1:] = episode.is_done
+            before = running.get(episode.id_, self._returns.get(episode.id_, np.zeros(1)))
+            returns, running[episode.id_] = discounted_returns(rewards, ended, self.config.gamma, before)
+            found.append(returns)
+        # An episode that goes on has steps in every batch, so that the others are over.
+        self._returns = running
+        self.return_statistics.add(np.concatenate(found))
+        scaled = []
+        for episode in episodes:
+            new, buffer = copy(episode), episode.rewards
+            new.rewards = InfiniteLookbackBuffer(
+                self.return_statistics.scale(buffer.data), buffer.lookback, buffer.space
+            )
+            scaled.append(new)
+        return scaled
+
     def _make_batch_if_necessary(self, training_data: Any) -> Any:
+        if self._normalizes_rewards and training_data.episodes is not None:
+            training_data = replace(training_data, episodes=self._with_normalized_rewards(training_data.episodes))
         batch = super()._make_batch_if_necessary(training_data)
         for module_id, columns in batch.policy_batches.items():
             if hasattr(self.module[module_id].unwrapped(), "update_observation_statistics"):

@@ -40,7 +40,8 @@ def launch(spec: dict[str, Any], *options: str) -> tuple[Run, Path]:
     """`tune-jobs launch` of a sweep file, in a terminal; returns the run and the sweep's folder."""
     storage = Path(tempfile.mkdtemp())
     path = storage / "bench.yaml"
-    path.write_text(yaml.safe_dump(spec))
+    # The peers train no setting twice.
+    path.write_text(yaml.safe_dump({**spec, "confirm": "none"}))
     command = [CLI, "launch", str(path), "--storage", str(storage), "--name", "bench", *options]
     return run(command, cwd=ROOT, first=FIRST_RESULT, terminal=True), storage / "bench"
 

@@ -224,7 +224,7 @@ def test_a_signal_while_a_sweeps_new_trials_are_written_is_not_forgotten(
     store: SweepStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pend(store)
-    monkeypatch.setattr("tune_jobs.sweeps.resume._add_trials", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr("tune_jobs.sweeps.adding._add_trials", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
     monkeypatch.setattr(driving, "connected", lambda *_: pytest.fail("the trials must not begin"))
     with pytest.raises(SweepInterrupted) as caught:
         sweeps.resume(store.folder, progress="none")

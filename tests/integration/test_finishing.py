@@ -22,7 +22,8 @@ from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
-from tune_jobs.sweeps.drive import _finished, write_new
+from tune_jobs.sweeps.drive import write_new
+from tune_jobs.sweeps.finishing import finish_sweep
 from tune_jobs.sweeps.outcome import SweepResult
 
 HOSTILE = "hostile_envs:Hostile"
@@ -70,7 +71,7 @@ def sweep_of(tmp_path: Path) -> Callable[..., SweepStore]:
 
 
 def finished(store: SweepStore) -> SweepResult:
-    return _finished(store, SweepResult(store.folder, store.read_record(), store.read_trials()))
+    return finish_sweep(store, SweepResult(store.folder, store.read_record(), store.read_trials()))
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,11 @@ from store_parts import make_iteration
 from sweep_folders import train
 
 from analysis import records
+from analysis.selection import policy_candidates
 from policies.acting.load import load_policy
 from policies.envs import modules as env_modules
 from policies.errors import TuneJobsError
-from tune_jobs.store.candidates import choose, read_results, read_trials
+from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.event_files import ScalarWriter
 from tune_jobs.store.locks import held
 from tune_jobs.store.ownership import Owner
@@ -28,6 +29,7 @@ from tune_jobs.store.places import refuse_links_in, remove_folder
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.policy_choice import confirmed_best, read_candidates
 
 
 class Watch:
@@ -126,7 +128,8 @@ def use(folder: Path) -> None:
     store = SweepStore(folder)
     acts = (
         lambda: sweeps.status(folder),
-        lambda: choose(store, read_trials(store)),
+        lambda: read_candidates(store, policy_candidates(read_trials(store)), 4),
+        lambda: confirmed_best(store),
         lambda: load_policy(finish.find_checkpoint(folder)),
         lambda: read_results(store),
         lambda: finish.find_policy(folder),

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from sweep_folders import make_sweep_folder
 
+from policies.errors import CannotRunError
 from tests.narrowing import present
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude
@@ -102,24 +103,38 @@ def test_a_missing_report_is_written(finished: SweepStore, cheap: None) -> None:
     assert written(finished, before) == {"report"}
 
 
-@pytest.mark.parametrize(
-    ("older", "folders"),
-    [
-        # Killed before the report: it still shows the sweep as it was before the trials that came last.
-        (["report/index.html"], {"report"}),
-        # Killed before the films: they still show the winner before this one.
-        (["report/index.html", "best/after.mp4"], {"best", "report"}),
-    ],
-)
-def test_what_is_older_than_what_it_shows_is_made_again(
-    finished: SweepStore, cheap: None, older: list[str], folders: set[str]
-) -> None:
-    for name in older:
-        aged(finished.folder / name, 3_600)
+def test_a_report_that_is_older_than_what_it_shows_is_made_again(finished: SweepStore, cheap: None) -> None:
+    # Killed before the report: it still shows the sweep as it was before the trials that came last.
+    aged(finished.folder / "report/index.html", 3_600)
     before = files(finished)
     resumed(finished)
-    assert written(finished, before) == folders
+    assert written(finished, before) == {"report"}
     assert files(finished)["best/evaluation.json"] == before["best/evaluation.json"]
+
+
+def test_films_that_show_another_winner_are_made_again(finished: SweepStore, cheap: None) -> None:
+    # Killed before the films: they still show the winner before this one.
+    best = finished.read_best()
+    finished.write_best(best.model_copy(update={"checkpoint": best.checkpoint.model_copy(update={"iteration": 1})}))
+    with finished.writing_films():
+        pass
+    finished.write_best(best)
+    assert not finished.films()
+    before = files(finished)
+    resumed(finished)
+    assert written(finished, before) == {"best", "report"}
+    assert files(finished)["best/evaluation.json"] == before["best/evaluation.json"]
+    assert finished.current_films()
+
+
+def test_films_without_a_record_count_by_their_age(finished: SweepStore, cheap: None) -> None:
+    # As older versions left them.
+    (finished.best_folder / "films.json").unlink()
+    assert finished.current_films()
+    aged(finished.best_folder / "after.mp4", 3_600)
+    assert not finished.films()
+    resumed(finished)
+    assert finished.current_films()
 
 
 @pytest.mark.parametrize("name", ["evaluation.json", "policy.safetensors"])
@@ -139,3 +154,21 @@ def test_another_winner_is_confirmed_if_the_checkpoint_is_gone(tmp_path: Path, c
     second = present(resumed(store).best).checkpoint
     assert (second.trial_id, second.iteration) != (first.trial_id, first.iteration)
     assert store.read_best().checkpoint == second
+
+
+def test_a_sweep_of_a_version_with_fewer_hyperparameters_goes_on(finished: SweepStore, cheap: None) -> None:
+    """A name that its records lack has its default; a value that is another one is still refused."""
+    trial = finished.trial("t0001")
+    record = trial.read_record()
+    older = {name: value for name, value in record.hyperparams.items() if not name.startswith("clip_")}
+    trial.write_record(record.model_copy(update={"hyperparams": older}))
+    assert resumed(finished).exit_code == 0
+    other = {**older, "gamma": 0.5}
+    trial.write_record(record.model_copy(update={"hyperparams": other}))
+    with pytest.raises(CannotRunError, match="t0001 of sweep mine is not the one its spec gives"):
+        resumed(finished)
+    del other["gamma"]
+    trial.write_record(record.model_copy(update={"hyperparams": {**other, "clip_param": 0.1, "gamma": 0.99}}))
+    with pytest.raises(CannotRunError, match="t0001 of sweep mine"):
+        resumed(finished)
+    trial.write_record(record)

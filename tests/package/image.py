@@ -89,6 +89,8 @@ class Root:
             mount -t tmpfs -o mode=1777 tmpfs /mnt/root/tmp
             # The image's Python is this machine's; another user than root has to get at it.
             chmod 711 /mnt/root/root
+            # Debian's is called python3 alone.
+            command -v python > /dev/null || ln -s "$(command -v python3)" /mnt/root/usr/local/bin/python
             printf '127.0.0.1 localhost head %s\\n' "$(hostname)" > /mnt/root/etc/hosts
             echo ready
             exec sleep infinity

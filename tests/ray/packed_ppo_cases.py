@@ -196,6 +196,23 @@ def check_clip_param() -> None:
 
 
 @arrives
+def check_clip_param_final() -> None:
+    """The way is gone before the phase that is looked at: the clip is that of a member that had it from the first."""
+    _, there, _ = updates(clip_param=0.01)
+    plain, moved, _ = updates(clip_param=0.5, clip_param_final=0.01, clip_decay_steps=2 * ROWS)
+    assert_other_gradients(plain, moved)
+    assert moved.losses == there.losses
+
+
+@arrives
+def check_clip_decay_steps() -> None:
+    """Half of the way is gone."""
+    _, there, _ = updates(clip_param=0.01)
+    _, moved, _ = updates(clip_param=0.02, clip_param_final=0.0, clip_decay_steps=4 * ROWS)
+    assert moved.losses == there.losses
+
+
+@arrives
 def check_vf_clip_param() -> None:
     plain, changed, _ = updates(vf_clip_param=2.5)
     assert_other_gradients(plain, changed)
@@ -278,6 +295,17 @@ def check_kl_target() -> None:
 
 
 # -- the batch
+
+
+@arrives
+def check_normalize_rewards() -> None:
+    plain, changed, sampled = updates(normalize_rewards=True)
+    assert_other_gradients(plain, changed)
+    first, second = sampled.fragment.rewards[:, :4], sampled.fragment.rewards[:, 4:]
+    np.testing.assert_array_equal(first, np.ones_like(first))
+    np.testing.assert_array_equal(second, np.full_like(second, second[0, 0]))
+    assert second[0, 0] < 0.5
+    np.testing.assert_array_equal(sampled.fragment.own_rewards, np.ones_like(sampled.fragment.rewards))
 
 
 def targets_by_definition(

@@ -71,6 +71,76 @@ def check_clip_param(build: Build, _: object) -> None:
     check_loss(build, clip_param=0.03)
 
 
+def clip_of(algo: Any) -> float:
+    """The clip of the loss: half the range of ratios in which it changes with them, by rows that gain by any ratio."""
+    learner, module = learner_of(algo), module_of(algo)
+    num = 400
+    ratios = torch.linspace(1.0, 2.0, num)
+    rows = {
+        "obs": torch.zeros(num, 4),
+        "actions": torch.zeros(num, dtype=torch.int64),
+        "action_dist_inputs": torch.zeros(num, 2),
+        "advantages": torch.ones(num),
+    }
+    limits = []
+    with torch.no_grad():
+        rows["value_targets"] = module.compute_values(rows)
+        out = module.forward_train(rows)
+        now = torch.distributions.Categorical(logits=out["action_dist_inputs"])
+        rows["action_logp"] = now.log_prob(rows["actions"]) - torch.log(ratios)  # type: ignore[no-untyped-call]
+        for place in range(num):
+            row = {name: value[place : place + 1] for name, value in rows.items()}
+            some = {name: value[place : place + 1] for name, value in out.items()}
+            loss = learner.compute_loss_for_module(module_id=MODULE, config=loss_config(algo), batch=row, fwd_out=some)
+            limits.append(-float(loss) - 1.0)
+    return max(limits)
+
+
+def learnt_rewards(algo: Any) -> NDArray[np.float32]:
+    """Train for an iteration and give the rewards of the episodes that the learner makes its batch of."""
+    learner = learner_of(algo)
+    found: list[NDArray[np.float32]] = []
+    connector = learner._learner_connector
+
+    def reading(*args: Any, episodes: Any, **kwargs: Any) -> Any:
+        found.extend(np.array(episode.get_rewards()) for episode in episodes)
+        return connector(*args, episodes=episodes, **kwargs)
+
+    learner._learner_connector = reading
+    algo.train()
+    learner._learner_connector = connector
+    return np.concatenate(found)
+
+
+@reaches("ppo", field="normalize_rewards")
+def check_normalize_rewards(build: Build, _: object) -> None:
+    """CartPole's rewards are all 1; returns are reported as they are."""
+    plain, algo = build("ppo", normalize_rewards=False), build("ppo", normalize_rewards=True)
+    np.testing.assert_array_equal(learnt_rewards(plain), 1.0)
+    for _iteration in range(2):
+        rewards = learnt_rewards(algo)
+        var = learner_of(algo).return_statistics.var
+        np.testing.assert_array_equal(rewards, np.float32(1.0 / np.sqrt(var + 1e-8)))
+        assert var > 4.0
+    # RLlib's own metrics have raw rewards too.
+    for episodes in algo.env_runner._ongoing_episodes_for_metrics.values():
+        for episode in episodes:
+            np.testing.assert_array_equal(episode.rewards.data, 1.0)
+    finished = algo.env_runner.pop_finished_episodes()
+    assert finished
+    assert [value for value, _ in finished] == [float(length) for _, length in finished]
+
+
+@reaches("ppo", field="clip_param_final")
+def check_clip_param_final(build: Build, _: object) -> None:
+    check_schedule(build, clip_of, {"clip_param": 0.4, "clip_param_final": 0.1, "clip_decay_steps": 150})
+
+
+@reaches("ppo", field="clip_decay_steps")
+def check_clip_decay_steps(build: Build, _: object) -> None:
+    check_schedule(build, clip_of, {"clip_param": 0.4, "clip_param_final": 0.0, "clip_decay_steps": 100})
+
+
 @reaches("ppo", field="vf_clip_param")
 def check_vf_clip_param(build: Build, _: object) -> None:
     check_loss(build, vf_clip_param=2.5)

@@ -26,9 +26,8 @@ def replicate(tmp_path: Path, **options: Any) -> SweepResult:
 
 def spec(**changes: Any) -> dict[str, Any]:
     """Four learning rates, of which two cannot learn."""
-    return make_spec(space={"lr": {"grid": [1e-2, 5e-3, 1e-7, 1e-8]}}, num_samples=1, stop={"num_env_steps": 1_280}) | (
-        changes
-    )
+    space = {"lr": {"grid": [1e-2, 5e-3, 1e-7, 1e-8]}}
+    return make_spec(space=space, num_samples=1, stop={"num_env_steps": 1_280}, confirm="none") | changes
 
 
 @pytest.mark.parametrize(("engine", "scheduler"), [("rllib", "hyperband"), ("packed", "asha")])

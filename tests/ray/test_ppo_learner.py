@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ppo_cases import current_lr, entropy_weight
+from packed_rllib import episodes_of, make_stack, sample
+from ppo_cases import clip_of, current_lr, entropy_weight
 from rllib_cases import MODULE, SMALL, Build, env_steps, learner_of, module_of
 
+from policies.errors import CheckpointError
 from policies.hyperparams import PPOHyperparams
 from policies.packed.member import Weights
 
@@ -60,6 +62,7 @@ def in_first_update(algo: Any, read: Callable[[Any], float]) -> tuple[int, float
 @pytest.mark.parametrize(("read", "name", "decay"), [
     (current_lr, "lr", "lr_decay_steps"),
     (entropy_weight, "entropy_coeff", "entropy_decay_steps"),
+    (clip_of, "clip_param", "clip_decay_steps"),
 ])  # fmt: skip
 def test_schedules_go_on_after_a_restore(
     build: Build, tmp_path: Path, read: Callable[[Any], float], name: str, decay: str
@@ -86,6 +89,57 @@ def test_the_kl_weight_moves_in_training_and_is_restored(build: Build, tmp_path:
     # Population based training goes on from another trial's checkpoint with a kl_coeff of its own.
     mutated = saved_and_restored(algo, tmp_path / "mutated", lambda: build(**{**values, "kl_coeff": 0.6}))
     assert float(learner_of(mutated).curr_kl_coeffs_per_module[MODULE]) == pytest.approx(0.6)
+
+
+def test_the_statistics_of_returns_are_restored_and_grow_on(build: Build, tmp_path: Path) -> None:
+    algo = build(2, normalize_rewards=True)
+    steps = 0
+    for _ in range(2):
+        steps = env_steps(algo.train())
+    before = vars(learner_of(algo).return_statistics)
+    # Those of both env runners' steps.
+    assert before["count"] == pytest.approx(steps + 1e-4)
+    assert learner_of(algo)._returns.keys()
+    restored = saved_and_restored(algo, tmp_path, lambda: build(normalize_rewards=True))
+    assert vars(learner_of(restored).return_statistics) == before
+    later = env_steps(restored.train())
+    assert learner_of(restored).return_statistics.count == pytest.approx(later + 1e-4)
+    without = build()
+    without.save_to_path(str(tmp_path / "without"))
+    with pytest.raises(CheckpointError, match="no statistics of the return"):
+        learner_of(restored).set_state(learner_of(without).get_state())
+
+
+def test_returns_go_on_from_chunk_to_chunk_as_in_a_pack(build: Build) -> None:
+    """The same fragments give a pack and RLlib's learner the same statistics, which a pack's checkpoint hands over."""
+    from policies.packed.to_rllib import to_algorithm
+
+    stack = make_stack("CartPole-v1", [{"normalize_rewards": True, "train_batch_size": 80}])
+    learner = learner_of(build(normalize_rewards=True))
+    ids = ["first"] * 4
+    for number in range(3):
+        fragment = sample(stack).fragment
+        chunks, expected = [], []
+        for row in range(4):
+            start = 0
+            for episode in episodes_of(fragment, row, "CartPole-v1", fragment.last[row]):
+                episode.id_ = f"{row} {ids[row]}"
+                episode.rewards.data = np.ones_like(episode.rewards.data)
+                if episode.is_done:
+                    ids[row] = f"{number} {start}"
+                chunks.append(episode)
+                expected.append(fragment.rewards[start : start + len(episode), row])
+                start += len(episode)
+        found = learner._with_normalized_rewards(chunks)
+        (member,) = stack.members
+        assert vars(learner.return_statistics) == pytest.approx(vars(member.return_statistics), rel=1e-9)
+        for episode, rewards in zip(found, expected, strict=True):
+            np.testing.assert_allclose(episode.get_rewards(), rewards, rtol=1e-6)
+    assert fragment.ended.any()
+    stack.envs.close()
+    algorithm = to_algorithm(member, env_id="CartPole-v1", env_args={})
+    assert vars(learner_of(algorithm).return_statistics) == vars(member.return_statistics)
+    algorithm.stop()
 
 
 def first_ratios(algo: Any) -> torch.Tensor:

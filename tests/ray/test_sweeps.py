@@ -142,7 +142,10 @@ def test_a_sweep_leaves_records_checkpoints_best_and_report(cartpole: tuple[Path
 def test_the_best_is_chosen_by_evaluation_and_confirmed_on_other_seeds(cartpole: tuple[Path, SweepResult]) -> None:
     storage, result = cartpole
     best = present(result.best)
-    assert best.selection_score == max(present(trial.best_evaluation_return) for trial in result.trials)
+    choice = present(best.choice)
+    assert (best.checkpoint, best.selection_score) == (choice.winner.checkpoint, choice.winner.score)
+    leader = max(present(trial.best_evaluation_return) for trial in result.trials)
+    assert leader == max(present(item.checkpoint.evaluation_return) for item in choice.candidates)
     assert best.confirmation.num_episodes == best.random.num_episodes == 100
     assert set(best.confirmation.seeds).isdisjoint(result.sweep.evaluation_seeds)
     assert best.confirmation.returns != best.random.returns
@@ -243,7 +246,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path: Path) -> None:
     # In a pack some would be tried again because others died.
     spec = make_spec(
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
-        iteration_timeout_s=25, engine="rllib",
+        iteration_timeout_s=25, engine="rllib", confirm="none",
     )  # fmt: skip
     told: dict[str, TrialRecord] = {}
 

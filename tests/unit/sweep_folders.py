@@ -1,6 +1,7 @@
 """A sweep folder as a run leaves it, in a second and without Ray: fakes for the training, the real files."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -44,16 +45,30 @@ def make_sweep_folder(folder: Path, iterations: int = 6, **spec: Any) -> SweepSt
     return store
 
 
-def train(store: SweepStore, trial_id: str, iterations: int) -> None:
-    """Run a trial to its end, and write its record as its driver does."""
+def train(
+    store: SweepStore,
+    trial_id: str,
+    iterations: int,
+    engine: FakeEngine | None = None,
+    scores: Callable[[int], float] | None = None,
+) -> None:
+    """Run a trial to its end, and write its record as its driver does.
+
+    Args:
+        store: The sweep.
+        trial_id: The trial.
+        iterations: How many it has.
+        engine: What trains it; None: policies that hardly differ.
+        scores: What the policy of each iteration scores; None: as `make_sweep_folder` says.
+    """
     known = store.trial(trial_id).read_record()
     task = make_task(
         store.folder, stop={"num_iterations": iterations}, evaluation={"every_iterations": 1},
         checkpoints={"every_iterations": 2, "keep": 2},
     )  # fmt: skip
     task = dataclasses.replace(task, trial_id=trial_id, seed=known.seed)
-    evaluator = FakeEvaluator(lambda iteration: 10.0 * known.index + iteration)
-    loop = TrialLoop(task, FakeEngine(), cast("Evaluator", evaluator), FakeClock(0.001))
+    evaluator = FakeEvaluator(scores or (lambda iteration: 10.0 * known.index + iteration))
+    loop = TrialLoop(task, engine or FakeEngine(), cast("Evaluator", evaluator), FakeClock(0.001))
     loop.open()
     while (progress := loop.advance(1e9)).status == "running":
         pass

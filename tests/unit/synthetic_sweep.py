@@ -10,15 +10,18 @@ import numpy as np
 
 from analysis.records import (
     BestRecord,
+    CandidateRecord,
     CheckpointRecord,
+    ChoiceRecord,
     EvaluationRecord,
     IterationRecord,
     SweepRecord,
     TrialRecord,
     TrialStatus,
 )
-from analysis.selection import NoUsableTrialError, select_best
+from analysis.selection import NoUsableTrialError, policy_candidates, select_best
 from analysis.settings import judge_settings
+from analysis.successive_rejects import TIED
 
 ERROR = """RuntimeError: env.step raised ZeroDivisionError: the cart left the track
 Traceback (most recent call last):
@@ -240,3 +243,30 @@ def make_best(
         confirmation=record("best/policy.json", returns),
         random=record("random", baseline),
     )
+
+
+def with_choice(best: BestRecord, trials: Sequence[TrialRecord]) -> BestRecord:
+    """Let a winner be chosen from the leading checkpoints: one tied, one lost by its score, one could not be read."""
+    known = policy_candidates(trials)
+    fates: list[dict[str, Any]] = [
+        {"score": 200.0, "num_episodes": 120, "lower": 200.0, "upper": 200.0},
+        {"score": 200.0, "num_episodes": 120, "lower": 199.5, "upper": 200.5, "rejected_in": 2, "reason": TIED},
+        {"score": 180.25, "num_episodes": 50, "rejected_in": 1},
+        {"score": 200.0, "num_episodes": 0, "rejected_in": 0, "reason": "its weights are damaged"},
+    ]
+    candidates = [
+        CandidateRecord(checkpoint=item.checkpoint, point=item.trial.point, **fate)
+        for item, fate in zip(known, fates, strict=False)
+    ]
+    candidates[1] = candidates[1].model_copy(update={"confirmation": best.confirmation})
+    choice = ChoiceRecord(
+        candidates=tuple(candidates), num_known=len(known), num_evaluation_episodes=10, first_seed=4721, num_rounds=2,
+        num_episodes=260, num_env_steps=50_000, max_env_steps=250_000,
+        note="Round 2 could not be played: the motor broke",
+    )  # fmt: skip
+    winner = choice.winner
+    return best.model_copy(
+        update={
+            "checkpoint": winner.checkpoint, "point": winner.point, "selection_score": winner.score, "choice": choice,
+        }
+    )  # fmt: skip

@@ -54,6 +54,7 @@ def no_update(first: bool | float | str | None, second: bool | float | str, **fr
 ONE_UPDATE = {"num_epochs": 1, "minibatch_size": 32}
 SCHEDULE = {"lr_final": 1e-3}
 ENTROPY = {"entropy_coeff": 0.0, "entropy_coeff_final": 1.0}
+CLIP = {"clip_param": 0.001, "clip_param_final": 0.05}
 KL = {"use_kl_loss": True}
 MANY_UPDATES = {"num_epochs": 8, "lr": 5e-2}
 RMSPROP, PRIORITIZED = {"optimizer": "rmsprop"}, {"replay": "prioritized"}
@@ -69,7 +70,16 @@ CASES = {
     ("ppo", "lr"): [Case((1e-2, 5e-2), {**SCHEDULE, "lr_decay_steps": 32}, {**SCHEDULE, "lr_decay_steps": 200})],
     ("ppo", "lr_decay_steps"): [Case((50, 100), {"lr_final": 1e-2}, SCHEDULE), Case((10, 32), SCHEDULE, other=64)],
     ("ppo", "gae_lambda"): [Case((0.2, 0.9), {"gamma": 0.0}, {"gamma": 0.9})],
-    ("ppo", "clip_param"): [Case((0.001, 0.5), ONE_UPDATE)],
+    ("ppo", "clip_param"): [
+        Case((0.001, 0.5), ONE_UPDATE),
+        Case((0.001, 0.5), {"clip_param_final": 0.2, "clip_decay_steps": 32},
+             {"clip_param_final": 0.2, "clip_decay_steps": 200}),
+    ],
+    ("ppo", "clip_param_final"): [Case((0.001, 0.5), {**ONE_UPDATE, "clip_decay_steps": 50}, {"clip_decay_steps": 50})],
+    ("ppo", "clip_decay_steps"): [
+        Case((50, 100), {**ONE_UPDATE, **CLIP}, CLIP),
+        Case((50, 100), {**CLIP, "clip_param_final": 0.001}, CLIP), Case((10, 32), CLIP, other=64),
+    ],
     ("ppo", "vf_clip_param"): [Case((0.01, 5.0), {"vf_loss_coeff": 0.0}, {"vf_loss_coeff": 0.5})],
     ("ppo", "entropy_coeff"): [
         Case((0.0, 0.7), {"entropy_coeff_final": 1.0, "entropy_decay_steps": 32},

@@ -23,7 +23,7 @@ VALUES: dict[str, Any] = {
     "zero": [0],
     "negative": [-1, np.int32(-1)],
     "huge": [2**40],
-    "fraction": [1.5, np.float32(0.5)],
+    "fraction": [1.5, np.float32(2.5)],
     "not finite": [float("nan"), float("inf"), np.nan],
     "empty text": [""],
     "text": ["x", "loud"],
@@ -47,6 +47,15 @@ TAKES = {
     "path": PATH,
     "storage": PATH | {"none"},
     "output": PATH | {"none"},
+    "html": PATH | {"none"},
+    "sources": PATH | {"texts", "empty list"},
+    "sweeps": PATH | {"texts", "empty list"},
+    "objective": {"none"},
+    "rows": set(),
+    "format": set(),
+    "returns": set(),
+    "width": {"whole", "fraction"},
+    "height": {"whole", "fraction"},
     # Any text is a name, an address or an id as far as its kind goes.
     "name": {"text", "none", "empty text", "no path"},
     "address": {"text", "none", "empty text", "no path"},
@@ -66,6 +75,7 @@ TAKES = {
     "action": {"whole", "zero", "negative", "huge", "numbers", "empty list", "none"},
 }
 MORE = {(name, "source"): {"mapping", "empty mapping"} for name in ("create", "launch", "load_spec")}
+MORE[("export", "top")] = {"none"}
 CASES = [
     (name, argument) for name, function in FUNCTIONS.items() for argument in inspect.signature(function).parameters
 ]
@@ -77,6 +87,7 @@ def call(name: str, argument: str, value: Any) -> Any:
         key: "nothing" for key, one in inspect.signature(function).parameters.items() if one.default is one.empty
     }
     given |= {"num_samples": 1} if "num_samples" in given else {}
+    given |= {"format": "csv"} if "format" in given else {}
     return function(**{**given, argument: value})
 
 
@@ -87,7 +98,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_whole_api_is_looked_at() -> None:
-    assert len(FUNCTIONS) == 20
+    assert len(FUNCTIONS) == 26
     assert {argument for _, argument in CASES} == set(TAKES)
 
 

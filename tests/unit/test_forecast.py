@@ -4,9 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_engine import FakeEngine
+from fake_sweeps import BEST
 from sweep_folders import make_sweep_folder
 from test_monitor import make_trial
 
+from tests.narrowing import present
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.forecast import caps_of, forecast
 from tune_jobs.sweeps.status import list_sweeps, status
@@ -113,6 +116,20 @@ def test_the_status_of_a_folder(tmp_path: Path) -> None:
     assert (best.trial_id, best.iteration, best.score) == ("t0003", 6, 31.0)
     assert best.point == store.trial("t0003").read_record().point
     assert [each.best for each in list_sweeps(tmp_path)] == [best]
+
+
+def test_the_best_of_a_finished_sweep_is_the_policy_that_was_chosen(tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "mine")
+    chosen = BEST.model_copy(update={"checkpoint": store.trial("t0001").checkpoint(6), "selection_score": 12.5})
+    store.write_best(chosen, FakeEngine().policy())
+    best = present(status(store.folder).best)
+    assert (best.trial_id, best.iteration, best.score, best.point) == ("t0001", 6, 12.5, BEST.point)
+    record = store.read_record()
+    store.write_record(record.model_copy(update={"state": "interrupted"}))  # as one that was extended
+    assert present(status(store.folder).best).trial_id == "t0003"
+    store.write_record(record)
+    (store.best_folder / "evaluation.json").write_text("{}")
+    assert present(status(store.folder).best).trial_id == "t0003"
 
 
 def test_the_status_of_a_sweep_of_another_version_is_told_without_a_forecast(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from analysis.answers import certainty, setting_score
-from analysis.objectives import SettingScores, expected_means, rank_settings, trial_score
+from analysis.objectives import SettingScores, expected_means, rank_settings, score_of, trial_score
 from analysis.racing import Race
 from analysis.records import IterationRecord, Objective, SettingsRecord, TrialRecord, TrialStatus
 from analysis.settings import judge_settings
@@ -36,18 +36,77 @@ def score(iterations: Sequence[IterationRecord], objective: Objective, threshold
 RISING = [iteration(steps, steps / 100, [steps / 50] * 30) for steps in range(1_000, CAP + 1, 1_000)]
 
 
-def test_final_is_of_the_last_hundred_episodes_and_the_evaluations_since() -> None:
-    # 120 episodes in the last four iterations: 140, 160, 180, 200; evaluated at 70, 80, 90, 100.
-    assert score(RISING, "final") == pytest.approx((170 + 85) / 2)
-    assert score(RISING[:-1], "final") == pytest.approx((150 + 75) / 2)
+def test_final_is_of_the_later_half_three_parts_evaluations_and_one_part_training_episodes() -> None:
+    # Evaluated at 60, 70, 80, 90, 100; episodes of 120, 140, 160, 180, 200.
+    assert score(RISING, "final") == pytest.approx(0.75 * 80 + 0.25 * 160)
+
+
+def test_an_evaluation_counts_for_the_env_steps_since_the_one_before() -> None:
+    # The first covers 5,000 to 6,000, the second 6,000 to 10,000; one before the later half does not count.
+    uneven = [iteration(4_000, 1.0), iteration(6_000, 50.0), iteration(10_000, 100.0)]
+    assert score(uneven, "final") == pytest.approx(90)
+
+
+def test_a_trial_that_ended_early_goes_on_as_it_was_at_last() -> None:
+    # Evaluated at 60, 70, 80, 90, and 90 for the rest. Its last 100 episodes are of four iterations, 120 to 180, as are
+    # those of the later half.
+    assert score(RISING[:-1], "final") == pytest.approx(0.75 * 78 + 0.25 * 150)
+    # In the later half 60 and 70, and 70 for three fifths; episodes of 120 and 140, and for the rest 80 to 140.
+    assert score(RISING[:7], "final") == pytest.approx(0.75 * 68 + 0.25 * (0.4 * 130 + 0.6 * 110))
+    # It ended before: 30, and all of its 90 episodes.
+    assert score(RISING[:3], "final") == pytest.approx(0.75 * 30 + 0.25 * 40)
+
+
+def test_one_that_solves_early_is_not_worse_than_one_that_solves_late() -> None:
+    solved = [iteration(1_000, 100.0, [50] * 50), iteration(2_000, 200.0, [200] * 150)]
+    returns = {steps: min(200.0, steps / 40) for steps in range(1_000, 9_001, 1_000)}
+    late = [iteration(steps, value, [value] * 50) for steps, value in returns.items()]
+    assert score(solved, "final") == 200
+    assert present(score(late, "final")) < 200
 
 
 def test_final_of_what_has_only_one_kind_of_episodes() -> None:
     assert score([iteration(1_000, None, [1, 2, 3])], "final") == 2
-    assert score([iteration(1_000, 7.0), iteration(2_000, 9.0)], "final") == 8
+    assert score([iteration(1_000, 7.0), iteration(2_000, 9.0)], "final") == 9
     assert score([iteration(1_000)], "final") is None
     assert score([], "final") is None
     assert score([iteration(1_000, None, [math.nan, 4.0])], "final") == 4
+    # No episode ended in the later half: those of before go on.
+    assert score([iteration(1_000, None, [4.0]), iteration(10_000, None, [])], "final") == 4
+
+
+def test_returns_near_the_largest_number_have_a_mean() -> None:
+    huge = [iteration(steps, 1.7e308, [1.7e308] * 40) for steps in range(1_000, CAP + 1, 1_000)]
+    assert score(huge, "final") == pytest.approx(1.7e308)
+
+
+@pytest.mark.parametrize("reason", ["num_episodes 150 >= 150", "num_iterations 5 >= 5", "time_s 60 >= 60"])
+def test_a_trial_that_trained_as_long_as_it_was_to_is_judged_by_its_own_later_half(reason: str) -> None:
+    ended = trial(0, 0).model_copy(update={"stop_reason": reason, "num_env_steps": 6_000})
+    # Evaluated at 40, 50, 60 in its later half; episodes of 80, 100, 120.
+    assert score_of(ended, RISING[:6], "final", num_env_steps=CAP) == pytest.approx(0.75 * 50 + 0.25 * 100)
+    assert score_of(ended, RISING[:6], "area", num_env_steps=CAP) == pytest.approx((10 * 1_000 + 35 * 5_000) / 6_000)
+    assert score_of(ended, RISING[:6], "steps_to_threshold", num_env_steps=CAP, threshold=70) == -2 * CAP
+    # All that rank settings do so.
+    (found,) = rank_settings([ended], {ended.trial_id: RISING[:6]}, num_env_steps=CAP)
+    assert found.scores == pytest.approx([62.5])
+
+
+@pytest.mark.parametrize(
+    ("status", "reason"),
+    [("completed", "training_return 60 >= 60"), ("completed", "evaluation_return 60 >= 60"), ("stopped", "asha")],
+)
+def test_one_that_reached_its_goal_or_was_cut_goes_on_as_it_was(status: TrialStatus, reason: str) -> None:
+    ended = trial(0, 0, status=status).model_copy(update={"stop_reason": reason, "num_env_steps": 6_000})
+    assert score_of(ended, RISING[:6], "final", num_env_steps=CAP) == score(RISING[:6], "final")
+    assert present(score(RISING[:6], "final")) > 62.5
+
+
+def test_of_equal_returns_the_score_is_that_return_to_the_bit() -> None:
+    for value in (200.0, -81.3, 0.1):
+        level = [iteration(steps, value, [value] * 7) for steps in range(700, CAP + 1, 700)]
+        assert score(level, "final") == value
+        assert score(level[:9], "final") == value
 
 
 def test_a_trial_that_collapsed_is_not_judged_by_its_best_evaluation() -> None:
@@ -152,7 +211,7 @@ def test_the_better_half_goes_on_with_twice_as_many_seeds() -> None:
     assert race.rounds == ((4, 1), (2, 2))
     assert race.max_trainings == 8
     scores = {4: [50.0, 30.0], 7: [60.0, 65.0], 1: [44.0, 41.0], 0: [50.0, 55.0]}
-    assert race.next_points(scores, 0) == (4, 7, 1, 0)
+    assert race.next_points({index: seeds[:1] for index, seeds in scores.items()}, 0) == (4, 7, 1, 0)
     assert race.next_points(scores, 1) == (7, 0, 7, 0)
     assert race.next_points(scores, 2) == ()
 
@@ -161,6 +220,12 @@ def test_a_race_ends_when_only_one_can_still_win() -> None:
     race = Race((0, 1, 2, 3), 7)
     scores = {0: [100.0, 101.0], 1: [50.0, 51.0], 2: [52.0, 51.0], 3: [49.0, 51.0]}
     assert race.next_points(scores, 1) == ()
+
+
+def test_a_setting_that_seeds_of_the_search_show_cannot_win_gets_none_of_the_race() -> None:
+    race = Race((0, 1, 2, 3), 3)
+    scores = {0: [100.0, 101.0, 99.0], 1: [99.0, 100.0, 101.0], 2: [52.0, 51.0, 50.0], 3: [49.0, 51.0, 50.0]}
+    assert set(race.next_points(scores, 0)) == {0, 1}
 
 
 def test_no_race_of_less_than_two() -> None:
@@ -206,7 +271,7 @@ def test_with_one_seed_a_setting_nothing_is_said_to_be_sure() -> None:
     assert (settings.best.lower, settings.best.probability_best) == (None, None)
     assert settings.num_may_be_best == 3
     assert "one seed a setting" in certainty(settings)
-    assert setting_score(settings) == "100.0 at the end of training"
+    assert setting_score(settings) == "100.0 in the later half of training"
 
 
 def test_intervals_and_chances_come_with_more_seeds() -> None:
@@ -216,7 +281,7 @@ def test_intervals_and_chances_come_with_more_seeds() -> None:
     assert present(best.lower) < 101 < present(best.upper)
     assert present(best.probability_best) > 0.99
     assert settings.num_may_be_best == 1
-    assert certainty(settings) == "the best of 3 with over 99 %; the data tell it from all others"
+    assert certainty(settings) == "the best of 3 with a probability of over 99 %; the data tell it from all others"
     assert "over training seeds" in setting_score(settings)
 
 

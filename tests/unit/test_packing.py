@@ -20,8 +20,8 @@ from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.transitions import pending_record
+from tune_jobs.sweeps.adding import check_same_trials
 from tune_jobs.sweeps.drive import write_new
-from tune_jobs.sweeps.resume import check_same_trials
 
 PACKED = engine_named("packed")
 IMAGES = {"env": {"id": "CartPole-v1", "pixels": True}, "hyperparams": {"conv_filters": [[4, 8, 4]]}}

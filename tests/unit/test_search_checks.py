@@ -13,8 +13,8 @@ from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.transitions import pending_record
+from tune_jobs.sweeps.adding import check_same_trials
 from tune_jobs.sweeps.drive import write_new
-from tune_jobs.sweeps.resume import check_same_trials
 
 LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
 TPE = {"space": LR, "num_samples": 20, "search": "tpe"}
@@ -71,7 +71,8 @@ def test_what_does_not_go_together_is_refused_with_both_names(
 
 
 @pytest.mark.parametrize(
-    "name", ["hidden_sizes", "activation", "num_envs", "vf_share_layers", "normalize_observations"]
+    "name",
+    ["hidden_sizes", "activation", "num_envs", "vf_share_layers", "normalize_observations", "normalize_rewards"],
 )
 def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name: str) -> None:
     values = {"hidden_sizes": [[8], [16]], "activation": ["tanh", "relu"], "num_envs": [4, 8]}.get(name, [True, False])

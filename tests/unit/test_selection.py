@@ -7,7 +7,16 @@ import pickle
 import pytest
 
 from analysis.records import CheckpointRecord, TrialRecord
-from analysis.selection import NoUsableTrialError, best_checkpoint, error_summary, rank_points, score_trial, select_best
+from analysis.selection import (
+    NoUsableTrialError,
+    best_checkpoint,
+    error_summary,
+    policy_candidates,
+    rank_points,
+    score_trial,
+    select_best,
+    tie_key,
+)
 from policies.errors import NotFoundError
 
 
@@ -234,3 +243,22 @@ def test_error_summary_is_the_line_that_names_the_error(error: str | None, line:
 
 def test_error_summary_is_short() -> None:
     assert len(error_summary("x" * 5000)) == 300
+
+
+def test_every_kept_checkpoint_of_a_trial_that_did_not_fail_may_be_deployed() -> None:
+    trials = [
+        trial(0, 100.0, 50.0, math.nan, None, point=0),
+        trial(1, 500.0, point=0, seed_index=1, status="failed"),
+        trial(2, 70.0, 120.0, point=1, status="stopped"),
+    ]
+    known = policy_candidates(trials)
+    assert [(item.trial.index, item.checkpoint.iteration) for item in known] == [(2, 2), (0, 1), (2, 1), (0, 2)]
+    assert policy_candidates(trials[1:2]) == policy_candidates([]) == []
+
+
+def test_equal_evaluations_are_in_the_order_of_the_training_returns() -> None:
+    trials = [trial(0, 9.0, training=1.0), trial(1, 9.0), trial(2, 9.0, training=5.0), trial(3, 9.0, training=math.nan)]
+    assert [item.trial.index for item in policy_candidates(trials)] == [2, 0, 1, 3]
+    few = [trial(0, 9.0, training=1.0, steps=20), trial(1, 9.0, training=1.0, steps=10)]
+    assert [item.trial.index for item in policy_candidates(few)] == [1, 0]
+    assert [tie_key(item) for item in policy_candidates(few)] == [(10, 1, 1), (20, 0, 1)]

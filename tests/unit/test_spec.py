@@ -234,7 +234,10 @@ def test_a_file_wins_over_a_preset_of_its_name(tmp_path: Path, monkeypatch: pyte
         ),
         ({"hyperparams": {"double_q": True}}, ["ppo has no hyperparameter 'double_q'", "dqn has it"]),
         ({"hyperparams": {"epochs": 3}}, ["hyperparams.epochs: ppo has no", "Did you mean 'num_epochs'?"]),
-        ({"hyperparams": {"xyz": 3}}, ["hyperparams.xyz: ppo has no", "It has activation, clip_param"]),
+        (
+            {"hyperparams": {"xyz": 3}},
+            ["hyperparams.xyz: ppo has no", "It has activation, clip_decay_steps, clip_param"],
+        ),
         (
             {"space": {"gama": {"grid": [0.9]}}},
             ["space.gama: ppo has no hyperparameter", "Did you mean 'gamma'?"],

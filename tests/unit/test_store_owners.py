@@ -1,5 +1,6 @@
 """What every store promises of who writes, of packs, logs and stops, and of what comes of a sweep."""
 
+import contextlib
 import json
 import os
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from store_parts import BEST, PACK, Reopen, fill, killed, make_best, make_checkp
 from stores import Harness
 
 from policies.acting.load import load_policy
-from policies.errors import CannotRunError, CheckpointError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.files import open_to_append
 from tests.narrowing import present
 from tune_jobs.store.contract import Assignment, Sweep, Trial
@@ -234,6 +235,31 @@ def test_films_are_those_that_were_written(sweep: Sweep, another: Reopen) -> Non
         paths["after_mp4"].write_bytes(b"film")
     films = another().films()
     assert {name: path.read_bytes() for name, path in films.items()} == {"after_mp4": b"film"}
+
+
+def test_films_of_another_winner_are_not_its_own(harness: Harness, sweep: Sweep, another: Reopen) -> None:
+    first, second = make_best(), make_best()
+    second = second.model_copy(update={"checkpoint": second.checkpoint.model_copy(update={"iteration": 7})})
+    with pytest.raises(NotFoundError), sweep.writing_films():
+        pass
+    sweep.write_best(first, make_portable("CartPole-v1"))
+    with sweep.writing_films() as paths:
+        for path in paths.values():
+            path.write_bytes(b"film")
+    sweep.write_best(second)
+    assert another().films() == {}
+    # It is confirmed again, or its settings are judged anew: it is the same policy.
+    sweep.write_best(first.model_copy(update={"selection_score": 3.0}))
+    assert set(another().current_films()) == set(paths)
+    # Somebody was ended while the other one was filmed.
+    sweep.write_best(second)
+    with contextlib.suppress(InterruptedError), sweep.writing_films() as paths:
+        paths["after_mp4"].write_bytes(b"film of another")
+        raise InterruptedError
+    sweep.write_best(first)
+    assert another().films() == {}
+    harness.put("mine", "best/films.json", b"{}")
+    assert another().films() == {}
 
 
 def test_a_report_is_written_over_the_one_before(harness: Harness, sweep: Sweep) -> None:

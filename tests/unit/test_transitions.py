@@ -42,7 +42,8 @@ def test_the_file_of_a_trial_is_as_it_was_before_its_record_was_made_of_parts() 
         status="stopped", stop_reason="scheduler, at 300 env steps", error="it broke", num_failures=1,
         num_iterations=3, num_env_steps=300, num_episodes=7, time_s=float("inf"), training_return=float("nan"),
         evaluation_return=4.5, best_evaluation_return=4.5, best_iteration=3, notes=("a note",), node="10.0.0.1/ab",
-        pid=12, started_at=1_700_000_000.25, ended_at=1_700_000_001.0, checkpoints=(CHECKPOINT,),
+        pid=12, ran_with={"cpu": "a CPU"}, started_at=1_700_000_000.25, ended_at=1_700_000_001.0,
+        checkpoints=(CHECKPOINT,),
     )  # fmt: skip
     assert dump(record) == SAMPLE.read_text(encoding="utf-8")
     assert TrialRecord.model_validate_json(SAMPLE.read_bytes()) == record

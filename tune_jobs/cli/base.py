@@ -26,6 +26,7 @@ _UNCHANGED = {
     "launch": "No trial had begun, and nothing was kept.",
     "resume": "No trial had begun, and nothing was changed: `tune-jobs resume SWEEP` continues it.",
     "replicate": "No trial had begun, and nothing was changed.",
+    "reproduce": "Nothing was changed.",
     "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
 }
 _JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
@@ -128,6 +129,8 @@ storage_option = click.option(
     help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]",
 )  # fmt: skip
 sweep_argument = click.argument("sweep", shell_complete=complete_sweeps)
+sweeps_argument = click.argument("sweeps", nargs=-1, required=True, shell_complete=complete_sweeps)
+sources_argument = click.argument("sources", nargs=-1, required=True, shell_complete=complete_sources)
 source_argument = click.argument("source", shell_complete=complete_sources)
 num_episodes_option = click.option(
     "--num-episodes", type=click.IntRange(1, 2**18), default=100, show_default=True, help="Greedy episodes."

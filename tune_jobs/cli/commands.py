@@ -31,6 +31,7 @@ from tune_jobs.cli.base import (
     sweep_argument,
 )
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
+from tune_jobs.cli.result_commands import compare, export, importance, reproduce
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -49,7 +50,8 @@ def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's sign
 
     SPEC is a sweep file or a preset; SWEEP is a sweep's name or folder.
 
-    Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials or the best's confirmation failed, 4 no such
+    Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials or the best's confirmation failed, or a reproduced
+    trial differs, 4 no such
     sweep, trial or checkpoint, 5 cannot run here, 130 interrupted.
     """
     ctx.meta[DEBUG] = debug
@@ -322,6 +324,10 @@ def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
     with stdout_for(as_json=as_json):
         path = sweeps.report(sweep, storage=storage)
     cli_output.show_paths({"report": path}, as_json=as_json)
+
+
+for _command in (compare, export, importance, reproduce):
+    cli.add_command(_command)
 
 
 @cli.command()

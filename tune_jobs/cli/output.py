@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 # Derived values, so that readers of the JSON need not compute them.
 _DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
+_MAX_CANDIDATES = 8
 STATUS_STYLES: dict[TrialStatus, str] = {
     "completed": "green",
     "failed": "red",
@@ -70,6 +71,10 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
     else:
         console = make_console()
         _print_trial_counts(console, result.trials)
+        if result.sweep.replications:
+            from analysis.answers import replicas_text
+
+            console.print(replicas_text(result.sweep, result.trials))
         if result.best is not None:
             _print_best(console, result.best)
         elif result.why_no_best is not None:
@@ -144,8 +149,10 @@ def show_best(best: BestRecord, *, as_json: bool) -> None:
     """Print the winner, the score it was chosen by, and its confirmation."""
     if as_json:
         print_json(best)
-    else:
-        _print_best(make_console(), best)
+        return
+    console = make_console()
+    _print_best(console, best)
+    _print_candidates(console, best)
 
 
 def _print_best(console: Console, best: BestRecord) -> None:
@@ -153,11 +160,43 @@ def _print_best(console: Console, best: BestRecord) -> None:
     where = f"{best.checkpoint.trial_id}, iteration {best.checkpoint.iteration}"
     facts = {
         "policy": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
-        "chosen by": f"{return_text(best.selection_score)} mean evaluation return",
+        **_chosen(best),
         "confirmed at": f"{_returns(best.confirmation)}; gap {difference_text(best.optimism_gap)}",
         "random policy": _returns(best.random),
     }
     print_facts(console, facts | _verdict(best.confirmation) | _setting_facts(best.settings))
+
+
+def _chosen(best: BestRecord) -> dict[str, str]:
+    """Return the score that the winner was chosen by, and what it was chosen from, which older records don't have."""
+    by = f"{return_text(best.selection_score)} mean evaluation return"
+    if best.choice is None:
+        return {"chosen by": by}
+    from analysis.choice_words import chosen_from
+
+    over = counted(best.choice.winner.num_episodes, "episode")
+    return {"chosen by": f"{by} over {over}", "chosen from": chosen_from(best.choice)}
+
+
+def _print_candidates(console: Console, best: BestRecord) -> None:
+    """Print what the policy was chosen from, the leading ones."""
+    from analysis.choice_words import COLUMNS, candidate_rows
+
+    rows = candidate_rows(best, none=PLAIN_NONE)
+    if best.choice is None or len(rows) < 2:
+        return
+    from rich.text import Text
+
+    console.print()
+    table = make_table(*COLUMNS, wrapped=("95 % interval", "confirmed at", "rejected"))
+    for row in rows[:_MAX_CANDIDATES]:
+        table.add_row(*map(Text, row.cells))
+    console.print(table)
+    if len(rows) > _MAX_CANDIDATES:
+        console.print(f"{counted(len(rows) - _MAX_CANDIDATES, 'other')}: see --json, or the report", style="dim")
+    console.print("Intervals are over episodes of each policy, not over training seeds.", style="dim")
+    if best.choice.note:
+        console.print(f"note: {best.choice.note}", style="yellow")
 
 
 def _setting_facts(settings: SettingsRecord | None) -> dict[str, str]:

@@ -10,6 +10,7 @@ from tune_jobs.cli.output import make_console, make_table, print_facts, print_js
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from analysis.racing import Race
     from tune_jobs.plan.sweep_plan import SweepPlan
     from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -33,6 +34,8 @@ def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
 
 
 def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
+    from tune_jobs.sweeps.confirm import largest_race
+
     machine, stop = plan.machine, spec.stop
     returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
     rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
@@ -54,6 +57,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "a trial stops at": " or ".join(rules),
         "search": _search_fact(spec),
         "scheduler": spec.scheduler.type,
+        "then": _confirm_fact(largest_race(spec, plan.num_points)),
         "env steps": f"at most {plan.max_env_steps:,} in all",
         "disk": f"at most about {bytes_text(plan.max_disk_bytes)}",
         "seeds": f"sweep {spec.seed}; evaluation {span(plan.evaluation_seeds)}; "
@@ -94,6 +98,13 @@ def _search_fact(spec: SweepSpec) -> str:
     if spec.search.type == "random":
         return "random draws for each combination of the grids"
     return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
+
+
+def _confirm_fact(race: Race | None) -> str:
+    if race is None:
+        return "no setting is trained again"
+    trials = counted(race.max_trainings, "trial")
+    return f"the {len(race.contenders)} leading settings get more seeds: at most {trials} (confirm: none leaves it out)"
 
 
 def _plan_table(plan: SweepPlan) -> Table:

@@ -134,7 +134,9 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
     """
     try:
         # Another version may have fields that are null, and that this one doesn't know.
-        return SweepSpec.model_validate({key: value for key, value in record.spec.items() if value is not None})
+        stored = {key: value for key, value in record.spec.items() if value is not None}
+        # A sweep of a version that had no such stage ended without it, and is not to begin training when it is read.
+        return SweepSpec.model_validate({"confirm": "none"} | stored)
     except WrongSpecError as error:
         told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
         raise CheckpointError(
@@ -173,6 +175,10 @@ def json_schema() -> dict[str, Any]:
             "anyOf": [{"type": "string"} | text, {"$ref": properties[section]["$ref"]}],
             "description": properties[section]["description"],
         }
+    properties["confirm"] = {
+        "anyOf": [{"const": "none"}, {"type": "boolean"}, {"$ref": properties["confirm"]["$ref"]}],
+        "description": properties["confirm"]["description"],
+    }
     for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
         # A section whose lines are all commented out is null.
         told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}

@@ -49,6 +49,7 @@ _FORMS = {
     "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
     "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random or tpe, or a mapping of its fields",
+    "confirm": "give none, true, or a mapping of its fields (top, seeds, max_share)",
     "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
 }
 """How to write fields that have several forms, or a form that no type describes."""

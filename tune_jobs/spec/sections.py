@@ -139,11 +139,21 @@ class ObjectiveSpec(Section):
 
     type: Objective = Field(
         "final",
-        description="final: its last 100 training episodes, and the evaluations since they began; area: the mean "
-        "evaluation over all of them; best: its best evaluation; steps_to_threshold: the env steps to the first "
-        "evaluation that reaches the threshold.",
+        description="final: the later half of its training, three parts evaluations and one part training episodes; "
+        "area: the mean evaluation over all of it; best: its best evaluation; steps_to_threshold: the env steps to the "
+        "first evaluation that reaches the threshold.",
     )
     threshold: Number | None = Field(None, description="steps_to_threshold: the return to reach; null: the env's own.")
+
+
+class ConfirmSpec(Section):
+    """How the leading settings are trained again when the search is over, by which it is known which is the best."""
+
+    top: Annotated[WholeNumber, Field(ge=2)] = Field(5, description="How many of the leading settings race at most.")
+    seeds: PositiveWhole = Field(5, description="How many more seeds a setting gets at most.")
+    max_share: Annotated[Number, Field(ge=0, le=10)] = Field(
+        0.5, description="The most env steps that this may take, as a share of those of the search; 0: it is off."
+    )
 
 
 class EvaluationSpec(Section):
@@ -180,6 +190,13 @@ def _from_text(key: str) -> BeforeValidator:
         return {key: value} if isinstance(value, str) else value
 
     return BeforeValidator(expand)
+
+
+def _from_a_word(value: Any) -> Any:
+    """Let `confirm` be switched by a word: none, false or true."""
+    if value == "none" or value is False:
+        return {"max_share": 0.0}
+    return {} if value is True else value
 
 
 _ASKED_FOR = [engine for engine in ENGINES if engine.can_be_asked_for]
@@ -228,6 +245,10 @@ class SweepFields(Section):
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
     objective: Annotated[ObjectiveSpec, _from_text("type")] = Field(
         default_factory=ObjectiveSpec, description="What a setting is judged by: its type, or a mapping."
+    )
+    confirm: Annotated[ConfirmSpec, BeforeValidator(_from_a_word)] = Field(
+        default_factory=ConfirmSpec,
+        description="Train the leading settings again with fresh seeds, to know which is the best: a mapping, or none.",
     )
     checkpoints: CheckpointSpec = Field(
         default_factory=CheckpointSpec, description="Which checkpoints of a trial are kept."

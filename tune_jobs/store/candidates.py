@@ -12,14 +12,11 @@ import logging
 from collections.abc import Mapping, Sequence
 
 from analysis.numbering import place_of
-from analysis.records import BestRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
-from analysis.selection import Selection, select_best
+from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
-from policies.portable.file import PortablePolicy, read_policy
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS, SWEEP_RECORD
 from tune_jobs.store.results_file import Scored
-from tune_jobs.store.transitions import with_checkpoints
 
 _LOG = logging.getLogger(__name__)
 
@@ -72,38 +69,6 @@ def candidates(trial: Trial) -> list[CheckpointRecord]:
     return [record for record in known if _agrees(trial, record, recorded.get(record.iteration, []))]
 
 
-def choose(store: Sweep, trials: Sequence[TrialRecord]) -> tuple[Selection, PortablePolicy]:
-    """Return the best selection whose checkpoint is whole, and its policy; a warning names better but damaged ones.
-
-    Args:
-        store: The sweep.
-        trials: The result of `read_trials`.
-
-    Raises:
-        NoUsableTrialError: No trial can win; the message says why.
-    """
-    remaining = list(trials)
-    while True:
-        selection = select_best(remaining)
-        try:
-            store.trial(selection.checkpoint.trial_id).verify_checkpoint(selection.checkpoint.iteration)
-            return selection, read_policy(store.checkpoint_folder(selection.checkpoint))
-        except NotFoundError as error:
-            leave_out(error)
-            remaining = [_without(record, selection.checkpoint) for record in remaining]
-
-
-def confirmed_best(store: Sweep) -> BestRecord | None:
-    """Return the winner that was confirmed before; None: it is missing or damaged, or another one would win now."""
-    try:
-        best = store.read_best()
-        read_policy(store.best_folder)
-        selection, _ = choose(store, read_trials(store))
-    except TuneJobsError:
-        return None
-    return best if best.checkpoint == selection.checkpoint else None
-
-
 def leave_out(error: TuneJobsError) -> None:
     """Warn that something is left out because of an error."""
     _warn(error.message)
@@ -113,10 +78,6 @@ def leave_out(error: TuneJobsError) -> None:
 def _warn(message: str) -> None:
     # Only once, because a sweep is read several times at its end.
     _LOG.warning("Left out: %s", message)
-
-
-def _without(record: TrialRecord, checkpoint: CheckpointRecord) -> TrialRecord:
-    return with_checkpoints(record, [item for item in record.checkpoints if item != checkpoint])
 
 
 def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:

@@ -243,15 +243,24 @@ class Sweep(Protocol):
         ...
 
     def films(self) -> Mapping[str, Path]:
-        """Return the films that exist, of before_mp4, after_mp4, after_gif and before_after_mp4, to read only."""
+        """Return the films that exist of the present winner, to read only; none if they show another.
+
+        They are before_mp4, after_mp4, after_gif and before_after_mp4.
+        """
         ...
 
     def current_films(self) -> Mapping[str, Path]:
-        """Return all films if they are there and were made after the present winner was written; else none."""
+        """Return all films if they are there and show the present winner; else none."""
         ...
 
     def writing_films(self) -> AbstractContextManager[Mapping[str, Path]]:
-        """Yield the path for each of the films, to be written in the block; each file has to appear whole."""
+        """Yield the path for each of the films of the present winner; each file has to appear whole, in the block.
+
+        Raises:
+            NotFoundError: No winner has been chosen.
+            CheckpointError: Its record is damaged.
+            CannotRunError: It can't be written whose films they are.
+        """
         ...
 
     def current_report(self) -> Path | None:

@@ -6,6 +6,7 @@ from pathlib import Path, PurePath
 
 from policies.errors import NotFoundError
 from tune_jobs.store.contract import Storage, Sweep
+from tune_jobs.store.names import TRIALS_FOLDER
 from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores, name_taken
 
 
@@ -17,6 +18,12 @@ def open_storage(folder: Path) -> Storage:
 def open_sweep(folder: Path) -> Sweep:
     """Return the sweep in a folder, which need not exist yet."""
     return SweepStore(folder)
+
+
+def sweep_of_trial(folder: Path) -> Sweep | None:
+    """Return the sweep that a trial's folder is in; None: it is in none."""
+    sweep = SweepStore(folder.parent.parent)
+    return sweep if folder.parent.name == TRIALS_FOLDER and sweep.exists() else None
 
 
 class LocalStorage:

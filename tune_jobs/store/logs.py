@@ -14,6 +14,7 @@ from policies.envs.faults import Frame, frame_of_env
 from policies.files import open_regular
 
 _TAIL_BYTES = 200_000
+_CONTINUED = re.compile(r"process \d+: built from checkpoint (\d+)$")
 _TIMEOUT_MARK = "Timeout ("
 _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
 # Files with the loops of a trial's own thread, and files from which this package calls an environment's code.
@@ -39,6 +40,25 @@ def log_mark(what: str) -> str:
 def begin_log(what: str) -> None:
     """Print the line that separates this process's output, which goes to the log, from that of earlier ones."""
     print(f"{log_mark(what)}{os.getpid()}", flush=True)
+
+
+def built_from(seed: int, checkpoint: Path | None) -> str:
+    """Return the line of a trial's log that says from which seed or checkpoint it was built."""
+    return f"built from seed {seed}" if checkpoint is None else f"built from checkpoint {checkpoint.name}"
+
+
+def continued_from(path: Path) -> int | None:
+    """Return the first iteration from whose checkpoint a trial continued; None: it never did, or that isn't known.
+
+    Args:
+        path: The trial's log. Those that older versions wrote of trials that no pack trained don't say it.
+    """
+    try:
+        with open_regular(path) as file:
+            lines = file.read().decode("utf-8", errors="replace").splitlines()
+    except OSError:
+        return None
+    return min((int(found[1]) for line in lines if (found := _CONTINUED.search(line))), default=None)
 
 
 def log_tail(path: Path, what: str = "", num_lines: int = 15) -> str:

@@ -32,6 +32,8 @@ FILMS = {
     "before_after_mp4": "before_after.mp4",
 }
 """The films of the winner and of a random policy, in the folder of the best."""
+FILMS_RECORD = "films.json"
+"""Whose films these are, beside them."""
 REPORT_FOLDER = "report"
 FIGURES_FOLDER = "figures"
 REPORT_PAGE = "index.html"

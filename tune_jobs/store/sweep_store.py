@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from analysis.records import FINISHED, BestRecord, CheckpointRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, NotFoundError, SpecError
+from analysis.records import FINISHED, BestRecord, CheckpointRecord, FilmsRecord, SweepRecord, TrialRecord
+from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
@@ -207,21 +207,36 @@ class SweepStore:
         return self.best_folder / names.BEST_POLICY
 
     def films(self) -> dict[str, Path]:
-        """Return the films that exist, of before_mp4, after_mp4, after_gif and before_after_mp4."""
+        """Return the films that exist of the present winner; see `Sweep.films`."""
         folder = self.best_folder
-        return {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
+        films = {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
+        return films if films and self._are_of_the_winner(films.values()) else {}
+
+    def _are_of_the_winner(self, films: Iterable[Path]) -> bool:
+        path = within(self.best_folder, names.FILMS_RECORD)
+        try:
+            if path.is_file():
+                record = read_record(path, FilmsRecord, "films record", is_sealed=True)
+                return record.checkpoint == self.read_best().checkpoint
+        except (CheckpointError, NotFoundError):
+            return False
+        # Older versions wrote no such record, and neither does a process that is ended while it films.
+        return self.has_best() and _not_older(films, [self.best_folder / names.BEST_RECORD])
 
     def current_films(self) -> dict[str, Path]:
-        """Return all films, if they were made for the present winner; see `Sweep.current_films`."""
+        """Return all films, if they are of the present winner; see `Sweep.current_films`."""
         films = self.films()
-        whole = len(films) == len(names.FILMS)
-        return films if whole and _not_older(films.values(), [self.best_folder / names.BEST_RECORD]) else {}
+        return films if len(films) == len(names.FILMS) else {}
 
     @contextlib.contextmanager
     def writing_films(self) -> Iterator[Mapping[str, Path]]:
-        """Yield the paths to write films to, by the names that `films` has."""
+        """Yield the paths to write films of the present winner to, by the names that `films` has."""
         folder = self.best_folder
+        record = within(folder, names.FILMS_RECORD)
+        shown = self.read_best().checkpoint
+        remove_file(record)
         yield {key: folder / name for key, name in names.FILMS.items()}
+        write_atomic(record, dump_sealed(FilmsRecord(checkpoint=shown)))
 
     def current_report(self) -> Path | None:
         """Return the report's page, if nothing that it shows was written since; see `Sweep.current_report`."""

@@ -24,10 +24,11 @@ from policies.suggestions import did_you_mean
 from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
-from tune_jobs.store.candidates import choose, leave_out, read_results, read_trials
+from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.local_storage import open_storage, open_sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
+from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
 from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.storage import expanded, storage_folder
 from tune_jobs.training.registry import engine_of_checkpoint
@@ -58,7 +59,7 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
 
 @guarding()
 def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
-    """Select the winner, confirm it on seeds it was not chosen on, and copy its policy to best/.
+    """Choose the policy to deploy, confirm it and the runners-up on seeds of their own, and copy it to best/.
 
     Raises:
         NoUsableTrialError: No trial can win; the message says why.
@@ -68,22 +69,24 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
     sweep = _trusted(store).read_record()
     spec = stored_spec(sweep)
     trials = read_trials(store)
-    selection, portable = choose(store, trials)
+    chosen = choose_policy(store, spec, trials)
+    winner = chosen.choice.winner
     seeds = confirmation_seeds(spec.seed, num_episodes)
-    policy = policy_from_portable(portable, description=f"{store.name}/{selection.trial.trial_id}")
+    policy = policy_from_portable(chosen.policy, description=f"{store.name}/{chosen.trial.trial_id}")
     env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
     random = random_policy(env_id, env_args, timeout_s)
     confirmation = run_evaluation(policy, env_id, env_args, seeds, timeout_s)
     record = BestRecord(
-        checkpoint=selection.checkpoint,
-        point=selection.trial.point_at(selection.checkpoint.iteration),
-        seed=selection.trial.seed,
-        selection_score=selection.score,
+        checkpoint=winner.checkpoint,
+        point=winner.point,
+        seed=chosen.trial.seed,
+        selection_score=winner.score,
         confirmation=confirmation,
         random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
         settings=judged(spec, trials, read_results(store), confirmation.threshold),
+        choice=with_runners_up(chosen, confirmation, timeout_s),
     )
-    store.write_best(record, portable)
+    store.write_best(record, chosen.policy)
     return record
 
 
@@ -344,6 +347,7 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
         why_no_best: Why its winner could not be confirmed just now; None: it was confirmed, or this was not tried.
     """
     from analysis.report import build_report
+    from analysis.report_data import goal_of
 
     best = None
     if why_no_best is None:
@@ -353,16 +357,19 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
             why_no_best = error
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None
+    record, trials, results = store.read_record(), read_trials(store), read_results(store)
+    threshold = goal_of(record, None) if best is None else best.confirmation.threshold
     films = store.films()
     videos = {name: films[key] for name, key in (("before", "before_mp4"), ("after", "after_mp4")) if key in films}
     with store.writing_report() as target:
         return build_report(
             store.folder,
             target=target,
-            sweep=store.read_record(),
-            trials=read_trials(store),
-            results=read_results(store),
+            sweep=record,
+            trials=trials,
+            results=results,
             best=best,
+            settings=judged(stored_spec(record), trials, results, threshold),
             why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
             videos=videos if why_no_best is None else {},
         )

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
-from analysis.records import FINISHED, BestRecord, SweepRecord, SweepState
-from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
+from analysis.records import FINISHED, SweepRecord, SweepState
+from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
 from tune_jobs.process.interruption import current
+from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.address import check_address
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -33,8 +31,6 @@ from tune_jobs.sweeps.outcome import SweepResult
 
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection
-
-_PACKAGES = ("tune-jobs", "ray", "torch", "gymnasium", "numpy")
 
 
 def write_new(
@@ -53,23 +49,15 @@ def write_new(
             confirmation_seeds=plan.confirmation_seeds,
             num_trials=len(plan.trials),
             created_at=time.time(),
-            versions=_versions(),
-            git_commit=_git_commit(),
+            versions=versions(),
+            git_commit=git_commit(),
             address=address,
             allowed_modules=modules_of(spec),
         )
     )
 
 
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
-
-
-def _git_commit() -> str | None:
+def git_commit() -> str | None:
     """Return the commit of the working directory's repository, which tells the version of a user's own code."""
     try:
         done = subprocess.run(
@@ -138,40 +126,61 @@ def settled(store: Sweep) -> Iterator[None]:
             if is_ours and store.exists():
                 store.clear_stop_request()
                 store.remove_leftovers()
-                _close_if_open(store)
+                close_if_open(store)
 
 
-def run_sweep(
-    store: Sweep,
-    plan: SweepPlan,
-    *,
-    address: str | None,
-    machine: Machine | None,
-    finish: bool,
-    progress: str,
-) -> SweepResult:
-    """Run the unfinished trials of a sweep whose lock is held, then conclude it.
+class Shared:
+    """What the stages of one run have in common: one Ray, one table. It is a context, which ends both.
 
-    A KeyboardInterrupt ends it with the results so far: the records are written, whatever was begun.
+    Attributes:
+        stack: Ends what was begun.
+        monitor: Sums up the trials of all stages; None before the first.
+        connection: The Ray of all stages; None before the first.
+        is_shown: Whether the table is on the screen.
     """
-    try:
-        return _run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
-    except KeyboardInterrupt:
-        with current().shielded():
-            current().came = True
-            _close_if_open(store)
-            return SweepResult(store.folder, store.read_record(), store.read_trials(), interrupted=True)
+
+    def __init__(self) -> None:
+        self.stack = contextlib.ExitStack()
+        self.monitor: SweepMonitor | None = None
+        self.connection: Connection | None = None
+        self.is_shown = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # A first signal does not cut this short; that it came is noted.
+        with noted(), current().asking(lambda: None):
+            self.stack.__exit__(kind, error, trace)
 
 
-def _run_sweep(
+def run_trials_of(
     store: Sweep,
     plan: SweepPlan,
+    shared: Shared,
     *,
     address: str | None,
     machine: Machine | None,
-    finish: bool,
     progress: str,
+    told: str = "",
 ) -> SweepResult:
+    """Run the unfinished trials of a sweep whose lock is held.
+
+    Args:
+        store: The sweep.
+        plan: Its plan.
+        shared: What this has in common with earlier and later stages.
+        address: Ray cluster to run on; None: this machine.
+        machine: This machine, if Ray is started here.
+        progress: The same as for `launch`.
+        told: What these trials are for, as the table's heading says it; empty: they are the sweep's.
+
+    Raises:
+        KeyboardInterrupt: A signal came.
+        CannotRunError: Ray cannot run here, or died.
+    """
     # From here on, processes that an earlier run left, here or on other machines, can't take a trial any more.
     run = store.take()
     todo = tuple(trial.trial_id for trial in store.read_trials() if trial.status not in FINISHED)
@@ -183,32 +192,28 @@ def _run_sweep(
         started = record.started_at or time.time()
         store.write_record(record.model_copy(update={"state": "running", "started_at": started, "ended_at": None}))
         spec, trials = stored_spec(record), store.read_trials()
-        monitor = SweepMonitor(
-            store.name,
-            trials,
-            caps=caps_of(spec, trials),
-            max_concurrent=plan.max_concurrent,
-        )
+        caps = caps_of(spec, trials)
+        if shared.monitor is None:
+            shared.monitor = SweepMonitor(store.name, trials, caps=caps, max_concurrent=plan.max_concurrent)
+        else:
+            shared.monitor.begin_stage(told, trials, caps, plan.max_concurrent)
         try:
-            _run_trials(store, plan, todo, monitor, run, address=address, machine=machine, progress=progress)
+            _run_trials(store, plan, todo, shared, run, address=address, machine=machine, progress=progress)
         finally:
             run.release()
-        _close_if_open(store)
+        close_if_open(store)
     from tune_jobs.store.candidates import read_trials
 
     records = read_trials(store)
     interrupted = any(trial.status not in FINISHED for trial in records)
-    result = SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
-    if interrupted or not finish:
-        return result
-    return replace(result, interrupted=True) if current().came else _finished(store, result, progress, keep=not todo)
+    return SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
 
 
 def _run_trials(
     store: Sweep,
     plan: SweepPlan,
     todo: tuple[str, ...],
-    monitor: SweepMonitor,
+    shared: Shared,
     run: Ownership,
     *,
     address: str | None,
@@ -217,13 +222,15 @@ def _run_trials(
 ) -> None:
     from tune_jobs.sweeps.live_view import shown
 
-    def ask() -> None:
-        monitor.stopping = True
-        store.request_stop()
-
+    monitor, stack = shared.monitor, shared.stack
+    if monitor is None:
+        raise RuntimeError("A stage is run before it has a monitor.")
     started = time.time()
-    monitor.phase = "starting Ray" if address is None else f"joining the Ray cluster at {address}"
-    with _noted(), shown(monitor, progress, store.driver_log, plan.notes):
+    with noted():
+        if not shared.is_shown:
+            monitor.phase = "starting Ray" if address is None else f"joining the Ray cluster at {address}"
+            stack.enter_context(shown(monitor, progress, store.driver_log, plan.notes))
+            shared.is_shown = True
         from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
         job = RunJob(
@@ -235,10 +242,17 @@ def _run_trials(
             packs=plan.packs,
             run=run.token,
         )
-        with current().asking(ask), connected(address, machine) as connection:
+
+        def ask() -> None:
+            monitor.stopping = True
+            store.request_stop()
+
+        with current().asking(ask):
+            if shared.connection is None:
+                shared.connection = stack.enter_context(connected(address, machine))
             monitor.phase = "starting the trials"
             try:
-                if connection.is_client:
+                if shared.connection.is_client:
                     from tune_jobs.ray_tune.driver_actor import run_trials_remotely
 
                     run_trials_remotely(job, monitor.update)
@@ -256,7 +270,7 @@ def _run_trials(
 
 
 @contextlib.contextmanager
-def _noted() -> Iterator[None]:
+def noted() -> Iterator[None]:
     """End the block at a KeyboardInterrupt, which is raised again when everything is saved."""
     try:
         yield
@@ -264,103 +278,8 @@ def _noted() -> Iterator[None]:
         current().came = True
 
 
-def _close_if_open(store: Sweep) -> None:
+def close_if_open(store: Sweep) -> None:
     """Close the run if Ray failed before the run began."""
     with current().shielded():
         if store.read_record().state == "running":
             close_run(store)
-
-
-def _finished(store: Sweep, result: SweepResult, progress: str = "none", *, keep: bool = False) -> SweepResult:
-    """Choose, confirm and film the winner, and write the report; what can't be made is noted, and raises no error.
-
-    Args:
-        store: The sweep.
-        result: The trials.
-        progress: Whether it is told what is done, as for `launch`.
-        keep: Whether only what is missing or out of date is made: the records of a sweep that was finished before stay
-            as they are, whichever machine, version or number of episodes they came from.
-    """
-    made = _Finish(store, progress, keep=keep)
-    with _noted():
-        made.make_all()
-    return replace(
-        result,
-        best=made.best,
-        why_no_best=made.why_no_best,
-        finish_failed=made.failed,
-        artifacts=made.artifacts,
-        notes=tuple(made.notes),
-        interrupted=made.stopped or current().came,
-    )
-
-
-class _Finish:
-    """Makes what comes after the trials, as far as possible."""
-
-    def __init__(self, store: Sweep, progress: str, *, keep: bool) -> None:
-        self._store = store
-        self._progress = progress
-        self._keep = keep
-        self.best: BestRecord | None = None
-        self._why: TuneJobsError | None = None
-        self.artifacts: dict[str, Path] = {}
-        self.notes: list[str] = []
-        self.stopped = False
-        """Whether another process asked to stop before everything was made."""
-        self.failed = False
-        """Whether no winner could be confirmed, or the environment failed where it was filmed."""
-
-    @property
-    def why_no_best(self) -> str | None:
-        """Why no winner could be chosen."""
-        return None if self._why is None else str(self._why)
-
-    def make_all(self) -> None:
-        """Make everything that can be made."""
-        from tune_jobs.store.candidates import confirmed_best
-        from tune_jobs.sweeps import conclude as finish
-        from tune_jobs.sweeps.settings import with_present_settings
-
-        store = self._store
-        if self._keep:
-            self.best = confirmed_best(store)
-        kept = self.best is not None
-        try:
-            if self.best is not None:
-                self.best = with_present_settings(store, self.best)
-            else:
-                with self._working("confirming the best policy"):
-                    self.best = finish.choose_best(store)
-            self.artifacts["policy"] = store.best_policy_path
-        except TuneJobsError as error:
-            self._why = error
-        self.failed = self._why is not None
-        if self.best is not None:
-            films = dict(store.current_films()) if kept else {}
-            self.artifacts.update(films)
-            if not films:
-                self._attempt("video", "filming the best policy", lambda: finish.make_videos(store))
-        page = store.current_report() if kept else None
-        if page is not None:
-            self.artifacts["report"] = page
-        else:
-            self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
-
-    def _working(self, doing: str) -> AbstractContextManager[None]:
-        from tune_jobs.sweeps.live_view import working
-
-        return working(self._store.name, doing, self._progress)
-
-    def _attempt(self, what: str, doing: str, make: Callable[[], dict[str, Path]]) -> None:
-        # Another process may have asked to stop, which ends this too.
-        self.stopped = self.stopped or self._store.stop_requested()
-        if self.stopped:
-            return
-        try:
-            with self._working(doing):
-                self.artifacts.update(make())
-        except TuneJobsError as error:
-            self.notes.append(f"No {what}: {error}")
-            # Other errors are expected, as not every environment can be drawn.
-            self.failed = self.failed or isinstance(error, EnvFailedError)

@@ -74,7 +74,7 @@ def _head(monitor: SweepMonitor, width: int) -> RenderableType:
     head.add_column(no_wrap=True)
     total = max(1, progress.max_env_steps)
     head.add_row(
-        Text(monitor.name, style="bold"),
+        Text(monitor.title, style="bold"),
         ProgressBar(total=total, completed=progress.num_env_steps, width=max(8, min(40, width // 3))),
         f"{100 * progress.num_env_steps // total} %",
     )
@@ -179,7 +179,7 @@ def _cells(row: Row, names: Sequence[str]) -> list[str]:
 
 def summary_line(monitor: SweepMonitor) -> str:
     """Describe the state of a sweep in one short line, for logs."""
-    elapsed = f"{monitor.name}: {duration(monitor.elapsed_s, tenths=False)}"
+    elapsed = f"{monitor.title}: {duration(monitor.elapsed_s, tenths=False)}"
     if monitor.phase:
         return f"{elapsed}; {monitor.phase}"
     progress = monitor.progress()

@@ -56,6 +56,7 @@ class SweepMonitor:
         self.records: dict[str, TrialRecord] = {record.trial_id: record for record in records}
         self.max_concurrent = max_concurrent
         self.stopping = False
+        self.stage = ""
         self.phase = ""
         """What is done before the trials train or after they have, such as "starting Ray"; empty while they do."""
         self._caps = caps
@@ -67,6 +68,30 @@ class SweepMonitor:
         self._selection: Selection | None = None
         # It needs all records; with a thousand trials, that takes too long to do at every report.
         self._selection_is_old = True
+
+    def begin_stage(
+        self, told: str, records: Iterable[TrialRecord], caps: Mapping[str, int], max_concurrent: int
+    ) -> None:
+        """Take the trials of a further stage of the same run.
+
+        Args:
+            told: What they are for; it is shown behind the sweep's name.
+            records: All trials of the sweep.
+            caps: As for a new monitor.
+            max_concurrent: As for a new monitor.
+        """
+        self.stage = told
+        self.max_concurrent = max_concurrent
+        # The caps come first: a table that is drawn meanwhile asks for that of each record.
+        self._caps = caps
+        self.records = {record.trial_id: record for record in records}
+        self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
+        self._selection_is_old = True
+
+    @property
+    def title(self) -> str:
+        """The sweep's name, and what its present trials are for."""
+        return f"{self.name}, {self.stage}" if self.stage else self.name
 
     @property
     def elapsed_s(self) -> float:

@@ -1,4 +1,4 @@
-"""The results of a sweep: its trials as records and as a table, and its report."""
+"""The results of a sweep: its trials as records, and its report."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from analysis.selection import score_trial
 from analysis.wording import PLAIN_NONE, return_text, setting_text
 from policies.arguments import checked
 from policies.envs.modules import allowed_again
-from policies.errors import NotFoundError
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from analysis.importance import WhatMattered
 
 
 class Trials(BriefList[TrialRecord]):
@@ -63,24 +62,26 @@ def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[Tria
 
 
 @checked
-def dataframe(sweep: str | Path, *, storage: str | Path | None = None) -> pd.DataFrame:
-    """Return a sweep's trials as a pandas DataFrame, one row per trial: the table `trials.csv` of its report.
+def importance(sweep: str | Path, *, storage: str | Path | None = None) -> WhatMattered:
+    """Say which hyperparameters a sweep's scores depend on, as its report does.
+
+    Scores are what settings are judged by (`objective` in the sweep file). It can be asked of a sweep that still runs.
+
+    Returns:
+        The share of each searched hyperparameter, the most important first, with its interval; the adjusted scores of
+        its values; pairs that matter together; and ends of its values that are worth moving. `too_few` says why
+        nothing can be said, if that is so.
 
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from analysis.report_data import goal_of
-    from analysis.tables import trials_frame
-    from tune_jobs.store.candidates import read_results, read_trials
+    from analysis.importance import what_mattered
     from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.exports import sweep_data
 
     store = find_sweep(sweep, storage)
-    try:
-        best = store.read_best()
-    except NotFoundError:
-        # No winner was chosen yet, or it can't be read: then the env's own threshold counts.
-        best = None
-    return trials_frame(read_trials(store), read_results(store), threshold=goal_of(store.read_record(), best))
+    data = sweep_data(store)
+    return what_mattered(store.read_record(), data.trials, data.results, threshold=data.threshold)
 
 
 @allowed_again()

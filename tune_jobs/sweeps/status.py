@@ -25,7 +25,7 @@ from tune_jobs.sweeps.storage import storage_folder
 
 @dataclass(frozen=True)
 class BestSoFar:
-    """The checkpoint that would win now; it is not confirmed."""
+    """The checkpoint that leads by its evaluations; of a finished sweep the policy that was chosen."""
 
     trial_id: str
     iteration: int
@@ -34,7 +34,7 @@ class BestSoFar:
     point: dict[str, Any]
     seed: int
     score: float
-    """Mean evaluation return of the point, over its seeds."""
+    """Mean evaluation return of the point, over its seeds; of a finished sweep that of the policy."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def _status(store: Sweep) -> SweepStatus:
         max_env_steps=None if so_far is None else so_far.max_env_steps,
         env_steps_per_s=None if so_far is None else so_far.env_steps_per_s,
         time_left_s=None if so_far is None else so_far.time_left_s,
-        best=_best(trials),
+        best=_confirmed(store, record) or _best(trials),
     )
 
 
@@ -192,6 +192,18 @@ def _forecast(record: SweepRecord, trials: Sequence[TrialRecord], *, alive: bool
     except CheckpointError:
         # The status of a sweep of another version is still told.
         return None
+
+
+def _confirmed(store: Sweep, record: SweepRecord) -> BestSoFar | None:
+    """Return the winner of a finished sweep, which its evaluations alone do not show."""
+    if record.state != "completed" or not store.has_best():
+        return None
+    try:
+        best = store.read_best()
+    except TuneJobsError:
+        return None
+    at = best.checkpoint
+    return BestSoFar(at.trial_id, at.iteration, at.num_env_steps, best.point, best.seed, best.selection_score)
 
 
 def _best(trials: Sequence[TrialRecord]) -> BestSoFar | None:

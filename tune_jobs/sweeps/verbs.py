@@ -19,17 +19,22 @@ from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.plan.user_code import Source, load_source
 from tune_jobs.process.interruption import can_drive, current
 from tune_jobs.sweeps.alone import run_alone
+from tune_jobs.sweeps.compare import compare
 from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
-from tune_jobs.sweeps.drive import connected, machine_here, run_sweep, settled, write_new
+from tune_jobs.sweeps.drive import connected, machine_here, settled, write_new
+from tune_jobs.sweeps.exports import dataframe, export, figure, study
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.policies import best, evaluate, restore, video
-from tune_jobs.sweeps.results import dataframe, report, trials
+from tune_jobs.sweeps.reproduce import reproduce
+from tune_jobs.sweeps.results import importance, report, trials
+from tune_jobs.sweeps.stages import run_sweep
 from tune_jobs.sweeps.status import SweepStatus, list_sweeps, status
 from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storage_folder
 
 __all__ = [
-    "CreatedSweep", "SweepResult", "SweepStatus", "best", "create", "dataframe", "drive", "evaluate", "extend",
-    "launch", "list_sweeps", "replicate", "report", "restore", "resume", "status", "stop", "trials", "video",
+    "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
+    "export", "extend", "figure", "importance", "launch", "list_sweeps", "replicate", "report", "reproduce", "restore",
+    "resume", "status", "stop", "study", "trials", "video",
 ]  # fmt: skip
 
 Progress = Literal["auto", "none"]

@@ -71,8 +71,6 @@ class _MemberEngine:
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         self._pack.add(task, checkpoint)
         self.is_built = True
-        source = f"seed {task.seed}" if checkpoint is None else f"checkpoint {checkpoint.name}"
-        _log(task, f"built from {source}")
 
     def train_iteration(self) -> IterationStats:
         raise NotImplementedError("The members of a pack are trained together.")

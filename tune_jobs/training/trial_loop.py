@@ -23,9 +23,11 @@ from policies.envs.tallies import Reached, begin_tally, end_tally
 from policies.errors import NonFiniteWeightsError
 from policies.files import write_plain
 from policies.portable.file import save_policy
+from tune_jobs.process.ran_with import ran_with
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.copies import pending_copy
 from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.logs import built_from
 from tune_jobs.store.names import RESULTS
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
@@ -131,6 +133,7 @@ class TrialLoop:
             self._tally = begin_tally(self.task.trial_id, self._store.tally_path, _reached(self._last))
         done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
         self._engine.build(done, folder)
+        self._store.write_log(built_from(self.task.seed, folder))
         self._started = self._clock() - self._last.time_s
         self._started_at = time.time()
 
@@ -263,13 +266,12 @@ class TrialLoop:
         self._unwritten.append(self._last)
         self._untold.append(self._last)
         self._tally.set(_reached(self._last))
-        score = record.evaluation_return
         if (
-            self._improves(score)
+            self._improves(record.evaluation_return)
             or reason is not None
             or record.iteration % self.task.checkpoints.every_iterations == 0
         ):
-            self._checkpoint(score)
+            self._checkpoint(record.evaluation_return)
         status: TrialStatus = "running" if reason is None else "completed"
         return self._progress(status, evaluated=evaluation is not None, reason=reason)
 
@@ -304,9 +306,8 @@ class TrialLoop:
 
     def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
         stop = self.task.stop
-        full_window = len(self._window) == TRAINING_RETURN_EPISODES
         # With fewer than 100 episodes, a lucky start would count as solved.
-        if full_window and _reaches(record.training_return, stop.training_return):
+        if len(self._window) == TRAINING_RETURN_EPISODES and _reaches(record.training_return, stop.training_return):
             return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
         if _reaches(evaluation_return, stop.evaluation_return):
             return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
@@ -323,10 +324,8 @@ class TrialLoop:
         return None
 
     def _improves(self, score: float | None) -> bool:
-        if score is None:
-            return False
         best = self._best.evaluation_return if self._best is not None else None
-        return best is None or score > best
+        return score is not None and (best is None or score > best)
 
     def _checkpoint(self, score: float | None) -> None:
         record = CheckpointRecord(
@@ -379,6 +378,7 @@ class TrialLoop:
             error=error,
             notes=tuple(self._notes),
             checkpoints=tuple(self._checkpoints),
+            ran_with=ran_with(),
             started_at=self._started_at,
             ended_at=None if status == "running" else time.time(),
         )

@@ -206,15 +206,17 @@ class PPOGroup:
         return norms
 
     def _move_schedules(self) -> None:
-        """Set learning rates and entropy weights for the env steps so far, including this iteration's."""
-        lr, entropy = [], []
+        """Set learning rates, entropy weights and clips for the env steps so far, including this iteration's."""
+        lr, entropy, clip = [], [], []
         for member, item in zip(self.members, self._hyperparams, strict=True):
             now = member.num_env_steps
             lr.append([linear(item.lr, item.lr_final, item.lr_decay_steps, now)])
             entropy.append([linear(item.entropy_coeff, item.entropy_coeff_final, item.entropy_decay_steps, now)])
+            clip.append([linear(item.clip_param, item.clip_param_final, item.clip_decay_steps, now)])
         column = torch.tensor(lr, device=self._device, dtype=torch.float32)
         self._optimizer.lr = column.repeat(self._rows.networks_per_member, 1)
         self._coefficients.entropy_coeff = torch.tensor(entropy, device=self._device, dtype=torch.float32)
+        self._coefficients.clip_param = torch.tensor(clip, device=self._device, dtype=torch.float32)
         if self._shared.use_kl_loss:
             weights = [[member.kl_coeff] for member in self.members]
             self._coefficients.kl_coeff = torch.tensor(weights, device=self._device, dtype=torch.float32)

@@ -20,7 +20,7 @@ from typing_extensions import override
 from policies.envs.action_bounds import ToBounds
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.vector import PackedEnvs
-from policies.packed.member import MemberStats, group_members
+from policies.packed.member import Member, MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo.gae import advantages_and_targets, standardise
 from policies.packed.ppo.group import Batch, PPOGroup
@@ -28,6 +28,7 @@ from policies.packed.ppo.loss import LOG_STD_CLIP
 from policies.packed.sampling import Observations, one_hot
 from policies.packed.shared import SharedByPPO
 from policies.packed.stack import Stack
+from policies.return_statistics import discounted_returns
 
 Floats = NDArray[np.float32]
 
@@ -42,6 +43,7 @@ class Fragment:
         self.actions: NDArray[Any] = np.empty(0)
         """Whole numbers, (T, S), or continuous actions as the policy drew them, (T, S, num_actions)."""
         self.rewards, self.own_rewards = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        """The rewards to learn from, normalised for members with `normalize_rewards`, and the env's own, (T, S)."""
         self.terminated, self.ended = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
         self.cuts: list[tuple[int, int, Floats]] = []
         """The step, the row and the last observation of each truncated episode."""
@@ -55,6 +57,8 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
     def __init__(self, shared: SharedByPPO, envs: PackedEnvs, device: str = "cpu") -> None:
         super().__init__(shared, envs, device)
         self._ended: list[tuple[tuple[float, int], ...]] = []
+        self._returns: dict[str, NDArray[np.float64]] = {}
+        """The discounted returns of running episodes, (N,), of members that normalise rewards."""
         self._stream = torch.cuda.Stream() if device.startswith("cuda") else None  # type: ignore[no-untyped-call]
         space = envs.action_space
         self._is_gaussian = isinstance(space, gym.spaces.Box)
@@ -64,6 +68,15 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         else:
             self._num_actions = int(cast("gym.spaces.Discrete[Any]", space).n)
         self._num_outputs = self._num_actions * (2 if self._is_gaussian else 1)
+
+    @override
+    def _begin(self, member: Member[PPOHyperparams]) -> None:
+        if member.hyperparams.normalize_rewards:
+            self._returns[member.member_id] = np.zeros(self.envs.num_envs)
+
+    @override
+    def _forget(self, member_id: str) -> None:
+        self._returns.pop(member_id, None)
 
     def _regroup(self) -> None:
         groups = group_members(self.members)
@@ -144,7 +157,21 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
                 fragment.cuts += [(step, row, done.final_observations[row]) for row in cut.tolist()]
         fragment.actions = np.stack(chosen)
         fragment.last = np.array(envs.observations, dtype=np.float32)
+        self._normalize_rewards(fragment)
         return fragment
+
+    def _normalize_rewards(self, fragment: Fragment) -> None:
+        """Add the discounted returns to the statistics of members with `normalize_rewards`, and scale their rewards."""
+        for index, member in enumerate(self.members):
+            before = self._returns.get(member.member_id)
+            if before is None:
+                continue
+            rows = slice(index * self.envs.num_envs, (index + 1) * self.envs.num_envs)
+            rewards = fragment.rewards[:, rows]
+            returns, last = discounted_returns(rewards, fragment.ended[:, rows], member.hyperparams.gamma, before)
+            member.return_statistics.add(returns)
+            fragment.rewards[:, rows] = member.return_statistics.scale(rewards)
+            self._returns[member.member_id] = last
 
     def _draw_noise(self, num_steps: int) -> Floats:
         """Draw the random numbers for the actions of T steps: Gumbel or normal numbers, (T, S, actions)."""

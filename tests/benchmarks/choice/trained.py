@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from analysis.records import IterationRecord
 from tests.benchmarks.choice.collecting import DATA
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,33 @@ class Task:
     """Env steps of each evaluation, shape (evaluations,)."""
     evaluations: Floats
     """Mean return of the greedy episodes of each evaluation."""
+
+    @property
+    def num_env_steps_each(self) -> int:
+        """The env steps of each training."""
+        return int(self.num_env_steps.max())
+
+    def iterations(self) -> list[list[list[IterationRecord]]]:
+        """Return the records of all iterations, by setting and seed; all episodes of one have their mean return."""
+        settings, seeds = self.shape
+        return [[self._training(setting, seed) for seed in range(seeds)] for setting in range(settings)]
+
+    def _training(self, setting: int, seed: int) -> list[IterationRecord]:
+        evaluated = dict(zip(self.evaluated_at.tolist(), self.evaluations[setting, seed].tolist(), strict=True))
+        columns = (self.num_env_steps, self.training_returns, self.iteration_returns, self.num_episodes)
+        rows = zip(*(column[setting, seed].tolist() for column in columns), strict=True)
+        return [
+            IterationRecord(
+                iteration=index + 1,
+                num_env_steps=int(steps),
+                num_episodes=0,
+                time_s=0.0,
+                training_return=training,
+                evaluation_return=evaluated.get(steps),
+                episode_returns=(mean,) * int(count),
+            )
+            for index, (steps, training, mean, count) in enumerate(rows)
+        ]
 
     @property
     def shape(self) -> tuple[int, int]:

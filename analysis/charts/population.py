@@ -1,0 +1,66 @@
+"""Chart of population based training: which values each trial had, over its env steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from analysis.charts.columns import column
+from analysis.charts.learning import ENV_STEPS
+from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots
+from analysis.charts.subject import Subject
+from analysis.plot_style import PALETTE
+from analysis.records import TrialRecord
+
+_MAX_PALE = 80
+_NUM_TOP = 3
+
+
+def make_charts(subject: Subject) -> list[Chart]:
+    """Return the chart of the schedules; none for a sweep whose trials keep their values."""
+    if not subject.is_population:
+        return []
+    title = "The population's schedules"
+    caption = "The value that each trial had over its env steps; it jumps where it went on from a better one's copy."
+    changed = {name for trial in subject.trials for change in trial.changes for name in change.after}
+    changing = [name for name in subject.varied_names if name in changed]
+    if not changing:
+        why = "No trial has gone on from another's copy yet, so every value is as it was at the start."
+        return [Chart("schedules", "learning", title, caption, None, why)]
+    top = [trial_id for setting in subject.settings[:_NUM_TOP] for trial_id in setting.trial_ids]
+    others = [trial for trial in subject.begun if trial.trial_id not in top]
+    notes = (f"{_MAX_PALE} of the {len(others):,} other trials are drawn.",) if len(others) > _MAX_PALE else ()
+    drawn = [trial for trial in subject.begun if trial.trial_id in top] + others[:_MAX_PALE]
+    plots = tuple(_plot(subject, name, drawn, top) for name in changing)
+    return [Chart("schedules", "learning", title, caption, Plots(plots), notes=notes)]
+
+
+def _plot(subject: Subject, name: str, trials: Sequence[TrialRecord], top: Sequence[str]) -> Plot:
+    steps = [schedule(trial, name) for trial in trials]
+    # The column of all values together gives them one scale, and one place to each category.
+    flat = column(name, [value for _, values in steps for value in values], subject.space)
+    places = iter(flat.values)
+    pale_x: list[Number] = []
+    pale_y: list[Number] = []
+    lines = []
+    for trial, (at, values) in zip(trials, steps, strict=True):
+        found = [next(places) for _ in values]
+        if trial.trial_id in top:
+            color = f"series-{top.index(trial.trial_id) % len(PALETTE)}"
+            lines.append(Line(trial.trial_id, color, tuple(at), tuple(found), is_stepped=True))
+        else:
+            pale_x += [*at, None]
+            pale_y += [*found, None]
+    if pale_x:
+        lines.insert(0, Line("other trials", "muted", tuple(pale_x), tuple(pale_y), look="pale", is_stepped=True))
+    return Plot(Axis(ENV_STEPS, low=0), flat.axis, tuple(lines))
+
+
+def schedule(trial: TrialRecord, name: str) -> tuple[list[int], list[object]]:
+    """Return the env steps at which a trial began to have each value of a hyperparameter, and those values.
+
+    The last value is given again at the trial's end.
+    """
+    steps: list[int] = [0, *(change.num_env_steps for change in trial.changes)]
+    values = [*(change.before.get(name) for change in trial.changes), trial.point.get(name)]
+    end = max(trial.num_env_steps, steps[-1])
+    return [*steps, end], [*values, values[-1]]

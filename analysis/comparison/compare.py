@@ -1,0 +1,167 @@
+"""Compare sweeps or settings: what can be compared, on which scale, and what a reader has to know of it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import string
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.comparison.entries import Entry, Wanted, judged_alike, make_entry
+from analysis.comparison.pairs import Pair, make_pair
+from analysis.records import FINISHED, Objective, TrialRecord
+from analysis.wording import counted
+
+MAX_ENTRIES = len(string.ascii_uppercase)
+_MAX_ALL_PAIRS = 4
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Sweeps or settings side by side."""
+
+    entries: tuple[Entry, ...]
+    """In the order in which they were named."""
+    pairs: tuple[Pair, ...]
+    """All pairs of up to four entries, else the one with the highest mean with each other; none if not comparable."""
+    objective: Objective
+    """What all of them are judged by."""
+    not_comparable: tuple[str, ...]
+    """Why their scores are on no common scale; empty if they are."""
+    notes: tuple[str, ...]
+    """What has to be known to read the numbers."""
+
+
+def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Comparison:
+    """Compare sweeps, or settings of them.
+
+    Args:
+        wanted: At least two.
+        objective: What all are judged by; None: what they say, or `final` if they don't agree.
+    """
+    notes: list[str] = []
+    thresholds = {item.data.threshold for item in wanted}
+    threshold = thresholds.pop() if len(thresholds) == 1 else None
+    if thresholds:
+        notes.append("They have other thresholds, so it is not said how many seeds solved the environment.")
+    chosen = objective or _objective(wanted, threshold, notes)
+    ready = {
+        letter: judged_alike(item, chosen, threshold)
+        for letter, item in zip(string.ascii_uppercase, wanted, strict=False)
+    }
+    entries = tuple(make_entry(item, letter) for letter, item in ready.items())
+    reasons = _not_comparable(wanted, entries)
+    pairs = () if reasons else tuple(make_pair(one, other, ready) for one, other in _pairs(entries))
+    notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries)]
+    return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes))
+
+
+def _objective(wanted: Sequence[Wanted], threshold: float | None, notes: list[str]) -> Objective:
+    objectives = list(dict.fromkeys(item.data.objective for item in wanted))
+    if len(objectives) > 1:
+        named = ", ".join(f"{item.name} by {item.data.objective}" for item in wanted)
+        notes.append(f"Their sweep files judge them differently ({named}): here all are judged by final.")
+        return "final"
+    if objectives[0] == "steps_to_threshold" and threshold is None:
+        notes.append("They share no threshold, so they are judged by final, not by the env steps to it.")
+        return "final"
+    return objectives[0]
+
+
+def _pairs(entries: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
+    if len(entries) <= _MAX_ALL_PAIRS:
+        return list(itertools.combinations(entries, 2))
+    leader = max(entries, key=lambda entry: -float("inf") if entry.mean is None else entry.mean)
+    return [(leader, entry) for entry in entries if entry is not leader]
+
+
+def _not_comparable(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
+    """Return why returns can't be compared: they are of different environments."""
+    first = entries[0]
+    reasons = []
+    for item, entry in zip(wanted[1:], entries[1:], strict=True):
+        if entry.env_id != first.env_id:
+            reasons.append(
+                f"{first.letter} is on {first.env_id}, {entry.letter} on {entry.env_id}: returns of different "
+                "environments are on different scales."
+            )
+        elif _env_of(item) != _env_of(wanted[0]):
+            reasons.append(
+                f"{first.letter} and {entry.letter} give {first.env_id} different arguments "
+                f"({_env_of(wanted[0])} and {_env_of(item)}), which may change its returns."
+            )
+    return reasons
+
+
+def _env_of(item: Wanted) -> dict[str, Any]:
+    """Return the arguments of an environment; what is made of its observations doesn't change returns."""
+    env = item.sweep.spec.get("env")
+    return dict(env.get("args") or {}) if isinstance(env, dict) else {}
+
+
+def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
+    notes = []
+    told: set[str] = set()
+    for item, entry in zip(wanted, entries, strict=True):
+        trials = item.data.trials
+        left = sum(trial.status not in FINISHED for trial in trials)
+        if left and entry.sweep not in told:
+            notes.append(
+                f"Sweep {entry.sweep} is {item.sweep.state}: {len(trials) - left} of {counted(len(trials), 'trial')} "
+                "have ended, and the numbers are those so far."
+            )
+        told.add(entry.sweep)
+        if entry.is_sweep and entry.scores and entry.num_settings > 1:
+            seeds = "one seed" if len(entry.scores) == 1 else f"{len(entry.scores)} seeds"
+            notes.append(
+                f"{entry.letter} leads {entry.num_settings} settings by the {seeds} that its mean is of: fresh seeds "
+                "would likely score less."
+            )
+    return notes
+
+
+def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
+    notes = _same_trainings(wanted, entries)
+    budgets = {entry.letter: item.data.num_env_steps for item, entry in zip(wanted, entries, strict=True)}
+    if len(set(budgets.values())) > 1:
+        told = ", ".join(f"{letter} {steps:,}" for letter, steps in budgets.items())
+        notes.append(f"Trials may take different numbers of env steps: {told}.")
+    versions = [item.sweep.versions for item in wanted]
+    other = sorted(
+        {name for known in versions for name in known if any(each.get(name) != known[name] for each in versions)}
+    )
+    if other:
+        told = "; ".join(
+            f"{name} {', '.join(str(known.get(name, 'not recorded')) for known in versions)}" for name in other
+        )
+        notes.append(f"They ran with different versions: {told}.")
+    if any(entry.num_failed for entry in entries):
+        notes.append("A failed seed counts as the worst trial of its sweep.")
+    return notes
+
+
+def _same_trainings(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
+    """Say where two sweeps did the same training twice, which is no independent evidence."""
+    notes = []
+    for one, other in itertools.combinations(range(len(wanted)), 2):
+        pair = (wanted[one], wanted[other])
+        if entries[one].sweep == entries[other].sweep or _not_comparable(pair, (entries[one], entries[other])):
+            continue
+        ours, theirs = ({_training(trial) for trial in _counted(item)} for item in pair)
+        if same := len(ours & theirs):
+            notes.append(
+                f"{entries[one].letter} and {entries[other].letter} have {counted(same, 'training')} with the same "
+                "hyperparameters and the same training seed: on one machine these are the same numbers twice, and the "
+                "intervals take them for independent ones."
+            )
+    return notes
+
+
+def _counted(item: Wanted) -> list[TrialRecord]:
+    return [trial for trial in item.data.trials if item.point_index in (None, trial.point_index)]
+
+
+def _training(trial: TrialRecord) -> str:
+    return json.dumps([trial.engine, trial.seed, trial.hyperparams], sort_keys=True, default=str)

@@ -1,0 +1,191 @@
+"""What is compared: a sweep by its leading setting, or one setting; with its scores over seeds and its cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from analysis.core_seconds import core_seconds
+from analysis.exports.frames import SweepData, num_solved, ranked_settings
+from analysis.objectives import SettingScores
+from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
+from analysis.selection import error_summary
+from analysis.statistics import iqm, moderated_means, seed_intervals, steps_to_threshold
+from analysis.tables import env_steps_to
+from analysis.wording import counted
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A sweep that is to be compared, or one of its settings."""
+
+    name: str
+    """As it is shown: `ppo`, or `ppo/t0003`."""
+    sweep: SweepRecord
+    data: SweepData
+    cores: float
+    """Cores of a process that trains."""
+    point_index: int | None = None
+    """The setting; None: the sweep, by its leading one."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One of the things compared; numbers that are not known are None."""
+
+    letter: str
+    """A, B, ..."""
+    name: str
+    sweep: str
+    is_sweep: bool
+    """Whether it is a whole sweep, which is compared by its leading setting."""
+    algorithm: str
+    env_id: str
+    objective: Objective
+    point_index: int | None
+    point: dict[str, Any]
+    trial_ids: tuple[str, ...]
+    scores: tuple[float, ...]
+    """One a training seed, higher is better; a failed seed has the worst score of its sweep."""
+    num_failed: int
+    num_solved: int | None
+    mean: float | None
+    lower: float | None
+    """The 95 % interval of the mean over training seeds; None: no setting of the sweep has two seeds."""
+    upper: float | None
+    iqm: float | None
+    standard_error: float | None
+    """Of the mean, moderated over the settings of the sweep."""
+    df: float | None
+    """Degrees of freedom of that."""
+    threshold: float | None
+    median_env_steps: float | None
+    """Env steps by which half of the seeds had reached the threshold in training; None: they did not."""
+    median_lower: float | None
+    median_upper: float | None
+    num_settings: int
+    """Settings of the sweep that have been judged."""
+    num_trials: int
+    """Trials whose cost is told: of the sweep, or of the setting."""
+    num_env_steps: int
+    core_seconds: float | None
+    wall_s: float | None
+    """Seconds that the sweep ran; None of a setting."""
+    why_none: str = ""
+    """Why there are no scores; empty if there are."""
+
+
+def judged_alike(wanted: Wanted, objective: Objective, threshold: float | None) -> Wanted:
+    """Return what is compared, judged by this objective and solved at this return."""
+    return replace(wanted, data=replace(wanted.data, objective=objective, threshold=threshold))
+
+
+def make_entry(wanted: Wanted, letter: str) -> Entry:
+    """Return the scores and the cost of a sweep or a setting.
+
+    Args:
+        wanted: What it is of; its `data` says what it is judged by, and which return solves the env.
+        letter: What it is called.
+    """
+    data, threshold = wanted.data, wanted.data.threshold
+    ranking = ranked_settings(data)
+    chosen = _chosen(wanted, ranking)
+    mine = [trial for trial in data.trials if wanted.point_index in (None, trial.point_index)]
+    costs = core_seconds(data.trials, wanted.cores)
+    known = [costs[trial.trial_id] for trial in mine if trial.trial_id in costs]
+    env = wanted.sweep.spec.get("env")
+    entry = Entry(
+        letter=letter,
+        name=wanted.name,
+        sweep=wanted.sweep.name,
+        is_sweep=wanted.point_index is None,
+        algorithm=str(wanted.sweep.spec.get("algorithm", "?")),
+        env_id=str(env.get("id", "?")) if isinstance(env, dict) else str(env),
+        objective=data.objective,
+        point_index=wanted.point_index if chosen is None else chosen.point_index,
+        point=(mine[0].point if mine and wanted.point_index is not None else {}) if chosen is None else chosen.point,
+        trial_ids=() if chosen is None else chosen.trial_ids,
+        scores=() if chosen is None else chosen.scores,
+        num_failed=sum(trial.status == "failed" for trial in mine) if chosen is None else chosen.num_failed,
+        num_solved=None if chosen is None else num_solved(chosen, data),
+        mean=None,
+        lower=None,
+        upper=None,
+        iqm=None,
+        standard_error=None,
+        df=None,
+        threshold=threshold,
+        median_env_steps=None,
+        median_lower=None,
+        median_upper=None,
+        num_settings=len(ranking),
+        num_trials=len(mine),
+        num_env_steps=sum(trial.num_env_steps for trial in mine),
+        core_seconds=math.fsum(known) if known else None,
+        wall_s=wanted.sweep.run_time_s if wanted.point_index is None else None,
+        why_none="" if chosen is not None else _why_none(wanted, mine),
+    )
+    if chosen is None:
+        return entry
+    return replace(entry, **_scored(chosen, ranking), **_median(chosen, data))
+
+
+def _chosen(wanted: Wanted, ranking: Sequence[SettingScores]) -> SettingScores | None:
+    if wanted.point_index is None:
+        return next(iter(ranking), None)
+    return next((item for item in ranking if item.point_index == wanted.point_index), None)
+
+
+def _why_none(wanted: Wanted, mine: Sequence[TrialRecord]) -> str:
+    """Return why a sweep or a setting has no scores."""
+    if not wanted.data.has_settings:
+        return "a population, whose trials change their values while they train: none has a setting"
+    if wanted.data.objective == "steps_to_threshold" and wanted.data.threshold is None:
+        return "it is judged by the env steps to a threshold, and its environment has none"
+    if not mine:
+        return "it has no trials yet"
+    failed = [trial for trial in mine if trial.status == "failed"]
+    if len(failed) == len(mine):
+        return f"all of its {counted(len(mine), 'trial')} failed, the first: {error_summary(failed[0].error)}"
+    ended = [trial for trial in mine if trial.status in FINISHED and trial.status != "failed"]
+    if not ended:
+        return f"none of its {counted(len(mine), 'trial')} has ended yet"
+    return "none of its trials has a whole episode or an evaluation with a finite return"
+
+
+def _scored(chosen: SettingScores, ranking: Sequence[SettingScores]) -> dict[str, Any]:
+    """Return the mean over seeds, and its interval and error as far as they are known."""
+    scores = [item.scores for item in ranking]
+    index = list(ranking).index(chosen)
+    found = {"mean": chosen.mean, "iqm": iqm(chosen.scores)}
+    if max(map(len, scores)) < 2:
+        return found
+    try:
+        interval, fit = seed_intervals(scores)[index], moderated_means(scores)
+    except ValueError:  # so large that their squares are not finite
+        return found
+    return {
+        **found,
+        "lower": interval.lower,
+        "upper": interval.upper,
+        "standard_error": float(fit.standard_errors[index]),
+        "df": float(fit.dfs[index]),
+    }
+
+
+def _median(chosen: SettingScores, data: SweepData) -> dict[str, Any]:
+    """Return the median of the env steps to the threshold; seeds that did not reach it are censored."""
+    if data.threshold is None:
+        return {}
+    rows = [data.results.get(trial_id, ()) for trial_id in chosen.trial_ids]
+    reached = [env_steps_to(data.threshold, items) for items in rows]
+    curve = steps_to_threshold(reached, [items[-1].num_env_steps if items else 0 for items in rows])
+    lower, upper = curve.median_interval
+    several = len(rows) > 1
+    return {
+        "median_env_steps": curve.median,
+        "median_lower": lower if several else None,
+        "median_upper": upper if several else None,
+    }

@@ -1,0 +1,155 @@
+"""Two of the things compared: whether one is better, by how much, and how sure that is."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from analysis.comparison.entries import Entry, Wanted
+from analysis.exports.frames import ranked_settings
+from analysis.objectives import SettingScores
+from analysis.statistics import Estimate, iqm, iqm_with_ci, probability_of_improvement, t_quantile
+from analysis.wording import counted
+from policies import random_streams
+
+
+@dataclass(frozen=True)
+class Shared:
+    """The settings that two sweeps have in common, each a stratum."""
+
+    num_settings: int
+    probability: Estimate
+    """P(a training of the left sweep scores more than one of the right, with the same setting)."""
+    left_iqm: Estimate
+    """Interquartile mean of all trainings with these settings; its ends are NaN where each has one seed."""
+    right_iqm: Estimate
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two entries, by their letters."""
+
+    left: str
+    right: str
+    probability: Estimate | None
+    """P(a training with the left one's setting scores more than one with the right one's); ties count half."""
+    why_no_probability: str
+    difference: Estimate | None
+    """The left mean less the right one, over training seeds."""
+    why_no_difference: str
+    shared: Shared | None
+    """None: they are not two sweeps, or have no setting in common."""
+    why_none_shared: str
+
+    @property
+    def verdict(self) -> str:
+        """Which of them is better, as far as the data say."""
+        if self.difference is None:
+            return f"Whether {self.left} or {self.right} is better can't be said: {self.why_no_difference}."
+        if self.difference.lower > 0:
+            return f"{self.left} is better than {self.right}."
+        if self.difference.upper < 0:
+            return f"{self.right} is better than {self.left}."
+        return f"The data can't tell {self.left} from {self.right}."
+
+
+def make_pair(left: Entry, right: Entry, wanted: Mapping[str, Wanted], *, level: float = 0.95) -> Pair:
+    """Compare two entries, whose scores are on one scale.
+
+    Args:
+        left: One of them.
+        right: The other.
+        wanted: What they were made of, by letter.
+        level: That of all intervals.
+    """
+    probability, why_no_probability = _probability(left, right, level)
+    difference, why_no_difference = mean_difference(left, right, level)
+    shared, why_none_shared = None, ""
+    if left.is_sweep and right.is_sweep:
+        shared, why_none_shared = _shared(wanted[left.letter], wanted[right.letter], level)
+    return Pair(
+        left.letter, right.letter, probability, why_no_probability, difference, why_no_difference, shared,
+        why_none_shared,
+    )  # fmt: skip
+
+
+def _without_scores(left: Entry, right: Entry) -> str:
+    missing = [entry.letter for entry in (left, right) if not entry.scores]
+    return f"{' and '.join(missing)} {'has' if len(missing) == 1 else 'have'} no scores" if missing else ""
+
+
+def _probability(left: Entry, right: Entry, level: float) -> tuple[Estimate | None, str]:
+    if why := _without_scores(left, right):
+        return None, why
+    single = [entry.letter for entry in (left, right) if len(entry.scores) < 2]
+    if single:
+        return None, f"{' and '.join(single)} {'has' if len(single) == 1 else 'have'} one seed"
+    return probability_of_improvement([left.scores], [right.scores], level=level), ""
+
+
+def mean_difference(left: Entry, right: Entry, level: float = 0.95) -> tuple[Estimate | None, str]:
+    """Return the difference of two means over training seeds with its interval, or why there is none.
+
+    The errors of the means are moderated over the settings of each sweep, as in `statistics.seed_intervals`, and the
+    degrees of freedom are those of Welch and Satterthwaite. Of two sweeps with one setting each it is Welch's interval.
+
+    Source:
+        Welch 1947, "The Generalization of Student's Problem when Several Different Population Variances are Involved";
+        Smyth 2004 for the variances, see `statistics.moderated_means`.
+    """
+    if why := _without_scores(left, right):
+        return None, why
+    errors, means = [], []
+    for entry in (left, right):
+        if entry.standard_error is None or entry.df is None or entry.mean is None:
+            several = len(entry.scores) > 1
+            return None, (
+                f"the scores of {entry.letter} are too large to be squared"
+                if several
+                else f"{entry.letter} has one seed a setting, so that nothing is known of how its seeds differ "
+                f"(`tune-jobs replicate {entry.sweep}` trains more)"
+            )
+        errors.append((entry.standard_error**2, entry.df))
+        means.append(entry.mean)
+    gap = means[0] - means[1]
+    total = sum(square for square, _ in errors)
+    num_seeds = len(left.scores) + len(right.scores)
+    if total == 0.0:
+        return None, "no two seeds of either differ, so nothing is known of how much they may"
+    df = total**2 / sum(square**2 / df for square, df in errors)
+    half = t_quantile((1.0 + level) / 2.0, max(1.0, df)) * math.sqrt(total)
+    return Estimate(gap, gap - half, gap + half, num_seeds), ""
+
+
+def _shared(left: Wanted, right: Wanted, level: float) -> tuple[Shared | None, str]:
+    """Compare two sweeps within the settings that both have trained, or say why that can't be done."""
+    ours, theirs = ({_key(item): item for item in ranked_settings(each.data)} for each in (left, right))
+    common = [key for key in ours if key in theirs]
+    if not ours or not theirs:
+        return None, ""
+    if not common:
+        return None, (
+            f"none of the {counted(len(ours), 'setting')} of {left.name} is among the "
+            f"{counted(len(theirs), 'setting')} of {right.name}, so only the leading ones are compared"
+        )
+    left_scores, right_scores = [ours[key].scores for key in common], [theirs[key].scores for key in common]
+    return Shared(
+        num_settings=len(common),
+        probability=probability_of_improvement(left_scores, right_scores, level=level),
+        left_iqm=_iqm(left_scores, level),
+        right_iqm=_iqm(right_scores, level),
+    ), ""
+
+
+def _iqm(tasks: list[tuple[float, ...]], level: float) -> Estimate:
+    if max(map(len, tasks)) > 1:
+        return iqm_with_ci(tasks, rng=random_streams.fixed(), level=level)
+    scores = [score for task in tasks for score in task]
+    return Estimate(iqm(scores), math.nan, math.nan, len(scores), "one seed a setting: no interval")
+
+
+def _key(item: SettingScores) -> str:
+    """Return a setting as text; values of other types differ, though 1 == True in Python."""
+    return json.dumps(item.point, sort_keys=True, default=str)

@@ -1,0 +1,234 @@
+"""A figure for a paper: how the leading settings of one sweep or several learn, with bands over training seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.exports.frames import SweepData, ranked_settings
+from analysis.objectives import SettingScores
+from analysis.plot_style import ACCENT, GRID, PALETTE, drawable, escape, new_figure, steps_axis, style_axes
+from analysis.statistics import seed_intervals
+from analysis.tables import cell_value
+from analysis.wording import counted, short_text
+from policies.errors import CannotRunError, NotFoundError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Returns = Literal["evaluation", "training"]
+"""Which returns a curve is of: greedy evaluations, or the mean of the last 100 training episodes."""
+COLUMN_WIDTH = (3.4, 2.5)
+"""The size of a figure in one column of a paper with two, inches."""
+FORMATS = ("pdf", "svg", "png")
+_NUM_POINTS = 120
+_FONT_SIZE = 8.0
+_AXES: dict[Returns, str] = {
+    "evaluation": "evaluation return",
+    "training": "training return, mean of 100 episodes",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The learning curve of a setting over its training seeds."""
+
+    label: str
+    num_seeds: int
+    num_env_steps: NDArray[np.float64]
+    """Shape (T,)."""
+    mean: NDArray[np.float64]
+    """Over the seeds, shape (T,)."""
+    lower: NDArray[np.float64] | None
+    """The lower end of the pointwise 95 % interval over training seeds, shape (T,); None: one seed a setting."""
+    upper: NDArray[np.float64] | None
+    least: float
+    """The lowest return of any of the seeds."""
+    most: float
+    """The highest."""
+    first_end: float
+    """Env steps at which the first of the seeds had ended; from there on it is held at its last value."""
+
+
+def setting_curves(data: SweepData, *, top: int, returns: Returns = "evaluation") -> list[Curve]:
+    """Return the learning curves of the leading settings of a sweep, best first.
+
+    Returns are interpolated between those that are known. A seed that ended before others of the figure, because it
+    reached its goal or failed, is held at its last value: to leave it out would make the mean that of the others.
+    The intervals are `statistics.seed_intervals` over all settings shown, at each number of env steps by itself.
+
+    Args:
+        data: The sweep.
+        top: How many settings.
+        returns: Which returns.
+    """
+    return curves_of(data, ranked_settings(data)[:top], returns=returns)
+
+
+def curves_of(data: SweepData, settings: Sequence[SettingScores], *, returns: Returns = "evaluation") -> list[Curve]:
+    """Return the learning curves of settings of one sweep; those without any such return are left out."""
+    known = []
+    for item in settings:
+        seeds = [curve for trial_id in item.trial_ids if (curve := _known(data, trial_id, returns))[0].size]
+        if seeds:
+            known.append((item, seeds))
+    if not known:
+        return []
+    start = max(steps[0] for _, seeds in known for steps, _ in seeds)
+    stop = max(steps[-1] for _, seeds in known for steps, _ in seeds)
+    grid = np.linspace(min(start, stop), stop, _NUM_POINTS if stop > start else 1)
+    values = [np.stack([np.interp(grid, *seed) for seed in seeds]) for _, seeds in known]
+    labels = _labels([item for item, _ in known])
+    bands = _bands(values)
+    return [
+        Curve(
+            label=label,
+            num_seeds=len(seeds),
+            num_env_steps=grid,
+            mean=own.mean(axis=0),
+            lower=None if band is None else band[0],
+            upper=None if band is None else band[1],
+            least=float(own.min()),
+            most=float(own.max()),
+            first_end=min(steps[-1] for steps, _ in seeds),
+        )
+        for label, (_, seeds), own, band in zip(labels, known, values, bands, strict=True)
+    ]
+
+
+def learning_figure(
+    sweeps: Sequence[tuple[str, SweepData]],
+    *,
+    top: int = 3,
+    returns: Returns = "evaluation",
+    size: tuple[float, float] = COLUMN_WIDTH,
+) -> Figure:
+    """Draw the learning curves of the leading settings of one sweep or several, with bands over training seeds.
+
+    A curve is the mean over the seeds of a setting, its band the 95 % interval of that mean; with one seed a setting
+    there is no band. Curves are dashed from where the first of their seeds has ended.
+
+    Args:
+        sweeps: Name and data of each sweep; the name is part of labels if there are several.
+        top: How many settings of each.
+        returns: Which returns.
+        size: Width and height, inches.
+
+    Raises:
+        NotFoundError: No sweep has a setting with such returns.
+    """
+    curves = [(name, curve) for name, data in sweeps for curve in setting_curves(data, top=top, returns=returns)]
+    if not curves:
+        raise NotFoundError(
+            f"There is nothing to draw: no setting of {', '.join(name for name, _ in sweeps)} has "
+            f"{returns} returns of a trial that has ended.",
+            "Wait for the first trials to end; a population has no settings.",
+        )
+    figure = new_figure(size)
+    axes = figure.subplots()
+    for number, (name, curve) in enumerate(curves):
+        color = PALETTE[number % len(PALETTE)]
+        label = curve.label if len(sweeps) == 1 else f"{name}: {curve.label}" if top > 1 and curve.label else name
+        steps, mean = curve.num_env_steps, drawable(curve.mean)
+        # The dashes begin where the line ends, so that there is no gap.
+        whole = steps <= curve.first_end
+        after = np.flatnonzero(~whole)
+        seeds = counted(curve.num_seeds, "seed")
+        label = f"{label} ({seeds})" if label else seeds
+        axes.plot(steps[whole], mean[whole], color=color, linewidth=1.2, label=escape(label))
+        if after.size:
+            rest = slice(max(0, int(after[0]) - 1), None)
+            axes.plot(steps[rest], mean[rest], color=color, linewidth=1.0, linestyle=(0, (3, 2)))
+        if curve.lower is not None and curve.upper is not None:
+            low, high = drawable(curve.lower), drawable(curve.upper)
+            axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+    style_axes(axes, xlabel="env steps", ylabel=_AXES[returns])
+    axes.grid(visible=True, color=GRID, linewidth=0.5)
+    steps_axis(axes)
+    goals = {data.threshold for _, data in sweeps}
+    goal = goals.pop() if len(goals) == 1 else None
+    if goal is not None:
+        height = float(drawable([goal])[0])
+        axes.axhline(height, color=ACCENT, linewidth=0.9, linestyle=(0, (5, 3)), zorder=1.5, label=f"goal {goal:g}")
+    # A band of few seeds goes beyond any return there can be, so it must not set the scale.
+    _fit_returns(axes, [curve for _, curve in curves], goal)
+    for text in (axes.xaxis.label, axes.yaxis.label, *axes.get_xticklabels(), *axes.get_yticklabels()):
+        text.set_fontsize(_FONT_SIZE)
+    handles, told = axes.get_legend_handles_labels()
+    figure.legend(handles, told, loc="outside upper left", frameon=False, fontsize=_FONT_SIZE - 1, ncols=1)
+    return figure
+
+
+def _fit_returns(axes: Axes, curves: Sequence[Curve], goal: float | None) -> None:
+    """Make the vertical axis one of the returns that seeds have, and of the goal."""
+    ends = [end for curve in curves for end in (curve.least, curve.most)] + ([] if goal is None else [goal])
+    low, high = (float(end) for end in drawable([min(ends), max(ends)]))
+    margin = 0.05 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)
+
+
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PDF, SVG or PNG, by the suffix of the path.
+
+    Letters stay letters in PDF and SVG (Type 42 fonts, which journals ask for); a PNG has 300 dots an inch. The same
+    figure gives the same file.
+
+    Raises:
+        CannotRunError: It cannot be written.
+    """
+    import matplotlib as mpl
+
+    kind = path.suffix.lower().removeprefix(".")
+    dates = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with mpl.rc_context({"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": path.stem}):
+            figure.savefig(path, format=kind, dpi=300, metadata=dates.get(kind))
+    except OSError as error:
+        raise CannotRunError(
+            f"{path} cannot be written: {error.strerror or error}.", "Give another path, or free space on its disk."
+        ) from error
+    return path
+
+
+def _known(data: SweepData, trial_id: str, returns: Returns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return env steps and returns of one trial, where it has any."""
+    pairs = [
+        (item.num_env_steps, value)
+        for item in data.results.get(trial_id, ())
+        if (value := item.evaluation_return if returns == "evaluation" else item.training_return) is not None
+    ]
+    array = np.asarray(pairs, dtype=np.float64).reshape(-1, 2)
+    return array[:, 0], array[:, 1]
+
+
+def _bands(
+    values: Sequence[NDArray[np.float64]],
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]] | None]:
+    """Return the ends of the intervals of each setting, or None of those without one."""
+    if max(len(own) for own in values) < 2:
+        return [None] * len(values)
+    try:
+        columns = [seed_intervals([own[:, place] for own in values]) for place in range(values[0].shape[1])]
+    except ValueError:  # so large that their squares are not finite
+        return [None] * len(values)
+    return [
+        (np.array([column[index].lower for column in columns]), np.array([column[index].upper for column in columns]))
+        if len(own) > 1
+        else None
+        for index, own in enumerate(values)
+    ]
+
+
+def _labels(settings: Sequence[SettingScores]) -> list[str]:
+    """Return what tells settings apart: the values that are not the same in all of them, or all values of a single."""
+    names = list(dict.fromkeys(name for item in settings for name in item.point))
+    differing = [name for name in names if len({repr(cell_value(item.point.get(name))) for item in settings}) > 1]
+    shown = differing or names
+    return [", ".join(f"{name} {short_text(item.point.get(name))}" for name in shown) for item in settings]

@@ -1,0 +1,119 @@
+"""The score of each point of a sweep, all judged after the same training.
+
+The seeds of a point are one cluster: a point counts once, with its mean. A trial that failed, or showed nothing that
+can be scored, has the worst score of all. Where a scheduler ended trials early, all are judged at the env steps of the
+first one that it ended: the trials that it let go on are a choice of the better ones, in which what makes trials bad
+would not be seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.objectives import score_of
+from analysis.records import FINISHED, IterationRecord, Objective, SweepRecord, TrialRecord, finite_or_none
+from analysis.wording import counted
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The points of a sweep that have a score."""
+
+    objective: Objective
+    points: tuple[dict[str, Any], ...]
+    scores: tuple[float, ...]
+    """Mean over the seeds of each point, higher is better."""
+    num_trials: int
+    why_none: str = ""
+    """Why there are no scores; empty if there are."""
+    notes: tuple[str, ...] = ()
+    num_env_steps: int | None = None
+    """The env steps at which all trials are judged; None: at their ends."""
+
+
+def score_points(
+    sweep: SweepRecord,
+    trials: Sequence[TrialRecord],
+    results: Mapping[str, Sequence[IterationRecord]],
+    threshold: float | None,
+) -> Scored:
+    """Return the points of a sweep with their scores; the arguments are those of `what_mattered`."""
+    wish = _section(sweep, "objective")
+    objective: Objective = wish.get("type", "final")
+    given = finite_or_none(wish.get("threshold"))
+    goal = threshold if given is None else given
+    ended = [trial for trial in sorted(trials, key=lambda item: item.index) if trial.status in FINISHED]
+    why_none = _why_none(sweep, trials, ended, objective, goal)
+    if why_none:
+        return Scored(objective, (), (), 0, why_none)
+    cut = [trial.num_env_steps for trial in ended if trial.status == "stopped"]
+    steps = min(cut) if cut else None
+    whole = int(_section(sweep, "stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
+    shown: dict[str, float | None] = {}
+    for trial in ended:
+        rows = [row for row in results.get(trial.trial_id, ()) if steps is None or row.num_env_steps <= steps]
+        score = None
+        if trial.status != "failed":
+            score = score_of(trial, rows, objective, num_env_steps=steps or whole, threshold=goal)
+        shown[trial.trial_id] = finite_or_none(score)
+    known = [score for score in shown.values() if score is not None]
+    if not known:
+        return Scored(objective, (), (), 0, "No trial showed a score.")
+    worst = min(known)
+    seeds: defaultdict[int, list[float]] = defaultdict(list)
+    values: dict[int, dict[str, Any]] = {}
+    for trial in ended:
+        score = shown[trial.trial_id]
+        seeds[trial.point_index].append(worst if score is None else score)
+        values[trial.point_index] = trial.point
+    notes = []
+    if lost := len(ended) - len(known):
+        notes.append(
+            f"{counted(lost, 'trial')} without a score counted as the worst, having failed or ended no episode."
+        )
+    if steps is not None:
+        notes.append(
+            f"The scheduler ended {len(cut):,} of {counted(len(ended), 'trial')} early. All are judged at {steps:,} "
+            "env steps, which each of them has done, so this is about the beginning of training."
+        )
+    if waiting := len(trials) - len(ended):
+        notes.append(f"Left out, as they have not ended: {counted(waiting, 'trial')}.")
+    return Scored(
+        objective,
+        tuple(values.values()),
+        # Divided first, as the sum of scores that are nearly too large for a float is too large.
+        tuple(math.fsum(score / len(scores) for score in scores) for scores in seeds.values()),
+        len(ended),
+        notes=tuple(notes),
+        num_env_steps=steps,
+    )
+
+
+def _why_none(
+    sweep: SweepRecord,
+    trials: Sequence[TrialRecord],
+    ended: Sequence[TrialRecord],
+    objective: Objective,
+    goal: float | None,
+) -> str:
+    if _section(sweep, "scheduler").get("type") == "pbt" or any(trial.changes for trial in trials):
+        return "Population based training changes values while a trial trains, so no value has a score of its own."
+    if objective == "steps_to_threshold" and goal is None:
+        return "The objective is steps_to_threshold, and the threshold is not known: set objective.threshold."
+    if not ended:
+        return "No trial has ended yet."
+    if all(trial.status == "failed" for trial in ended):
+        return "All trials failed."
+    return ""
+
+
+def _section(sweep: SweepRecord, name: str) -> Mapping[str, Any]:
+    """Return a section of the spec, which older versions don't have and nobody promises to be a mapping."""
+    found = sweep.spec.get(name)
+    if isinstance(found, str):
+        return {"type": found}
+    return found if isinstance(found, Mapping) else {}

@@ -1,0 +1,171 @@
+"""How sure it is which setting is best: the leading ones seed by seed, what can't be told apart, and env steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from analysis.page.scores import counts_env_steps, interval_of, score_means, score_text
+from analysis.page.source import Source
+from analysis.records import IterationRecord, SettingRecord, SettingsRecord, TrialRecord, finite_or_none
+from analysis.report_tables import Cell, Table, steps_table
+from analysis.statistics import tie_groups
+from analysis.strip_plot import Strip
+from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, point_names, steps_to_solve_frame
+from analysis.wording import NONE, number, short_text
+from policies import random_streams
+
+_ONE_SEED = (
+    "Each was trained with one seed: how much seeds differ is not known, so there are no intervals, and nothing says "
+    "that the first is the best."
+)
+_SEVERAL_SEEDS = (
+    "Intervals are over training seeds, and learn from all settings how much seeds differ. P(best) is the probability "
+    "that no other setting is better. Settings that share a letter can't be told apart."
+)
+_MAX_LABEL = 26
+"""A longer text of a setting is not written beside its dots; the table has it."""
+
+
+@dataclass(frozen=True)
+class HowSure:
+    """What the section shows."""
+
+    about: list[str]
+    """What the table is about, and what it can't say."""
+    settings_table: Table
+    fewest_env_steps: str
+    """Which hyperparameters solve the env in the fewest env steps; empty without a goal or trials."""
+    steps_table: Table
+
+
+def section(source: Source) -> HowSure:
+    """Return what the section shows."""
+    return HowSure(
+        about=_about(source),
+        settings_table=settings_table(source),
+        fewest_env_steps=fewest_env_steps(source.trials, source.results, source.goal),
+        steps_table=steps_table(source.trials, source.results, goal=source.goal),
+    )
+
+
+def strips(source: Source) -> list[Strip]:
+    """Return the leading settings for the figure; none where there is nothing to compare."""
+    settings = source.settings
+    if settings is None or settings.num_settings < 2:
+        return []
+    sign = -1.0 if counts_env_steps(settings) else 1.0
+    labels = [" · ".join(short_text(value) for value in item.point.values()) for item in settings.ranking]
+    fit = max(map(len, labels)) <= _MAX_LABEL
+    found = []
+    for rank, (item, label) in enumerate(zip(settings.ranking, labels, strict=True), start=1):
+        interval = None
+        if item.lower is not None and item.upper is not None:
+            low, high = sorted((sign * item.lower, sign * item.upper))
+            interval = (max(0.0, low) if sign < 0 else low, high)
+        scores = tuple(sign * score for score in item.scores)
+        name = f"{rank}.  {label}" if fit else f"{rank}."
+        found.append(Strip(name, scores, sign * item.score, interval, item.may_be_best))
+    return found
+
+
+def settings_table(source: Source) -> Table:
+    """Return the leading settings, best first; empty where there are not two, or none can be judged."""
+    settings = source.settings
+    if settings is None or settings.num_settings < 2:
+        return Table([], [])
+    names, letters = list(settings.best.point), _letters(source, settings)
+    several = settings.best.probability_best is not None
+    headings = ["rank", *names, "seeds"]
+    headings += ["solved"] if settings.threshold is not None else []
+    headings += [f"score {score_means(settings)}"]
+    headings += ["95 % interval over training seeds", "P(best)"] if several else []
+    headings += ["tie group"] if letters else []
+    rows = []
+    for rank, item in enumerate(settings.ranking, start=1):
+        cells = [Cell(rank, str(rank)), *(_value(item, name) for name in names)]
+        failed = f", {item.num_failed} failed" if item.num_failed else ""
+        cells += [Cell(len(item.scores), f"{len(item.scores)}{failed}")]
+        if settings.threshold is not None:
+            cells += [Cell(item.num_solved, NONE if item.num_solved is None else str(item.num_solved))]
+        cells += [Cell(item.score, score_text(settings, item.score))]
+        if several:
+            interval = interval_of(settings, item)
+            chance = item.probability_best
+            cells += [
+                Cell(interval, interval or NONE),
+                Cell(chance, NONE if chance is None else _percent(chance), "" if item.may_be_best else "pending"),
+            ]
+        if letters:
+            text = letters.get(item.point_index, NONE)
+            cells += [Cell(text, text)]
+        rows.append(cells)
+    return Table(headings, rows)
+
+
+def _about(source: Source) -> list[str]:
+    settings = source.settings
+    if settings is None or settings.num_settings < 2:
+        return []
+    listed = len(settings.ranking)
+    texts = [f"The first {listed} of {settings.num_settings:,} settings." if listed < settings.num_settings else ""]
+    texts += [_ONE_SEED if settings.best.probability_best is None else _SEVERAL_SEEDS]
+    if any(item.num_failed for item in settings.ranking):
+        texts += ["A seed that failed counts as the worst score of the sweep."]
+    return [text for text in texts if text]
+
+
+def _letters(source: Source, settings: SettingsRecord) -> dict[int, str]:
+    """Return the tie groups of each listed setting as letters, by its point; none where seeds say nothing.
+
+    Settings that share a letter are not told apart: a compact letter display (Piepho 2004, "An Algorithm for a
+    Letter-Based Representation of All-Pairwise Comparisons").
+    """
+    if settings.best.probability_best is None:
+        return {}
+    ranked = source.ranked
+    try:
+        groups = tie_groups([item.scores for item in ranked], rng=random_streams.fixed()).groups
+    except ValueError:  # scores so large that their squares are not finite, or no setting is left
+        return {}
+    listed = {item.point_index for item in settings.ranking}
+    shown = [points for group in groups if (points := {ranked[index].point_index for index in group} & listed)]
+    # Groups that differ in settings alone that are not listed are one here.
+    shown = [points for rank, points in enumerate(shown) if not any(points <= other for other in shown[:rank])]
+    letters: dict[int, str] = {}
+    for letter, points in zip("abcdefghijklmnopqrstuvwxyz", shown, strict=False):
+        for point in points:
+            letters[point] = letters.get(point, "") + letter
+    return letters
+
+
+def _value(item: SettingRecord, name: str) -> Cell:
+    value = cell_value(item.point.get(name))
+    return Cell(value, number(value))
+
+
+def _percent(probability: float) -> str:
+    return "< 1 %" if probability < 0.01 else "> 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"
+
+
+def fewest_env_steps(
+    trials: Sequence[TrialRecord], results: Mapping[str, Sequence[IterationRecord]], goal: float | None
+) -> str:
+    """Say which hyperparameters solve the env in the fewest env steps; empty without a goal or trials."""
+    if goal is None or not trials:
+        return ""
+    frame = steps_to_solve_frame(trials, results, threshold=goal)
+    solving = frame[frame["num_solved"] > 0]
+    over = f"a mean training return of {number(goal)} over {SOLVED_OVER_NUM_EPISODES} episodes"
+    if solving.empty:
+        return f"No trial reached {over}."
+    first = solving.iloc[0]
+    values = ", ".join(f"{name} {number(first[name])}" for name in point_names(trials))
+    who = f"{values} reaches" if values else "The sweep's one point reaches"
+    median, num_seeds = finite_or_none(float(first["median_num_env_steps"])), int(first["num_seeds"])
+    if median is None:
+        return (
+            f"{who} {over} with only {int(first['num_solved'])} of {num_seeds} seeds, and no point with more than half."
+        )
+    seeds = "one seed" if num_seeds == 1 else f"the median of {num_seeds} seeds"
+    return f"{who} {over} in the fewest env steps: {number(median)} ({seeds})."

@@ -1,0 +1,178 @@
+"""What to do next, to copy: commands, sweep files, and the setting as other libraries' programs."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from analysis.page.estimates import replicate_takes, takes
+from analysis.page.narrowed import narrowed_space
+from analysis.page.source import Source, point_text
+from analysis.records import SettingRecord
+from analysis.wording import counted
+
+if TYPE_CHECKING:
+    from policies.hyperparams import TrainedHyperparams
+
+_OF_THE_RUN = (
+    "about", "checkpoints", "confirm", "engine", "iteration_timeout_s", "max_retries", "name", "num_samples",
+    "resources", "scheduler", "search", "space",
+)  # fmt: skip
+"""Sections of a sweep file that say how it was searched and run, not what was trained."""
+_SEEDS_OF_A_SETTING = 5
+_LEAST_GOOD = 3
+
+
+@dataclass(frozen=True)
+class Step:
+    """Something to do."""
+
+    title: str
+    why: str
+    text: str
+    """What to copy."""
+    folded: bool = False
+    """Whether it is long, so that it is shown when asked for."""
+
+
+@dataclass(frozen=True)
+class NextSteps:
+    """What the section shows; without steps it isn't shown."""
+
+    steps: list[Step]
+
+
+def section(source: Source) -> NextSteps:
+    """Return what the section shows."""
+    return NextSteps([*_commands(source), *_narrowed(source), *_setting(source)])
+
+
+def _commands(source: Source) -> Iterator[Step]:
+    path, settings = shlex.quote(source.path), source.settings
+    if source.sweep.state in ("created", "interrupted"):
+        yield Step("Go on", "The sweep is not finished.", f"tune-jobs resume {path}")
+    if not source.is_trained or not source.trials:
+        return
+    if settings is not None and settings.num_settings > 1 and not source.is_population:
+        about = replicate_takes(source)
+        why = "Train the leading settings again with fresh seeds, until it is clear which is the best"
+        yield Step("Replicate", f"{why}{f': about {about}' if about else ''}.", f"tune-jobs replicate {path}")
+    samples = source.sweep.spec.get("num_samples")
+    space = source.sweep.spec.get("space")
+    if isinstance(samples, int) and isinstance(space, Mapping) and _is_random(space):
+        num_trials = sum(trial.seed_index == 0 for trial in source.trials)
+        about = takes(source, len(source.trials)) if num_trials else ""
+        why = f"As many samples of the space again{f': about {about}' if about else ''}."
+        yield Step("Extend", why, f"tune-jobs extend {path} --num-samples {samples}")
+
+
+def _is_random(space: Mapping[str, Any]) -> bool:
+    """Whether more samples give other points, which those of a grid alone don't."""
+    return any(isinstance(domain, Mapping) and "grid" not in domain for domain in space.values())
+
+
+def _narrowed(source: Source) -> Iterator[Step]:
+    spec, ranked = source.sweep.spec, source.ranked
+    space = spec.get("space")
+    if not isinstance(space, Mapping) or source.is_population or len(ranked) <= _LEAST_GOOD:
+        return
+    good = ranked[: max(_LEAST_GOOD, len(ranked) // 4)]
+    narrowed = narrowed_space(space, [item.point for item in good])
+    if narrowed == dict(space):
+        return
+    search = {name: _filled(spec[name]) for name in ("num_samples", "search", "scheduler") if spec.get(name)}
+    content = _trained(spec) | {"space": narrowed} | search | {"seed": _next_seed(spec)}
+    why = (
+        f"Where the best {len(good)} of {counted(len(ranked), 'setting')} lie and a little beyond, with another seed. "
+        "Save it and launch it by its file's name."
+    )
+    if max(len(item.scores) for item in ranked) == 1:
+        why += " With one seed a setting those are partly lucky ones."
+    yield Step("Search a narrower space", why, _yaml(content), folded=True)
+
+
+def _setting(source: Source) -> Iterator[Step]:
+    settings = source.settings
+    if settings is None or source.is_population or not source.is_trained:
+        return
+    spec, best = source.sweep.spec, settings.best
+    fixed = spec.get("hyperparams")
+    fixed = dict(fixed) if isinstance(fixed, Mapping) else {}
+    content = _trained(spec) | {
+        "hyperparams": fixed | best.point,
+        "seeds_per_point": _SEEDS_OF_A_SETTING,
+        "seed": _next_seed(spec),
+    }
+    which = point_text(best.point)
+    why = f"{which + ', ' if which else ''}with {_SEEDS_OF_A_SETTING} seeds that this sweep has not used."
+    yield Step("Train the setting by itself", why, _yaml(content), folded=True)
+    yield from _foreign(source, best)
+
+
+def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
+    from policies.foreign_code import rllib_program, stable_baselines3_program
+
+    values = _hyperparams(source, best)
+    if values is None:
+        return
+    spec = source.sweep.spec
+    env, stop = spec.get("env"), spec.get("stop")
+    env = env if isinstance(env, Mapping) else {"id": str(env)}
+    env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
+    cap = stop.get("num_env_steps") if isinstance(stop, Mapping) else None
+    changed = [name for name in ("frame_stack", "pixels", "failure_penalty") if env.get(name) not in (None, 1, False)]
+    note = f" The env's {', '.join(changed)} are left out." if changed else ""
+    if spec.get("rl_module"):
+        note += " The RLModule of your own is left out."
+    for title, program in (
+        (
+            "The setting in Stable-Baselines3",
+            stable_baselines3_program(
+                values, env_id=env_id, env_args=env_args, num_env_steps=cap if isinstance(cap, int) else 100_000
+            ),
+        ),
+        ("The setting in RLlib", rllib_program(values, env_id=env_id, env_args=env_args)),
+    ):
+        why = "The same values in its names; scores may differ, as implementations do." + note
+        yield Step(title, " ".join([why, *program.notes]), program.code, folded=True)
+
+
+def _hyperparams(source: Source, best: SettingRecord) -> TrainedHyperparams | None:
+    """Return all hyperparameters of a setting; None if they can't be read, as of another version."""
+    from policies.hyperparams import DQNHyperparams, PPOHyperparams
+
+    kinds: dict[str, type[TrainedHyperparams]] = {"ppo": PPOHyperparams, "dqn": DQNHyperparams}
+    kind = kinds.get(str(source.sweep.spec.get("algorithm")))
+    trial = next((trial for trial in source.trials if trial.trial_id in best.trial_ids), None)
+    if kind is None or trial is None:
+        return None
+    try:
+        return kind.model_validate(trial.hyperparams)
+    except ValueError:
+        return None
+
+
+def _trained(spec: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a sweep file says of the training: without what is empty, and without how it was searched and run."""
+    content = {name: _filled(value) for name, value in spec.items() if name not in _OF_THE_RUN}
+    return {name: value for name, value in content.items() if value not in (None, {})}
+
+
+def _filled(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        return value
+    filled = {name: _filled(item) for name, item in value.items()}
+    return {name: item for name, item in filled.items() if item not in (None, {})}
+
+
+def _next_seed(spec: Mapping[str, Any]) -> int:
+    seed = spec.get("seed")
+    return seed + 1 if isinstance(seed, int) else 1
+
+
+def _yaml(content: Mapping[str, Any]) -> str:
+    import yaml
+
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, default_flow_style=None).rstrip()

@@ -1,0 +1,134 @@
+"""How to repeat a sweep: the command and its file, every hyperparameter, versions, CPU and seeds."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.page.source import Source
+from analysis.records import SweepRecord
+from analysis.report_tables import Cell, Table
+from analysis.tables import cell_value
+from analysis.wording import NONE, duration, moment, number, seed_range
+
+_MAX_CPUS = 4
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """What the section shows."""
+
+    facts: list[tuple[str, str]]
+    spec_yaml: str
+    """The resolved sweep file."""
+    command: str
+    reproduce: str
+    """The command that runs one trial again and compares; empty: no trial has ended."""
+    hyperparams: Table
+
+
+def section(source: Source) -> Repeat:
+    """Return what the section shows."""
+    import yaml
+
+    spec = yaml.safe_dump(source.sweep.spec, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return Repeat(
+        facts=[*facts(source.sweep), *_machines(source)],
+        spec_yaml=spec,
+        command=f"tune-jobs launch {shlex.quote(f'{source.sweep.name}.yaml')} --name {shlex.quote(_again(source))}",
+        reproduce=_reproduce(source),
+        hyperparams=hyperparam_table(source.sweep),
+    )
+
+
+def facts(sweep: SweepRecord) -> list[tuple[str, str]]:
+    """Return when, with what and on which seeds the sweep ran."""
+    rows = [
+        ("started", moment(sweep.started_at)),
+        ("ended", moment(sweep.ended_at)),
+        ("time in all", duration(sweep.run_time_s)),
+        ("sweep seed", str(sweep.spec.get("seed", NONE))),
+        ("training seeds", "of each trial, in the table above: they follow from the sweep seed"),
+        ("evaluation seeds", seed_range(sweep.evaluation_seeds)),
+        ("confirmation seeds", seed_range(sweep.confirmation_seeds)),
+        ("address", sweep.address or "this machine"),
+        ("git commit", sweep.git_commit or NONE),
+    ]
+    return rows + sorted(sweep.versions.items())
+
+
+def hyperparam_table(sweep: SweepRecord) -> Table:
+    """Return every hyperparameter of the algorithm: what it was in the sweep, its default, and other names for it."""
+    from policies.foreign_names import FOREIGN_NAMES, LIBRARIES, names_for
+    from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+
+    algorithm = str(sweep.spec.get("algorithm"))
+    # Found by comparison, as records are not trusted to name an algorithm that there is.
+    known = next((name for name in FOREIGN_NAMES if name == algorithm), None)
+    if known is None:
+        return Table([], [])
+    space, fixed = (_mapping(sweep.spec.get(name)) for name in ("space", "hyperparams"))
+    rows = []
+    for name, field in HYPERPARAMS_BY_ALGORITHM[known].model_fields.items():
+        default = _text(field.get_default(call_default_factory=True))
+        if name in space:
+            text, kind = f"searched, {_domain(space[name])}", "searched"
+        elif name in fixed:
+            text, kind = _text(fixed[name]), ""
+        else:
+            text, kind = default, "pending"
+        others = [
+            ", ".join(other.name for other in names_for(known, name) if other.library == library) or NONE
+            for library in LIBRARIES
+        ]
+        cells = [Cell(name, name), Cell(text, text, f"wide {kind}".strip()), Cell(default, default)]
+        rows.append([*cells, *(Cell(other, other, "wide") for other in others)])
+    return Table(["hyperparameter", "in this sweep", "default", *LIBRARIES.values()], rows)
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return number(cell_value(value))
+
+
+def _domain(domain: Any) -> str:
+    """Return a domain in words: "loguniform from 1e-05 to 0.01", "grid of 32, 64"."""
+    if not isinstance(domain, Mapping) or len(domain) != 1:
+        return str(domain)
+    kind, ends = next(iter(domain.items()))
+    if not isinstance(ends, list | tuple):
+        return f"{kind} {ends}"
+    texts = [_text(value) for value in ends]
+    if kind in ("grid", "choice"):
+        return f"{kind} of {', '.join(texts)}"
+    step = f" in steps of {texts[2]}" if len(texts) == 3 else ""
+    return f"{kind} from {texts[0]} to {' '.join(texts[1:2])}{step}"
+
+
+def _machines(source: Source) -> list[tuple[str, str]]:
+    """Return the CPUs that trials were trained on, on which the rounding of numbers depends."""
+    cpus: dict[str, None] = {}
+    for trial in source.trials:
+        # Records of older versions don't say it.
+        if "cpu" in trial.ran_with:
+            cpus[", ".join(filter(None, (trial.ran_with["cpu"], trial.ran_with.get("instructions"))))] = None
+    shown = "; ".join(list(cpus)[:_MAX_CPUS])
+    more = f" and {len(cpus) - _MAX_CPUS} others" if len(cpus) > _MAX_CPUS else ""
+    return [("CPU", f"{shown}{more}" if cpus else "not recorded; other CPUs round differently")]
+
+
+def _reproduce(source: Source) -> str:
+    ended = [trial.trial_id for trial in source.trials if trial.status == "completed"]
+    which = source.winner or next(iter(ended), None)
+    return "" if which is None else f"tune-jobs reproduce {shlex.quote(f'{source.path}/{which}')}"
+
+
+def _again(source: Source) -> str:
+    return f"{source.sweep.name}-again"

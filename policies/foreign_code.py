@@ -1,0 +1,267 @@
+"""A setting as a program for Stable-Baselines3 or RLlib, and what of it they have no name for.
+
+The names are those of `policies.foreign_names`; the values are computed where they mean something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+
+_TORCH = {"linear": "Identity", "relu": "ReLU", "tanh": "Tanh", "silu": "SiLU", "elu": "ELU", "gelu": "GELU"}
+_FITS = 100
+"""Columns that a call may take in one line."""
+
+
+@dataclass(frozen=True)
+class ForeignProgram:
+    """A program for another library."""
+
+    code: str
+    notes: tuple[str, ...]
+    """What it leaves out or does otherwise, each a sentence."""
+
+
+@dataclass(frozen=True)
+class _Code:
+    """Python code as an argument's value."""
+
+    text: str
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+_NO_CLIPPING = _Code('float("inf")')
+
+
+def stable_baselines3_program(
+    values: TrainedHyperparams, *, env_id: str, env_args: Mapping[str, Any], num_env_steps: int
+) -> ForeignProgram:
+    """Return a program that trains with a setting in Stable-Baselines3 2.7 or later.
+
+    Args:
+        values: The setting, all hyperparameters of it.
+        env_id: A registered Gymnasium id.
+        env_args: Keyword arguments of the environment.
+        num_env_steps: Env steps to train.
+    """
+    is_ppo = isinstance(values, PPOHyperparams)
+    arguments, notes = _sb3_ppo(values) if isinstance(values, PPOHyperparams) else _sb3_dqn(values, num_env_steps)
+    learning_rate: Any = values.lr
+    if values.lr_final is not None and values.lr_decay_steps is not None:
+        # SB3 gives the share of total_timesteps that is left.
+        change = f"({values.lr_final!r} - {values.lr!r})"
+        done = f"min(1.0, (1.0 - left) * {num_env_steps} / {values.lr_decay_steps})"
+        learning_rate = _Code(f"lambda left: {values.lr!r} + {change} * {done}")
+    network: dict[str, Any] = {
+        "net_arch": list(values.hidden_sizes),
+        "activation_fn": _Code(f"torch.nn.{_TORCH[values.activation]}"),
+    }
+    if is_ppo:
+        network["ortho_init"] = values.initializer == "orthogonal"
+    if values.initializer == "he_uniform" or (values.initializer == "orthogonal" and not is_ppo):
+        notes.append(f"initializer {values.initializer} is left out: it takes a policy class of your own.")
+    if values.conv_filters is not None:
+        notes.append("conv_filters are left out: SB3's are those of CnnPolicy, or of a features extractor of your own.")
+    name = "PPO" if is_ppo else "DQN"
+    made = f"make_vec_env({env_id!r}, n_envs={values.num_envs}{_env_kwargs('env_kwargs', env_args)})"
+    imports = ["import torch", f"from stable_baselines3 import {name}"]
+    imports += ["from stable_baselines3.common.env_util import make_vec_env"]
+    lines = [f"env = {made}"]
+    scales = isinstance(values, PPOHyperparams) and values.normalize_rewards
+    if values.normalize_observations or scales:
+        imports += ["from stable_baselines3.common.vec_env import VecNormalize"]
+        norm_obs = "" if values.normalize_observations else ", norm_obs=False"
+        norm_reward = f"gamma={values.gamma!r}" if scales else "norm_reward=False"
+        lines += [f"env = VecNormalize(env{norm_obs}, {norm_reward})"]
+    call = {
+        "learning_rate": learning_rate,
+        "gamma": values.gamma,
+        "max_grad_norm": _NO_CLIPPING if values.grad_clip is None else values.grad_clip,
+        **arguments,
+        "policy_kwargs": network,
+    }
+    policy = "MlpPolicy" if values.conv_filters is None else "CnnPolicy"
+    lines += [_call(f"model = {name}", [repr(policy), "env"], call), f"model.learn(total_timesteps={num_env_steps})"]
+    return ForeignProgram("\n".join([*imports, "", *lines]), tuple(notes))
+
+
+def rllib_program(values: TrainedHyperparams, *, env_id: str, env_args: Mapping[str, Any]) -> ForeignProgram:
+    """Return a program that makes RLlib's algorithm (Ray 2.60, new API stack) with a setting.
+
+    Args:
+        values: The setting, all hyperparameters of it.
+        env_id: A registered Gymnasium id.
+        env_args: Keyword arguments of the environment.
+    """
+    arguments, notes = _rllib_ppo(values) if isinstance(values, PPOHyperparams) else _rllib_dqn(values)
+    name = "PPO" if isinstance(values, PPOHyperparams) else "DQN"
+    model: dict[str, Any] = {
+        "fcnet_hiddens": list(values.hidden_sizes),
+        "fcnet_activation": "GELU" if values.activation == "gelu" else values.activation,
+    }
+    if isinstance(values, PPOHyperparams):
+        model["vf_share_layers"] = values.vf_share_layers
+    if values.conv_filters is not None:
+        model["conv_filters"] = [list(item) for item in values.conv_filters]
+        notes.append("RLlib pads the convolutions of conv_filters, which we don't.")
+    if values.initializer != "torch":
+        notes.append(f"initializer {values.initializer} is left out: fcnet_kernel_initializer takes torch's functions.")
+    runners: dict[str, Any] = {"num_env_runners": 0, "num_envs_per_env_runner": values.num_envs}
+    if isinstance(values, DQNHyperparams):
+        runners["rollout_fragment_length"] = max(1, round(values.train_freq / values.num_envs))
+    if values.normalize_observations:
+        notes.append("normalize_observations is left out: RLlib's is a connector, MeanStdFilter.")
+    schedule = values.lr if values.lr_final is None else [[0, values.lr], [values.lr_decay_steps, values.lr_final]]
+    clip = {} if values.grad_clip is None else {"grad_clip": values.grad_clip}
+    training = {"lr": schedule, "gamma": values.gamma, **clip, **arguments}
+    chain = [
+        f".environment({env_id!r}{_env_kwargs('env_config', env_args)})",
+        _call(".env_runners", [], runners),
+        ".learners(num_learners=0)",
+        _call(".training", [], training),
+        f".rl_module(model_config={_call('DefaultModelConfig', [], model)})",
+    ]
+    body = "\n".join(f"    {line}" for part in chain for line in part.splitlines())
+    code = (
+        f"from ray.rllib.algorithms.{name.lower()} import {name}Config\n"
+        "from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig\n\n"
+        f"config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
+    )
+    return ForeignProgram(code, tuple(notes))
+
+
+def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
+    notes = []
+    n_steps = max(1, round(values.train_batch_size / values.num_envs))
+    if n_steps * values.num_envs != values.train_batch_size:
+        notes.append(f"The train batch is {n_steps * values.num_envs} env steps, not {values.train_batch_size}.")
+    if values.entropy_coeff_final is not None:
+        notes.append("entropy_coeff stays at its first value: SB3 has no schedule for ent_coef.")
+    if values.clip_param_final is not None:
+        notes.append(
+            "clip_param stays at its first value: SB3's clip_range takes a function of the share that is left."
+        )
+    if values.vf_clip_param is not None:
+        notes.append("vf_clip_param is left out: clip_range_vf means something else.")
+    if values.use_kl_loss:
+        notes.append("The KL penalty is left out: target_kl means something else.")
+    if values.vf_share_layers:
+        notes.append("vf_share_layers is left out: SB3 shares its features extractor alone.")
+    return {
+        "n_steps": n_steps,
+        "batch_size": values.minibatch_size,
+        "n_epochs": values.num_epochs,
+        "gae_lambda": values.gae_lambda,
+        "clip_range": values.clip_param,
+        "ent_coef": values.entropy_coeff,
+        "vf_coef": values.vf_loss_coeff,
+    }, notes
+
+
+def _sb3_dqn(values: DQNHyperparams, num_env_steps: int) -> tuple[dict[str, Any], list[str]]:
+    lacking = [
+        name
+        for name, differs in (
+            ("double_q", values.double_q),
+            ("dueling", values.dueling),
+            ("replay " + values.replay, values.replay != "uniform"),
+            ("td_loss mse", values.td_loss == "mse"),
+            ("optimizer rmsprop", values.optimizer == "rmsprop"),
+            ("target_network false", not values.target_network),
+            ("the schedule of epsilon", values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step"),
+            ("updates of the target by episodes", values.target_update_unit == "episode"),
+        )
+        if differs
+    ]
+    notes = [f"SB3's DQN lacks {', '.join(lacking)}."] if lacking else []
+    train_freq = max(1, round(values.train_freq / values.num_envs))
+    return {
+        "buffer_size": values.replay_capacity,
+        "learning_starts": values.learning_starts,
+        "batch_size": values.train_batch_size,
+        "tau": values.tau,
+        "train_freq": train_freq,
+        "gradient_steps": max(1, round(values.updates_per_env_step * train_freq * values.num_envs)),
+        "n_steps": values.n_step,
+        "target_update_interval": values.target_update_interval or 1,
+        "exploration_fraction": min(1.0, values.epsilon_decay / max(1, num_env_steps)),
+        "exploration_initial_eps": values.epsilon_initial,
+        "exploration_final_eps": values.epsilon_final,
+    }, notes
+
+
+def _rllib_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
+    entropy: Any = values.entropy_coeff
+    if values.entropy_coeff_final is not None:
+        entropy = [[0, values.entropy_coeff], [values.entropy_decay_steps, values.entropy_coeff_final]]
+    notes = []
+    if values.clip_param_final is not None:
+        notes.append("clip_param stays at its first value: RLlib has no schedule for it.")
+    if values.normalize_rewards:
+        notes.append("normalize_rewards is left out: RLlib has none.")
+    kl = {"kl_coeff": values.kl_coeff, "kl_target": values.kl_target} if values.use_kl_loss else {}
+    return {
+        "lambda_": values.gae_lambda,
+        "clip_param": values.clip_param,
+        "vf_clip_param": _NO_CLIPPING if values.vf_clip_param is None else values.vf_clip_param,
+        "vf_loss_coeff": values.vf_loss_coeff,
+        "entropy_coeff": entropy,
+        "use_kl_loss": values.use_kl_loss,
+        **kl,
+        "train_batch_size_per_learner": values.train_batch_size,
+        "minibatch_size": values.minibatch_size,
+        "num_epochs": values.num_epochs,
+    }, notes
+
+
+def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
+    lacking = [
+        name
+        for name, differs in (
+            ("replay none", values.replay == "none"),
+            ("optimizer rmsprop", values.optimizer == "rmsprop"),
+            ("target_network false", not values.target_network),
+            ("the schedule of epsilon", values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step"),
+            ("updates of the target by episodes", values.target_update_unit == "episode"),
+        )
+        if differs
+    ]
+    replay: dict[str, Any] = {"type": "EpisodeReplayBuffer", "capacity": values.replay_capacity}
+    if values.replay == "prioritized":
+        replay = replay | {
+            "type": "PrioritizedEpisodeReplayBuffer",
+            "alpha": values.prioritized_alpha,
+            "beta": values.prioritized_beta,
+        }
+    decay = max(1, round(values.epsilon_decay))
+    return {
+        "train_batch_size_per_learner": values.train_batch_size,
+        "training_intensity": values.updates_per_env_step * values.train_batch_size,
+        "double_q": values.double_q,
+        "dueling": values.dueling,
+        "n_step": values.n_step,
+        "td_error_loss_fn": values.td_loss,
+        "adam_epsilon": values.optimizer_epsilon,
+        "tau": values.tau,
+        "target_network_update_freq": values.target_update_interval or 1,
+        "num_steps_sampled_before_learning_starts": values.learning_starts,
+        "epsilon": [[0, values.epsilon_initial], [decay, values.epsilon_final]],
+        "replay_buffer_config": replay,
+    }, [f"RLlib's DQN lacks {', '.join(lacking)}."] if lacking else []
+
+
+def _env_kwargs(name: str, env_args: Mapping[str, Any]) -> str:
+    return f", {name}={dict(env_args)!r}" if env_args else ""
+
+
+def _call(function: str, positional: list[str], arguments: Mapping[str, Any]) -> str:
+    parts = [*positional, *(f"{name}={value!r}" for name, value in arguments.items())]
+    line = f"{function}({', '.join(parts)})"
+    if len(line) <= _FITS and len(parts) <= 3:
+        return line
+    return f"{function}(\n" + "".join(f"    {part},\n" for part in parts) + ")"

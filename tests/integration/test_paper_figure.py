@@ -1,0 +1,112 @@
+"""The figure for a paper: what it draws of settings, seeds and bands, and its files."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+from sweep_folders import make_sweep_folder
+from synthetic_sweep import make_sweep
+
+import tune_jobs
+from analysis.exports.frames import SweepData
+from analysis.exports.paper import learning_figure, save_figure, setting_curves
+from analysis.records import IterationRecord
+from policies.errors import NotFoundError, SpecError
+from tests.narrowing import present
+
+
+def data_of(**given: Any) -> SweepData:
+    made = make_sweep(**given)
+    return SweepData(made.trials, made.results, "final", num_env_steps=50_000, threshold=195.0)
+
+
+def held(curve: list[tuple[int, float]]) -> list[IterationRecord]:
+    return [
+        IterationRecord(iteration=i, num_env_steps=steps, num_episodes=9, time_s=1.0, evaluation_return=value)
+        for i, (steps, value) in enumerate(curve, start=1)
+    ]
+
+
+def of_curves(*curves: list[tuple[int, float]]) -> SweepData:
+    """One setting, with a seed for each curve."""
+    made = make_sweep(points=[{"lr": 1e-3}], seeds_per_point=len(curves))
+    results = {trial.trial_id: held(curve) for trial, curve in zip(made.trials, curves, strict=True)}
+    return SweepData(made.trials, results, "final", num_env_steps=200, threshold=None)
+
+
+def test_a_curve_is_the_mean_over_seeds_with_students_interval() -> None:
+    (curve,) = setting_curves(of_curves([(100, 0.0), (200, 4.0)], [(100, 2.0), (200, 6.0)], [(100, 1.0), (200, 2.0)]),
+                              top=3)  # fmt: skip
+    assert curve.num_seeds == 3
+    assert (curve.num_env_steps[0], curve.num_env_steps[-1]) == (100, 200)
+    assert (curve.mean[0], curve.mean[-1]) == (1.0, 4.0)
+    lower, upper = present(curve.lower), present(curve.upper)
+    for place, values in ((0, [0.0, 2.0, 1.0]), (-1, [4.0, 6.0, 2.0])):
+        expected = stats.t.interval(0.95, 2, loc=np.mean(values), scale=stats.sem(values))
+        np.testing.assert_allclose([lower[place], upper[place]], expected)
+
+
+def test_a_seed_that_ended_early_is_held_and_the_curve_says_from_where() -> None:
+    (curve,) = setting_curves(of_curves([(100, 0.0), (150, 10.0)], [(100, 0.0), (200, 0.0)]), top=1)
+    assert curve.first_end == 150
+    assert curve.mean[-1] == 5.0
+
+
+def test_one_seed_has_no_band() -> None:
+    (curve,) = setting_curves(of_curves([(100, 0.0), (200, 1.0)]), top=1)
+    assert curve.lower is None
+    figure = learning_figure([("one", of_curves([(100, 0.0), (200, 1.0)]))])
+    assert not figure.axes[0].collections
+
+
+def test_the_leading_settings_are_drawn_with_bands_and_what_tells_them_apart() -> None:
+    data = data_of(seeds_per_point=3)
+    figure = learning_figure([("mine", data)], top=2)
+    (axes,) = figure.axes
+    assert len(axes.collections) == 2
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert len(labels) == 3
+    assert all("lr" in label and "(3 seeds)" in label for label in labels[:2])
+    assert labels[2] == "goal 195"
+
+
+def test_a_band_of_few_seeds_does_not_set_the_scale() -> None:
+    figure = learning_figure([("two", of_curves([(100, 0.0), (200, 1.0)], [(100, 1.0), (200, 0.0)]))])
+    # Student's t of two seeds: 0.5 -+ 6.35.
+    assert figure.axes[0].get_ylim() == pytest.approx((-0.05, 1.05))
+
+
+def test_several_sweeps_are_told_by_name(tmp_path: Path) -> None:
+    make_sweep_folder(tmp_path / "one")
+    make_sweep_folder(tmp_path / "two", seed=5)
+    figure = tune_jobs.figure(["one", "two"], top=1, storage=tmp_path, returns="evaluation", width=5, height=3)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [label.split(" ")[0] for label in labels[:2]] == ["one", "two"]
+    assert tuple(figure.get_size_inches()) == (5, 3)
+
+
+def test_returns_of_different_envs_share_no_axis(tmp_path: Path) -> None:
+    make_sweep_folder(tmp_path / "one")
+    make_sweep_folder(tmp_path / "other", env={"id": "Acrobot-v1"})
+    with pytest.raises(SpecError, match="one is on CartPole-v1, other on Acrobot-v1"):
+        tune_jobs.figure(["one", "other"], storage=tmp_path)
+
+
+def test_without_anything_to_draw_it_says_so() -> None:
+    data = data_of()
+    with pytest.raises(NotFoundError, match="nothing to draw: no setting of mine"):
+        learning_figure([("mine", dataclasses.replace(data, results={}))])
+
+
+@pytest.mark.parametrize(("kind", "begins"), [("pdf", b"%PDF"), ("svg", b"<?xml"), ("png", b"\x89PNG")])
+def test_files_are_of_their_kind_and_the_same_each_time(tmp_path: Path, kind: str, begins: bytes) -> None:
+    data = data_of(points=[{"lr": 1e-3, "activation": "$x$"}, {"lr": 2e-3, "activation": "y"}], seeds_per_point=2)
+    first = save_figure(learning_figure([("mine", data)]), tmp_path / "a" / f"figure.{kind}")
+    second = save_figure(learning_figure([("mine", data)]), tmp_path / "b" / f"figure.{kind}")
+    assert first.read_bytes().startswith(begins)
+    assert first.read_bytes() == second.read_bytes()
+    if kind == "pdf":
+        assert b"/Type3" not in first.read_bytes()

@@ -1,0 +1,53 @@
+"""How sure a ranking of settings is, as the report shows it."""
+
+from typing import Any
+
+import numpy as np
+from report_sources import setting, settings_of, source_of
+from synthetic_sweep import make_points, make_sweep
+
+from analysis.page import how_sure
+from analysis.page.scores import interval_of, score_text
+
+
+def test_settings_that_share_a_letter_are_not_told_apart() -> None:
+    synthetic = make_sweep(points=[{"lr": 3e-3}, {"lr": 3.1e-3}, {"lr": 1e-7}], seeds_per_point=4)
+    table = how_sure.settings_table(source_of(synthetic))
+    letters = [row[-1].text for row in table.rows]
+    assert table.headings[-1] == "tie group"
+    assert letters[0] == letters[1] == "a"
+    assert letters[2] == "b"
+    assert [row[0].text for row in table.rows] == ["1", "2", "3"]
+
+
+def test_env_steps_to_the_threshold_are_shown_as_such() -> None:
+    scores = {"scores": (-9000.0, -11000.0), "score": -10000.0, "lower": -14000.0, "upper": -6000.0}
+    settings = settings_of(
+        setting(1, ["t0000", "t0001"], 2, probability_best=0.5, **scores),
+        setting(2, ["t0002", "t0003"], 2, probability_best=0.5, **scores | {"upper": 2000.0}),
+        objective="steps_to_threshold",
+    )
+    first, second = settings.ranking
+    assert score_text(settings, first.score) == "10,000"
+    assert interval_of(settings, first) == "6,000 to 14,000"
+    assert interval_of(settings, second) == "0 to 14,000"
+    source = source_of(make_sweep(points=make_points(1, np.random.default_rng(0)), seeds_per_point=2), settings)
+    one, two = how_sure.strips(source)
+    assert one.scores == (9000.0, 11000.0)
+    assert one.interval == (6000.0, 14000.0)
+    assert two.interval == (0.0, 14000.0)
+
+
+def test_labels_that_are_too_long_are_left_to_the_table() -> None:
+    def labels(point: dict[str, Any]) -> list[str]:
+        synthetic = make_sweep(points=[{"lr": 3e-3} | point, {"lr": 1e-3} | point])
+        return [strip.label for strip in how_sure.strips(source_of(synthetic))]
+
+    assert labels({"activation": "relu"}) == ["1.  0.001 · relu", "2.  0.003 · relu"]
+    assert labels({f"name{index}": "a long value" for index in range(4)}) == ["1.", "2."]
+
+
+def test_nothing_is_compared_where_there_is_one_setting() -> None:
+    source = source_of(make_sweep(points=[{"lr": 3e-3}], seeds_per_point=3))
+    assert how_sure.strips(source) == []
+    assert how_sure.settings_table(source).rows == []

@@ -1,0 +1,146 @@
+"""A sweep as a study of Optuna, for its importances, its plots and its dashboard."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis.exports.frames import SweepData
+from analysis.objectives import score_of
+from analysis.records import FINISHED, TrialRecord
+from analysis.tables import cell_value
+from policies.errors import CannotRunError, SpecError
+from tune_jobs.spec.domains import Listed, Range
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+if TYPE_CHECKING:
+    import optuna
+
+
+def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = None) -> optuna.Study:
+    """Return the ended trials of a sweep as an Optuna study.
+
+    A trial's value is what settings are judged by, `objective` in the sweep file, and higher is better. Its evaluations
+    are intermediate values, by env steps. One that the sweep's scheduler ended is pruned; one that failed, or showed
+    nothing to be judged by, has failed. Lists, such as hidden sizes, are texts. Seeds, returns and the point that a
+    trial shares with others are user attributes.
+
+    Args:
+        spec: The sweep.
+        data: Its trials.
+        name: The study's name.
+        path: A SQLite file to keep the study in, which must not exist; None: it is kept in memory.
+
+    Raises:
+        CannotRunError: Optuna is not installed, or the file exists or cannot be written.
+        SpecError: It is a sweep of population based training, or `steps_to_threshold` has no threshold.
+    """
+    if importlib.util.find_spec("optuna") is None:
+        raise CannotRunError(
+            "An Optuna study needs Optuna, and that is not installed.",
+            "Install it with `pip install 'tune-jobs[tpe]'`.",
+        )
+    if spec.scheduler.type == "pbt":
+        raise SpecError(
+            f"Sweep {name} is one of population based training, whose trials change their values while they train; a "
+            "trial of Optuna has one value of each.",
+            "Export it as csv or parquet, which have every change.",
+        )
+    if data.objective == "steps_to_threshold" and data.threshold is None:
+        raise SpecError(
+            f"Sweep {name} is judged by the env steps to a threshold, and its environment has none.",
+            "Export it as csv or parquet.",
+        )
+    import optuna
+
+    verbosity = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        study = optuna.create_study(study_name=name, direction="maximize", storage=_storage(path))
+        distributions = {key: _distribution(domain) for key, domain in spec.space.items()}
+        study.set_user_attr("objective", data.objective)
+        for trial in sorted(data.trials, key=lambda item: item.index):
+            if trial.status in FINISHED and trial.has_point:
+                study.add_trial(_as_optunas(spec, data, trial, distributions))
+    finally:
+        optuna.logging.set_verbosity(verbosity)
+    return study
+
+
+def _storage(path: Path | None) -> str | None:
+    if path is None:
+        return None
+    if path.exists():
+        raise CannotRunError(
+            f"{path} exists already.", "Remove it, or give another file with --out (in Python output=)."
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    except OSError as error:
+        raise CannotRunError(
+            f"{path} cannot be written: {error.strerror or error}.", "Give another file, or free space on its disk."
+        ) from error
+    return f"sqlite:///{path}"
+
+
+def _as_optunas(
+    spec: SweepSpec,
+    data: SweepData,
+    trial: TrialRecord,
+    distributions: dict[str, optuna.distributions.BaseDistribution],
+) -> optuna.trial.FrozenTrial:
+    import optuna
+
+    iterations = data.results.get(trial.trial_id, ())
+    score = None
+    if trial.status != "failed":
+        score = score_of(trial, iterations, data.objective, num_env_steps=data.num_env_steps, threshold=data.threshold)
+    told: dict[str, Any] = {"state": optuna.trial.TrialState.FAIL}
+    if score is not None and math.isfinite(score):
+        pruned = trial.status == "stopped"
+        states = optuna.trial.TrialState
+        told = {"state": states.PRUNED if pruned else states.COMPLETE, "value": score}
+    return optuna.trial.create_trial(
+        params={key: _value(domain, trial.point[key]) for key, domain in spec.space.items()},
+        distributions=distributions,
+        intermediate_values={
+            item.num_env_steps: item.evaluation_return for item in iterations if item.evaluation_return is not None
+        },
+        user_attrs=_attributes(trial),
+        **told,
+    )
+
+
+def _attributes(trial: TrialRecord) -> dict[str, Any]:
+    """Return what else is known of a trial; SQLite's JSON has no NaN, so that it is left out."""
+    names = (
+        "trial_id", "point_index", "seed_index", "seed", "engine", "status", "stop_reason", "num_env_steps",
+        "num_episodes", "time_s", "training_return", "evaluation_return", "best_evaluation_return",
+    )  # fmt: skip
+    known = {name: getattr(trial, name) for name in names}
+    return {
+        name: value
+        for name, value in known.items()
+        if value is not None and not (isinstance(value, float) and not math.isfinite(value))
+    }
+
+
+def _distribution(domain: Any) -> optuna.distributions.BaseDistribution:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if isinstance(domain, Listed):
+        return CategoricalDistribution(tuple(cell_value(value) for value in domain.values))
+    assert isinstance(domain, Range)
+    low, high = domain.bounds
+    if domain.is_whole:
+        # A step and a logarithmic scale exclude each other in Optuna.
+        step = 1 if domain.is_log else int(domain.q or 1)
+        return IntDistribution(int(low), int(high), log=domain.is_log, step=step)
+    return FloatDistribution(low, high, log=domain.is_log, step=None if domain.is_log else domain.q)
+
+
+def _value(domain: Any, value: Any) -> Any:
+    return cell_value(value) if isinstance(domain, Listed) else value

@@ -1,0 +1,97 @@
+"""Write the trials that a sweep is to have and does not have yet, once it is checked that the others are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from analysis.numbering import planned_places
+from analysis.records import FINISHED, SweepRecord
+from policies.errors import CannotRunError, CheckpointError
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Hyperparams
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan, num_points_of
+from tune_jobs.process.interruption import current
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.names import SWEEP_RECORD
+from tune_jobs.store.transitions import pending_record, tried_again
+
+
+def add_what_is_missing(
+    store: Sweep,
+    record: SweepRecord,
+    spec: SweepSpec,
+    machine: Machine,
+    address: str | None,
+    *,
+    retry_failed: bool = False,
+) -> SweepPlan:
+    """Plan the sweep of a record, and write the record and the trials that do not exist yet."""
+    _check_replications(record, spec)
+    trials = store.read_trials()
+    plan = make_plan(spec, machine, trials, replications=record.replications, retry_failed=retry_failed)
+    check_same_trials(store, plan)
+    with current().shielded():
+        _add_trials(store, record, spec, plan, address, retry_failed=retry_failed)
+    return plan
+
+
+def _check_replications(record: SweepRecord, spec: SweepSpec) -> None:
+    try:
+        planned_places(num_points_of(spec), spec.seeds_per_point, record.replications)
+    except ValueError as error:
+        raise CheckpointError(
+            f"The record of sweep {record.name} is damaged: {error}.", f"Restore {SWEEP_RECORD} from a backup."
+        ) from error
+
+
+def check_same_trials(store: Sweep, plan: SweepPlan) -> None:
+    """Check that planning again gives the trials that exist.
+
+    Raises:
+        CannotRunError: It gives others; a resumed trial would train with other values than it began with.
+    """
+    planned = {trial.trial_id: trial for trial in plan.trials}
+    known = HYPERPARAMS_BY_ALGORITHM[store.read_record().spec["algorithm"]]
+    for record in store.read_trials():
+        trial = planned.get(record.trial_id)
+        # A point that a search method chose depends on the trials that had ended then, which may be more by now.
+        same = trial is not None and (
+            not trial.has_point or _same_values(trial.hyperparams, record.first_hyperparams, known)
+        )
+        if trial is None or trial.seed != record.seed or not same:
+            raise CannotRunError(
+                f"Trial {record.trial_id} of sweep {store.name} is not the one its spec gives: {SWEEP_RECORD} was "
+                "changed, or was written by a version that draws other points.",
+                f"Restore {SWEEP_RECORD} from a backup, or launch a new sweep.",
+            )
+
+
+def _same_values(planned: Mapping[str, Any], recorded: Mapping[str, Any], known: type[Hyperparams]) -> bool:
+    """Whether planned hyperparameters are the recorded ones; names that an older version lacked have defaults."""
+    fields = known.model_fields
+    added = {name: fields[name].default for name in planned if name in fields and name not in recorded}
+    return dict(planned) == {**added, **recorded}
+
+
+def _add_trials(
+    store: Sweep, record: SweepRecord, spec: SweepSpec, plan: SweepPlan, address: str | None, *, retry_failed: bool
+) -> None:
+    """Write the records of the trials that are added; nothing if there are none to run."""
+    known = {trial.trial_id: trial for trial in store.read_trials()}
+    todo = []
+    for trial in plan.trials:
+        before = known.get(trial.trial_id)
+        if before is None:
+            todo.append(pending_record(trial))
+        elif retry_failed and before.status == "failed":
+            todo.append(tried_again(before))
+    if not todo and all(trial.status in FINISHED for trial in known.values()):
+        return
+    # The sweep's record comes first: if this process is killed then, trials are missing, which a resume adds. Trials
+    # that the sweep's spec does not give would be refused for good.
+    changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
+    store.write_record(record.model_copy(update={**changes, "state": "running"}))
+    for trial_record in todo:
+        store.trial(trial_record.trial_id).write_record(trial_record)

@@ -1,0 +1,112 @@
+"""Compare sweeps, or settings of sweeps."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from analysis.comparison.compare import MAX_ENTRIES, Comparison
+from analysis.comparison.compare import compare as compare_all
+from analysis.comparison.entries import Wanted
+from analysis.exports.frames import ranked_settings
+from policies.arguments import PositiveInt, checked
+from policies.errors import NotFoundError, SpecError
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.store.contract import Sweep
+from tune_jobs.sweeps.exports import sweep_data
+from tune_jobs.sweeps.sources import find_source, find_trial
+from tune_jobs.sweeps.storage import expanded
+
+
+@checked
+def compare(
+    sources: str | Path | Sequence[str | Path],
+    *,
+    objective: Literal["final", "area", "best", "steps_to_threshold"] | None = None,
+    top: PositiveInt = 3,
+    html: str | Path | None = None,
+    storage: str | Path | None = None,
+) -> Comparison:
+    """Compare sweeps by their leading settings, or settings with each other, over training seeds.
+
+    Args:
+        sources: Each a sweep, by name or folder, or a setting, by one of its trials: `SWEEP/t0003` or the trial's
+            folder. Of one sweep alone the leading settings are compared.
+        objective: What all are judged by; None: what their sweep files say, or `final` where these differ.
+        top: How many settings are compared of a sweep that is named alone.
+        html: A file for a page with figures; None: none is written.
+        storage: Folder for sweeps.
+
+    Returns:
+        Scores, intervals, costs; for each pair how probably a training of one scores more than one of the other, and
+        the difference of their means. Of different environments it says why they are not comparable.
+
+    Raises:
+        NotFoundError: There is no such sweep or trial.
+        SpecError: Fewer than two different things, or too many, are to be compared.
+        CannotRunError: The page cannot be written.
+    """
+    named = [sources] if isinstance(sources, str | Path) else list(sources)
+    if not named:
+        raise SpecError("Nothing was given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials.")
+    wanted = _settings_of(named[0], top, storage) if len(named) == 1 else [_wanted(each, storage) for each in named]
+    _refuse_twice(wanted)
+    if not 2 <= len(wanted) <= MAX_ENTRIES:
+        raise SpecError(
+            f"{len(wanted)} things were given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials."
+        )
+    found = compare_all(wanted, objective)
+    if html is not None:
+        from analysis.comparison.page import write_page
+
+        write_page(expanded(html), found, dict(zip(string.ascii_uppercase, wanted, strict=False)))
+    return found
+
+
+def _wanted(source: str | Path, storage: str | Path | None) -> Wanted:
+    store, trial_id = find_source(source, storage)
+    if trial_id is None:
+        return _of(store, store.name, None)
+    trial = find_trial(store, trial_id)
+    return _of(store, f"{store.name}/{trial.trial_id}", trial.point_index)
+
+
+def _of(store: Sweep, name: str, point_index: int | None) -> Wanted:
+    record = store.read_record()
+    cores = float(stored_spec(record).cpus_per_trial)
+    return Wanted(name, record, sweep_data(store), cores, point_index)
+
+
+def _settings_of(source: str | Path, top: int, storage: str | Path | None) -> list[Wanted]:
+    """Return the leading settings of a sweep, each called after its first trial."""
+    store, trial_id = find_source(source, storage)
+    if trial_id is not None:
+        raise SpecError(
+            f"Only {store.name}/{trial_id} was given to be compared.", "Name another trial or sweep to compare it with."
+        )
+    whole = _of(store, store.name, None)
+    ranking = ranked_settings(whole.data)[:top]
+    if len(ranking) < 2:
+        raise NotFoundError(
+            f"Sweep {store.name} has no two settings that could be compared: "
+            f"{len(ranking)} of its settings {'has' if len(ranking) == 1 else 'have'} been trained and judged.",
+            "Name another sweep to compare it with.",
+        )
+    return [_of(store, f"{store.name}/{item.trial_ids[0]}", item.point_index) for item in ranking]
+
+
+def _refuse_twice(wanted: Sequence[Wanted]) -> None:
+    """Refuse the same sweep or setting twice; a sweep with one of its own settings may be wanted."""
+    seen: dict[tuple[str, float, int | None], str] = {}
+    for item in wanted:
+        # A copy in another folder is the same sweep.
+        key = (item.sweep.name, item.sweep.created_at, item.point_index)
+        if key in seen:
+            what = "the same sweep" if item.point_index is None else "seeds of the same setting, or the same trial"
+            raise SpecError(
+                f"{seen[key]} and {item.name} are {what}: there is nothing to compare.",
+                "Name two different ones; `tune-jobs compare SWEEP` compares the settings of one sweep.",
+            )
+        seen[key] = item.name

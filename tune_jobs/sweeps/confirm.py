@@ -1,0 +1,102 @@
+"""Train the leading settings of a sweep again, as its `confirm` asks: a race within a share of the search's env steps.
+
+Which round comes next follows from the sweep's records alone, so a sweep that was interrupted goes on with the same
+race, and an equal spec and seed give an equal one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from analysis.objectives import reached_goal
+from analysis.racing import Race, race_within
+from analysis.records import ReplicationRecord, SweepRecord, TrialRecord
+from policies.guard.guarded import check_env
+from policies.portable.file import BASELINE_KINDS
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.candidates import read_results, read_trials
+from tune_jobs.store.contract import Sweep
+from tune_jobs.sweeps.forecast import caps_of
+from tune_jobs.sweeps.settings import ranked
+
+
+def may_confirm(spec: SweepSpec) -> bool:
+    """Whether a sweep's `confirm` can act: it is on, and trials keep a setting by which a policy is trained."""
+    return spec.confirm.max_share > 0 and spec.scheduler.type != "pbt" and spec.algorithm not in BASELINE_KINDS
+
+
+def points_to_confirm(store: Sweep) -> tuple[int, ...]:
+    """Return the points that get one more seed each in the next round of a sweep's `confirm`; none: it is over.
+
+    All trials have ended. A sweep that somebody has replicated since its last sample is left alone.
+
+    Raises:
+        CheckpointError: A record is damaged.
+        EnvError: The objective is about the env's threshold, and the env cannot be made.
+        EnvFailedError: As for EnvError, and it failed.
+    """
+    record = store.read_record()
+    spec = stored_spec(record)
+    rounds = recent_rounds(record)
+    if not may_confirm(spec) or any(item.by != "confirm" for item in rounds):
+        return ()
+    threshold = None
+    if spec.objective.type == "steps_to_threshold":
+        threshold = check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
+    trials, results = read_trials(store), read_results(store)
+    before = trials_before(trials, rounds)
+    contenders = [item.point_index for item in ranked(spec, before, results, threshold)]
+    race = confirming_race(spec, contenders, before)
+    if race is None:
+        return ()
+    scores = {item.point_index: item.scores for item in ranked(spec, trials, results, threshold)}
+    return race.next_points(scores, len(rounds))
+
+
+def recent_rounds(record: SweepRecord) -> list[ReplicationRecord]:
+    """Return the replications since the last points came to a sweep."""
+    last = max((item.num_points for item in record.replications), default=0)
+    spec = stored_spec(record)
+    seeds = spec.seeds_per_point
+    num_replicas = sum(len(item.points) for item in record.replications)
+    if record.num_trials - num_replicas > last * seeds:
+        return []
+    return [item for item in record.replications if item.num_points == last]
+
+
+def trials_before(trials: Sequence[TrialRecord], rounds: Sequence[ReplicationRecord]) -> list[TrialRecord]:
+    """Return the trials that there were before these rounds, which were the last ones."""
+    num_added = sum(len(item.points) for item in rounds)
+    ordered = sorted(trials, key=lambda trial: trial.index)
+    return ordered[: len(ordered) - num_added]
+
+
+def confirming_race(spec: SweepSpec, contenders: Sequence[int], trials: Sequence[TrialRecord]) -> Race | None:
+    """Return the race that fits in the share of the search's env steps; None: none does.
+
+    Args:
+        spec: The sweep.
+        contenders: The indices of its points, best first.
+        trials: Its trials before the race. Seeds that earlier races gave count as spent.
+    """
+    searched = sum(trial.num_env_steps for trial in trials if trial.seed_index < spec.seeds_per_point)
+    spent = sum(trial.num_env_steps for trial in trials) - searched
+    # The race is not to exceed the share, so each training counts with the most that it may take: as far as the longest
+    # of the search, or to the cap if all of them ended before they had to.
+    whole = [trial for trial in trials if trial.status == "completed" and not reached_goal(trial)]
+    steps = [trial.num_env_steps for trial in whole] if whole else caps_of(spec, trials).values()
+    most = max(steps, default=0)
+    if not most:
+        return None
+    allowed = int((spec.confirm.max_share * searched - spent) // most)
+    return race_within(contenders, top=spec.confirm.top, num_seeds=spec.confirm.seeds, max_trainings=allowed)
+
+
+def largest_race(spec: SweepSpec, num_points: int) -> Race | None:
+    """Return the race that a new sweep has if all of its trials train to their caps; None: none."""
+    if not may_confirm(spec):
+        return None
+    allowed = int(spec.confirm.max_share * num_points * spec.seeds_per_point)
+    confirm = spec.confirm
+    return race_within(range(num_points), top=confirm.top, num_seeds=confirm.seeds, max_trainings=allowed)

@@ -1,0 +1,256 @@
+"""A sweep in other forms: data frames, CSV and Parquet files, a LaTeX table, an Optuna study, a figure for a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+from analysis.exports.frames import ROWS, Rows, SweepData
+from analysis.records import BestRecord
+from policies.arguments import Inches, PositiveInt, checked
+from policies.errors import CannotRunError, NotFoundError, SpecError
+from tune_jobs.sweeps.storage import expanded
+
+if TYPE_CHECKING:
+    import optuna
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from analysis.exports.paper import Returns
+    from tune_jobs.spec.sweep_spec import SweepSpec
+    from tune_jobs.store.contract import Sweep
+
+Format = Literal["csv", "parquet", "latex", "optuna", "pdf", "svg", "png"]
+"""What `export` writes: a folder of tables, a LaTeX file, a SQLite file, or a figure."""
+FORMATS: tuple[Format, ...] = get_args(Format)
+FIGURES = ("pdf", "svg", "png")
+_SUFFIXES = {"latex": ".tex", "optuna": ".db", "pdf": ".pdf", "svg": ".svg", "png": ".png"}
+
+
+@checked
+def dataframe(
+    sweep: str | Path,
+    rows: Literal["trials", "iterations", "evaluations", "settings"] = "trials",
+    *,
+    storage: str | Path | None = None,
+) -> pd.DataFrame:
+    """Return a table of a sweep as a pandas DataFrame.
+
+    The guide on exports says what the columns are.
+
+    Args:
+        sweep: Name or folder.
+        rows: What a row is: a trial, as in `trials.csv` of the report; an iteration of a trial; a greedy evaluation of
+            one; or a setting, judged over its training seeds, the one to train with first.
+        storage: Folder for sweeps.
+
+    Raises:
+        NotFoundError: There is no such sweep.
+    """
+    from analysis.exports.frames import make_frame
+    from tune_jobs.sweeps.conclude import find_sweep
+
+    return make_frame(sweep_data(find_sweep(sweep, storage)), rows)
+
+
+@checked
+def study(sweep: str | Path, *, storage: str | Path | None = None) -> optuna.Study:
+    """Return the ended trials of a sweep as an Optuna study in memory; `export` writes one to a file.
+
+    A trial's value is what settings are judged by (`objective` in the sweep file), higher is better; its evaluations
+    are intermediate values; one that a scheduler ended is pruned.
+
+    Raises:
+        NotFoundError: There is no such sweep.
+        CannotRunError: Optuna is not installed.
+        SpecError: It is a sweep of population based training, whose trials have no one value of a hyperparameter.
+    """
+    from tune_jobs.search.study import make_study
+    from tune_jobs.sweeps.conclude import find_sweep
+
+    store = find_sweep(sweep, storage)
+    return make_study(_spec_of(store), sweep_data(store), store.name)
+
+
+@checked
+def figure(
+    sweeps: str | Path | Sequence[str | Path],
+    *,
+    top: PositiveInt = 3,
+    returns: Literal["evaluation", "training"] = "evaluation",
+    width: Inches = 3.4,
+    height: Inches = 2.5,
+    storage: str | Path | None = None,
+) -> Figure:
+    """Draw how the leading settings learn, with bands over training seeds, as a matplotlib Figure for a paper.
+
+    A curve is the mean over the seeds of a setting, its band the 95 % interval of that mean; with one seed a setting
+    there is no band. Curves are dashed from where the first of their seeds has ended: it is held at its last value.
+
+    Args:
+        sweeps: One sweep, or several of one environment.
+        top: How many settings of each.
+        returns: Greedy evaluations, or the mean of the last 100 training episodes.
+        width: Inches.
+        height: Inches.
+        storage: Folder for sweeps.
+
+    Raises:
+        NotFoundError: There is no such sweep, or nothing of it to draw.
+        SpecError: The sweeps are of different environments, whose returns have no common axis.
+    """
+    names = [sweeps] if isinstance(sweeps, str | Path) else list(sweeps)
+    return _figure(names, storage, top=top, returns=returns, size=(width, height))
+
+
+@checked
+def export(
+    sweeps: str | Path | Sequence[str | Path],
+    format: Literal["csv", "parquet", "latex", "optuna", "pdf", "svg", "png"],  # noqa: A002
+    *,
+    output: str | Path | None = None,
+    top: PositiveInt | None = None,
+    storage: str | Path | None = None,
+) -> dict[str, Path]:
+    """Write a sweep in another form.
+
+    Args:
+        sweeps: One sweep; for a figure also several.
+        format: `csv` and `parquet` write a folder with a table each of trials, iterations, evaluations and settings;
+            `latex` a table of the leading settings (booktabs); `optuna` a study in a SQLite file; `pdf`, `svg` and
+            `png` the learning curves of the leading settings.
+        output: The folder (csv, parquet) or file to write; None: `NAME-csv`, `NAME-parquet`, `NAME.tex`, `NAME.db`,
+            `NAME.pdf`, ... in the current folder.
+        top: How many settings the LaTeX table (10) or the figure (3 of each sweep) shows.
+        storage: Folder for sweeps.
+
+    Returns:
+        The files, by what they are.
+
+    Raises:
+        NotFoundError: There is no such sweep, or nothing of it to draw.
+        SpecError: Several sweeps are given for a table, or the sweep has no form of this kind.
+        CannotRunError: A file cannot be written, or a package is not installed.
+    """
+    from tune_jobs.sweeps.conclude import find_sweep
+
+    names = [sweeps] if isinstance(sweeps, str | Path) else list(sweeps)
+    if not names or (len(names) > 1 and format not in FIGURES):
+        raise SpecError(
+            f"{len(names)} sweeps were given; {format} is of one.",
+            f"Export them one by one; several go into one figure ({', '.join(FIGURES)}).",
+        )
+    store = find_sweep(names[0], storage)
+    suffix = _SUFFIXES.get(format, f"-{format}")
+    path = Path(f"{store.name}{suffix}") if output is None else expanded(output)
+    if format in _SUFFIXES and path.suffix.lower() != suffix:
+        path = path.with_name(f"{path.name}{suffix}")
+    if format in FIGURES:
+        from analysis.exports.paper import COLUMN_WIDTH, save_figure
+
+        drawn = _figure(names, storage, top=top or 3, returns="evaluation", size=COLUMN_WIDTH)
+        return {"figure": save_figure(drawn, path)}
+    if format == "optuna":
+        from tune_jobs.search.study import make_study
+
+        make_study(_spec_of(store), sweep_data(store), store.name, path)
+        return {"study": path}
+    if format == "latex":
+        return {"table": _write_latex(store, path, top)}
+    return _write_tables(sweep_data(store), path, format)
+
+
+def sweep_data(store: Sweep) -> SweepData:
+    """Return what the tables and figures of a sweep are made of.
+
+    Raises:
+        CheckpointError: The record of the sweep or of a trial is damaged.
+    """
+    from analysis.report_data import goal_of
+    from tune_jobs.store.candidates import read_results, read_trials
+
+    best: BestRecord | None = None
+    try:
+        best = store.read_best()
+    except NotFoundError:
+        # No winner was chosen yet, or it can't be read: then the env's own threshold counts.
+        best = None
+    spec = _spec_of(store)
+    return SweepData(
+        trials=read_trials(store),
+        results=read_results(store),
+        objective=spec.objective.type,
+        num_env_steps=spec.stop.num_env_steps,
+        threshold=goal_of(store.read_record(), best),
+        has_settings=spec.scheduler.type != "pbt",
+    )
+
+
+def _spec_of(store: Sweep) -> SweepSpec:
+    from tune_jobs.spec.file import stored_spec
+
+    return stored_spec(store.read_record())
+
+
+def _figure(
+    names: Sequence[str | Path],
+    storage: str | Path | None,
+    *,
+    top: int,
+    returns: Returns,
+    size: tuple[float, float],
+) -> Figure:
+    from analysis.exports.paper import learning_figure
+    from tune_jobs.sweeps.conclude import find_sweep
+
+    if not names:
+        raise SpecError("No sweep was given to draw.", "Give one sweep, or several of one environment.")
+    stores = [find_sweep(name, storage) for name in names]
+    envs = {store.name: _spec_of(store).env for store in stores}
+    first = stores[0].name
+    for name, env in envs.items():
+        if (env.id, env.args) != (envs[first].id, envs[first].args):
+            raise SpecError(
+                f"Sweep {first} is on {envs[first].id}, {name} on {env.id}"
+                f"{' with other arguments' if env.id == envs[first].id else ''}: their returns have no common axis.",
+                "Draw them one by one.",
+            )
+    return learning_figure([(store.name, sweep_data(store)) for store in stores], top=top, returns=returns, size=size)
+
+
+def _write_latex(store: Sweep, path: Path, top: int | None) -> Path:
+    from analysis.exports.latex import NUM_LISTED, latex_table
+    from policies.files import write_atomic
+
+    data = sweep_data(store)
+    if not data.has_settings:
+        raise SpecError(
+            f"Sweep {store.name} is one of population based training, whose trials have no settings to list.",
+            "Export it as csv or parquet.",
+        )
+    text = latex_table(data, name=store.name, env_id=_spec_of(store).env.id, top=top or NUM_LISTED)
+    write_atomic(path, text)
+    return path
+
+
+def _write_tables(data: SweepData, folder: Path, kind: str) -> dict[str, Path]:
+    from analysis.exports.frames import flat, make_frame
+    from analysis.tables import write_csv
+    from policies.files import write_atomic
+
+    if folder.exists() and not folder.is_dir():
+        raise CannotRunError(f"{folder} is a file; {kind} writes a folder of tables.", "Give a folder.")
+    written: dict[str, Path] = {}
+    for rows in ROWS:
+        path = folder / f"{rows}.{kind}"
+        frame = make_frame(data, rows)
+        if kind == "csv":
+            write_csv(path, frame)
+        else:
+            write_atomic(path, flat(frame).to_parquet(index=False))
+        written[rows] = path
+    return written
+
+
+__all__ = ["FIGURES", "FORMATS", "Rows", "dataframe", "export", "figure", "study", "sweep_data"]

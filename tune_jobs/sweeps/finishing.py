@@ -1,0 +1,110 @@
+"""Finish a sweep whose trials have ended: choose, confirm and film the winner, and write the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+
+from analysis.records import BestRecord
+from policies.errors import EnvFailedError, TuneJobsError
+from tune_jobs.process.interruption import current
+from tune_jobs.store.contract import Sweep
+from tune_jobs.sweeps.drive import noted
+from tune_jobs.sweeps.outcome import SweepResult
+
+
+def finish_sweep(store: Sweep, result: SweepResult, progress: str = "none", *, keep: bool = False) -> SweepResult:
+    """Choose, confirm and film the winner, and write the report; what can't be made is noted, and raises no error.
+
+    Args:
+        store: The sweep.
+        result: The trials.
+        progress: Whether it is told what is done, as for `launch`.
+        keep: Whether only what is missing or out of date is made: the records of a sweep that was finished before stay
+            as they are, whichever machine, version or number of episodes they came from.
+    """
+    made = _Finish(store, progress, keep=keep)
+    with noted():
+        made.make_all()
+    return replace(
+        result,
+        best=made.best,
+        why_no_best=made.why_no_best,
+        finish_failed=made.failed,
+        artifacts=made.artifacts,
+        notes=tuple(made.notes),
+        interrupted=made.stopped or current().came,
+    )
+
+
+class _Finish:
+    """Makes what comes after the trials, as far as possible."""
+
+    def __init__(self, store: Sweep, progress: str, *, keep: bool) -> None:
+        self._store = store
+        self._progress = progress
+        self._keep = keep
+        self.best: BestRecord | None = None
+        self._why: TuneJobsError | None = None
+        self.artifacts: dict[str, Path] = {}
+        self.notes: list[str] = []
+        self.stopped = False
+        """Whether another process asked to stop before everything was made."""
+        self.failed = False
+        """Whether no winner could be confirmed, or the environment failed where it was filmed."""
+
+    @property
+    def why_no_best(self) -> str | None:
+        """Why no winner could be chosen."""
+        return None if self._why is None else str(self._why)
+
+    def make_all(self) -> None:
+        """Make everything that can be made."""
+        from tune_jobs.sweeps import conclude as finish
+        from tune_jobs.sweeps.policy_choice import confirmed_best
+        from tune_jobs.sweeps.settings import with_present_settings
+
+        store = self._store
+        if self._keep:
+            self.best = confirmed_best(store)
+        kept = self.best is not None
+        try:
+            if self.best is not None:
+                self.best = with_present_settings(store, self.best)
+            else:
+                with self._working("confirming the best policy"):
+                    self.best = finish.choose_best(store)
+            self.artifacts["policy"] = store.best_policy_path
+        except TuneJobsError as error:
+            self._why = error
+        self.failed = self._why is not None
+        if self.best is not None:
+            films = dict(store.current_films()) if kept else {}
+            self.artifacts.update(films)
+            if not films:
+                self._attempt("video", "filming the best policy", lambda: finish.make_videos(store))
+        page = store.current_report() if kept else None
+        if page is not None:
+            self.artifacts["report"] = page
+        else:
+            self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
+
+    def _working(self, doing: str) -> AbstractContextManager[None]:
+        from tune_jobs.sweeps.live_view import working
+
+        return working(self._store.name, doing, self._progress)
+
+    def _attempt(self, what: str, doing: str, make: Callable[[], dict[str, Path]]) -> None:
+        # Another process may have asked to stop, which ends this too.
+        self.stopped = self.stopped or self._store.stop_requested()
+        if self.stopped:
+            return
+        try:
+            with self._working(doing):
+                self.artifacts.update(make())
+        except TuneJobsError as error:
+            self.notes.append(f"No {what}: {error}")
+            # Other errors are expected, as not every environment can be drawn.
+            self.failed = self.failed or isinstance(error, EnvFailedError)

@@ -1,0 +1,272 @@
+"""Run a trial again from its record, and say whether it comes to the same."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from analysis.comparison.repetition import Changed, Repetition, causes, first_difference
+from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialPlan, TrialRecord
+from analysis.selection import error_summary
+from analysis.wording import counted
+from policies.arguments import checked
+from policies.envs.modules import allow_modules
+from policies.errors import CannotRunError, NotFoundError, SpecError
+from policies.guard.guard import guarding
+from policies.guard.guarded import check_env, measure_step
+from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import SweepPlan
+from tune_jobs.process.ran_with import versions
+from tune_jobs.spec.engines import engine_named
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.sections import SchedulerSpec, SearchSpec
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.logs import continued_from
+from tune_jobs.store.transitions import pending_record
+from tune_jobs.sweeps.alone import run_alone
+from tune_jobs.sweeps.drive import git_commit, machine_here, settled
+from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.sources import find_source, find_trial
+from tune_jobs.sweeps.stages import run_sweep
+from tune_jobs.sweeps.storage import expanded
+
+_LONG_S = 1e9
+_WEIGHTS = "policy.safetensors"
+
+
+@checked
+def reproduce(
+    source: str | Path,
+    *,
+    output: str | Path | None = None,
+    storage: str | Path | None = None,
+    progress: Literal["auto", "none"] = "auto",
+) -> Repetition:
+    """Run a trial again from its record, as it ran, and compare every iteration of the two; the trial is only read.
+
+    It runs until the last iteration that is recorded, also where a scheduler ended the trial there; a trial that failed
+    for one more. It runs on this machine, by the engine that is recorded; a member of a pack is a pack of its own, as
+    its random numbers do not depend on the others (decision 10). What came after the trial had continued from a
+    checkpoint, because it was interrupted or failed, can't be repeated, and is not compared.
+
+    Args:
+        source: `SWEEP/t0003`, or the trial's folder.
+        output: Folder to keep the repetition in, which must not exist; None: it is removed.
+        storage: Folder for sweeps.
+        progress: The same as for `launch`.
+
+    Returns:
+        Equal or not; if not, from which iteration on, and what is other now: CPU, versions, environment variables.
+
+    Raises:
+        NotFoundError: There is no such trial, or it has done no iteration.
+        SpecError: No trial was named, or it is one of population based training, which continued from checkpoints of
+            others.
+        CannotRunError: It cannot run here, or the folder exists or cannot be written.
+        SweepInterrupted: Ctrl-C, SIGTERM or SIGHUP ended it.
+    """
+    store, trial_id = find_source(source, storage)
+    if trial_id is None:
+        raise SpecError(
+            f"{store.name} is a sweep; one of its trials is repeated at a time.",
+            f"Name one, such as {store.name}/t0000.",
+        )
+    trial, sweep = find_trial(store, trial_id), store.read_record()
+    spec = stored_spec(sweep)
+    recorded = store.trial(trial.trial_id).read_iterations()
+    _check(store, trial, spec, recorded)
+    repeatable = _repeatable(store, trial, recorded)
+    where, is_kept = _folder(output, store.name)
+    again = open_sweep(where)
+    again.create()
+    try:
+        _write(again, sweep, spec, trial, repeatable[-1].iteration if repeatable else 1)
+        _train_again(str(again.folder), progress)
+        return _compared(store, again, trial, len(repeatable), is_kept=is_kept)
+    finally:
+        if not is_kept:
+            shutil.rmtree(where.parent, ignore_errors=True)
+
+
+def _check(store: Sweep, trial: TrialRecord, spec: SweepSpec, recorded: Sequence[IterationRecord]) -> None:
+    name = f"{store.name}/{trial.trial_id}"
+    if spec.scheduler.type == "pbt":
+        raise SpecError(
+            f"{name} is of a population: it continued from checkpoints of other trials, and when depended on which was "
+            "faster, so it can't be repeated by itself.",
+            "Launch the sweep again, with resources that run one process at a time, to repeat a population.",
+        )
+    if not trial.has_point or not recorded:
+        why = f": it failed before ({error_summary(trial.error)})" if trial.status == "failed" else ""
+        raise NotFoundError(
+            f"{name} has done no iteration that could be repeated{why}.", f"See `tune-jobs trials {store.name}`."
+        )
+
+
+def _repeatable(store: Sweep, trial: TrialRecord, recorded: Sequence[IterationRecord]) -> list[IterationRecord]:
+    """Return the iterations before the trial continued from a checkpoint for the first time; mostly all."""
+    continued = continued_from(store.trial(trial.trial_id).log_path)
+    return [item for item in recorded if continued is None or item.iteration <= continued]
+
+
+def _folder(output: str | Path | None, name: str) -> tuple[Path, bool]:
+    """Return the folder of the repetition, and whether it is kept."""
+    if output is None:
+        return Path(tempfile.mkdtemp(prefix="tune-jobs-reproduce-")) / name, False
+    folder = expanded(output)
+    if folder.exists():
+        raise CannotRunError(f"{folder} exists already.", "Give a folder that does not exist; it is made.")
+    return folder, True
+
+
+def _write(again: Sweep, sweep: SweepRecord, spec: SweepSpec, trial: TrialRecord, last_iteration: int) -> None:
+    """Write a sweep of the one trial: nothing but its stop rules, and what chose or ended trials, is other."""
+    # One that failed did so in the iteration after the last that is recorded.
+    cap = last_iteration + (trial.status == "failed")
+    stop = spec.stop.model_copy(
+        update={"num_iterations": min(spec.stop.num_iterations, max(1, cap)), "time_s": _LONG_S}
+    )
+    changes = {
+        "stop": stop, "scheduler": SchedulerSpec(), "search": SearchSpec(), "max_retries": 0, "name": again.name,
+    }  # fmt: skip
+    plan = TrialPlan.model_validate({name: getattr(trial, name) for name in TrialPlan.model_fields})
+    again.trial(trial.trial_id).write_record(pending_record(plan))
+    again.write_record(
+        sweep.model_copy(
+            update={
+                "name": again.name, "state": "created", "spec": spec.model_copy(update=changes).model_dump(mode="json"),
+                "num_trials": 1, "created_at": time.time(), "started_at": None, "ended_at": None, "run_time_s": 0.0,
+                "versions": versions(), "git_commit": git_commit(), "address": None,
+            }
+        )
+    )  # fmt: skip
+
+
+@run_alone
+@guarding(start=True)
+def _train_again(folder: str, progress: str) -> SweepResult:
+    """Run the one trial of a folder, in Ray's processes, as it ran."""
+    store = open_sweep(Path(folder))
+    record = store.read_record()
+    allow_modules(record.allowed_modules)
+    spec = stored_spec(record)
+    (trial,) = store.read_trials()
+    machine = machine_here()
+    plan = _plan(spec, trial, record, machine)
+    with store.lock(), settled(store):
+        return run_sweep(store, plan, address=None, machine=machine, finish=False, progress=progress)
+
+
+def _plan(spec: SweepSpec, trial: TrialRecord, record: SweepRecord, machine: Machine) -> SweepPlan:
+    cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
+    if machine.fitting(cpus, gpus) < 1:
+        raise CannotRunError(
+            f"{trial.trial_id} needs {counted(cpus, 'CPU')} and {gpus:g} GPUs; {machine.source} has "
+            f"{machine.num_cpus:g} and {machine.num_gpus:g}.",
+            "Run it on a machine like the one it ran on.",
+        )
+    env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
+    env = check_env(env_id, env_args, spec.algorithm, timeout_s=timeout_s)
+    packs = None
+    if engine_named(trial.engine).trains_many:
+        from policies.packed.envs.make import choose_kind
+
+        choice = choose_kind(measure_step(env_id, env_args, timeout_s=timeout_s), spare_cpus=0)
+        packs = PackPlan(
+            num_packs=1, slots=1, cpus_per_pack=cpus, gpus_per_pack=gpus, trial_ids=(trial.trial_id,),
+            env_kind=choice.kind, env_step_us=choice.step_us, num_env_processes=0,
+        )  # fmt: skip
+    return SweepPlan(
+        trials=(trial,), num_points=1, cpus_per_trial=cpus, gpus_per_trial=gpus, max_concurrent=1,
+        evaluation_seeds=record.evaluation_seeds, confirmation_seeds=record.confirmation_seeds, max_env_steps=0,
+        max_disk_bytes=0, env=env, machine=machine, packs=packs,
+    )  # fmt: skip
+
+
+def _compared(store: Sweep, again: Sweep, trial: TrialRecord, num_repeatable: int, *, is_kept: bool) -> Repetition:
+    recorded, sweep = store.trial(trial.trial_id).read_iterations(), store.read_record()
+    repeatable = recorded[:num_repeatable]
+    (repeated,) = again.read_trials()
+    # The last recorded iteration of a trial that a scheduler or a signal ended may lie between two evaluations.
+    ended = trial.status not in ("completed", "failed") or len(repeatable) < len(recorded)
+    difference = first_difference(repeatable, again.trial(trial.trial_id).read_iterations(), may_lack_evaluation=ended)
+    last = repeatable[-1].iteration if difference is None and repeatable else 0
+    same = [
+        _weights(store, ours) == _weights(again, theirs)
+        for ours in trial.checkpoints
+        for theirs in repeated.checkpoints
+        if ours.iteration == theirs.iteration <= last
+    ]
+    known = trial.ran_with or sweep.versions
+    changed = list(causes(known, repeated.ran_with or versions()))
+    commits = (sweep.git_commit, again.read_record().git_commit)
+    if commits[0] != commits[1]:
+        changed.append(Changed("git commit", *(commit or "none" for commit in commits)))
+    return Repetition(
+        name=f"{store.name}/{trial.trial_id}",
+        num_iterations=len(recorded),
+        num_compared=len(repeatable),
+        first_difference=None if difference is None else difference[0],
+        differences=() if difference is None else difference[1],
+        num_equal_weights=sum(same),
+        num_other_weights=len(same) - sum(same),
+        causes=tuple(changed),
+        notes=tuple(_notes(store, trial, repeated, len(recorded) - len(repeatable), is_known="cpu" in known)),
+        knows_cpu="cpu" in known,
+        folder=again.folder if is_kept else None,
+    )
+
+
+def _weights(store: Sweep, checkpoint: CheckpointRecord) -> str | None:
+    folder = store.checkpoint_folder(checkpoint)
+    path = folder / _WEIGHTS
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def _notes(store: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out: int, *, is_known: bool) -> list[str]:
+    notes = []
+    if num_left_out:
+        notes.append(
+            f"The last {counted(num_left_out, 'iteration')} can't be repeated: the trial was interrupted or failed, "
+            "and continued from its checkpoint with new episodes."
+        )
+    if trial.status == "stopped":
+        notes.append("A scheduler ended the trial there; the repetition ended at the same iteration.")
+    if trial.status in ("running", "paused"):
+        notes.append(f"The trial is {trial.status}: it was repeated as far as it was recorded.")
+    if trial.status == "failed" or repeated.status == "failed":
+        notes.append(_failures(trial, repeated))
+    others = [
+        other
+        for other in store.read_trials()
+        if other.engine == trial.engine == "packed" and (other.node, other.pid) == (trial.node, trial.pid)
+        and other.trial_id != trial.trial_id and trial.pid is not None
+    ]  # fmt: skip
+    if others:
+        notes.append(
+            f"It was trained in a process with {counted(len(others), 'other trial')}, and repeated alone: the "
+            "last bits of its sums may depend on the others of its pack, its random numbers do not."
+        )
+    if not is_known:
+        here = ", ".join(f"{name} {value}" for name, value in repeated.ran_with.items() if name not in versions())
+        notes.append(
+            "The record is of an older version, which wrote down neither the CPU nor environment variables; here they "
+            f"are: {here}."
+        )
+    return notes
+
+
+def _failures(trial: TrialRecord, repeated: TrialRecord) -> str:
+    if trial.status != "failed":
+        return f"The repetition failed: {error_summary(repeated.error)}"
+    if repeated.status != "failed":
+        return f"The trial had failed ({error_summary(trial.error)}); the repetition did not, in the next iteration."
+    return f"Both failed; the trial: {error_summary(trial.error)}; the repetition: {error_summary(repeated.error)}"

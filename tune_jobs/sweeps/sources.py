@@ -1,0 +1,55 @@
+"""Find what a text names: a sweep, or one trial of a sweep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from analysis.records import TrialRecord
+from policies.errors import NotFoundError
+from policies.suggestions import did_you_mean
+from tune_jobs.store.candidates import read_trials
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.local_storage import sweep_of_trial
+from tune_jobs.sweeps.storage import expanded
+
+
+def find_source(source: str | Path, storage: str | Path | None = None) -> tuple[Sweep, str | None]:
+    """Find a sweep by name or folder, or a trial of one: `SWEEP/t0003`, or the trial's folder.
+
+    Returns:
+        The sweep, and the trial's id as it was given, which need not exist; None: it is the sweep.
+
+    Raises:
+        NotFoundError: There is no such sweep.
+    """
+    from tune_jobs.sweeps.conclude import find_sweep
+
+    folder = expanded(source)
+    if (of_trial := sweep_of_trial(folder)) is not None:
+        return of_trial, folder.name
+    try:
+        return find_sweep(source, storage), None
+    except NotFoundError as error:
+        sweep, _, trial_id = str(source).rstrip("/").rpartition("/")
+        if not sweep:
+            raise
+        try:
+            return find_sweep(sweep, storage), trial_id
+        except NotFoundError:
+            raise error from None
+
+
+def find_trial(store: Sweep, trial_id: str) -> TrialRecord:
+    """Return the record of a trial.
+
+    Raises:
+        NotFoundError: The sweep has no such trial.
+    """
+    trials = {record.trial_id: record for record in read_trials(store)}
+    if trial_id not in trials:
+        raise NotFoundError(
+            f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)} trials."
+            f"{did_you_mean(trial_id, list(trials))}",
+            f"List them with `tune-jobs trials {store.name}`.",
+        )
+    return trials[trial_id]
