@@ -159,7 +159,8 @@ def fewest_env_steps(
     over = f"a mean training return of {number(goal)} over {SOLVED_OVER_NUM_EPISODES} episodes"
     if solving.empty:
         return f"No trial reached {over}."
-    first = solving.iloc[0]
+    # By columns: a row of them would have one type for all its numbers, and with it another word for "missing".
+    first = {column: solving[column].iloc[0] for column in solving.columns}
     values = ", ".join(f"{name} {number(first[name])}" for name in point_names(trials))
     who = f"{values} reaches" if values else "The sweep's one point reaches"
     median, num_seeds = finite_or_none(float(first["median_num_env_steps"])), int(first["num_seeds"])

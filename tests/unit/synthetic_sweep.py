@@ -87,6 +87,8 @@ def make_sweep(
             threshold=threshold,
         )
         trial = make_trial(index, seeds_per_point=seeds_per_point, point=point, status=status, rows=rows)
+        if trial.stop_reason is not None and len(rows) < stop_at:
+            trial = trial.model_copy(update={"stop_reason": f"training_return {threshold} >= {threshold}"})
         trials.append(trial.model_copy(update={"error": error if status == "failed" else None}))
         results[trial.trial_id] = rows
     sweep = make_sweep_record(name, algorithm, env_id, trials, seeds_per_point)
