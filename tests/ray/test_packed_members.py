@@ -32,13 +32,13 @@ pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 SHARED = {"train_batch_size": 256, "minibatch_size": 64, "num_epochs": 4, "num_envs": 8, "lr": 3e-3}
 
 
-def make_stack(env_id: str, **shared: Any) -> PPOStack:
+def make_stack(env_id: str, env_args: dict[str, Any] | None = None, **shared: Any) -> PPOStack:
     from policies.packed.envs.make import make_packed_envs
     from policies.packed.make import make_stack as make
 
     hyperparams = PPOHyperparams(**{**SHARED, **shared})
     kind: EnvKind = "vectorised" if env_id == "CartPole-v1" else "scalar"
-    return cast("PPOStack", make(hyperparams, make_packed_envs(env_id, {}, hyperparams.num_envs, kind=kind)))
+    return cast("PPOStack", make(hyperparams, make_packed_envs(env_id, env_args, hyperparams.num_envs, kind=kind)))
 
 
 def add(stack: PPOStack, name: str, seed: int, member: PPOMember | None = None, **values: Any) -> None:
@@ -111,6 +111,29 @@ def test_a_member_does_not_depend_on_the_others(env_id: str, shared: dict[str, A
         assert packed.rng.bit_generator.state == alone.rng.bit_generator.state
         assert packed.num_env_steps == alone.num_env_steps
         assert packed.num_optimizer_steps == alone.num_optimizer_steps
+
+
+@pytest.mark.parametrize("size", [32, 64])
+def test_of_equal_sizes_a_member_does_not_depend_on_the_others_to_the_bit(size: int) -> None:
+    """Nothing is padded: each matrix of its own has the shape that it has alone, and so its sums are the same.
+
+    Of episodes that are truncated after 50 steps one member has many where another has none.
+    """
+
+    def weights_beside(num_others: int) -> dict[str, bytes]:
+        stack = make_stack("CartPole-v1", {"max_episode_steps": 50}, hidden_sizes=(size,))
+        add(stack, "watched", 77, hidden_sizes=(size,))
+        for index in range(num_others):
+            add(stack, f"o{index}", index, hidden_sizes=(size,), lr=1e-3 * (index + 1))
+        for _ in range(20):
+            stack.train_iteration()
+        found = {name: value.tobytes() for name, value in stack.member("watched").weights.items()}
+        stack.envs.close()
+        return found
+
+    alone = weights_beside(0)
+    assert weights_beside(3) == alone
+    assert weights_beside(9) == alone
 
 
 def test_members_of_one_seed_are_the_same() -> None:

@@ -260,15 +260,19 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         next_values = np.array(values[1:])
         cuts = [(step, row - rows.start, final) for step, row, final in fragment.cuts if rows.start <= row < rows.stop]
         if cuts:
-            # Each member gets as many rows as the member with the most; rows that are not filled are not read.
+            # In blocks of as many rows a member as it has envs, however many the others need: sums over matrices of
+            # another height may be rounded otherwise. Rows that are not filled are not read.
             places = [row // num_envs for _, row, _ in cuts]
-            slots = [places[:number].count(place) for number, place in enumerate(places)]
-            finals = np.zeros((num_members, max(slots) + 1, fragment.last.shape[1]), dtype=np.float32)
-            for place, slot, (_, _, final) in zip(places, slots, cuts, strict=True):
-                finals[place, slot] = final
-            found = self._evaluate(group, observations.prepare(finals.reshape(-1, finals.shape[-1])))
-            for place, slot, (step, row, _) in zip(places, slots, cuts, strict=True):
-                next_values[step, row] = found[place, slot]
+            slots = [divmod(places[:number].count(place), num_envs) for number, place in enumerate(places)]
+            num_blocks = 1 + max(block for block, _ in slots)
+            finals = np.zeros((num_blocks, num_members, num_envs, fragment.last.shape[1]), dtype=np.float32)
+            for place, (block, slot), (_, _, final) in zip(places, slots, cuts, strict=True):
+                finals[block, place, slot] = final
+            found = [
+                self._evaluate(group, observations.prepare(final.reshape(-1, final.shape[-1]))) for final in finals
+            ]
+            for place, (block, slot), (step, row, _) in zip(places, slots, cuts, strict=True):
+                next_values[step, row] = found[block][place, slot]
         return values[:-1], next_values
 
     def _evaluate(self, group: PPOGroup, observations: Floats) -> Floats:
