@@ -10,7 +10,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -162,23 +162,17 @@ def drawable(values: ArrayLike) -> NDArray[np.float64]:
     return np.clip(np.asarray(values, dtype=np.float64), -MAX_DRAWN, MAX_DRAWN)
 
 
-def goal_line(axes: Axes, threshold: float | None) -> None:
-    """Draw the return to reach as a dashed line, if there is one."""
-    if threshold is not None:
-        axes.axhline(
-            float(drawable([threshold])[0]),
-            color=ACCENT,
-            linewidth=1.6,
-            linestyle=(0, (6, 3)),
-            label=f"goal {threshold:g}",
-            zorder=1.5,
-        )
+def goal_line(axes: Axes, threshold: float | None, *, axis: Literal["x", "y"] = "y") -> None:
+    """Draw the return to reach as a dashed line, if there is one.
 
-
-def goal_line_across(axes: Axes, threshold: float | None) -> None:
-    """Draw the return to reach on a horizontal axis, if there is one."""
+    Args:
+        axes: Where it is drawn.
+        threshold: The return; None: there is none.
+        axis: The axis that returns are on.
+    """
     if threshold is not None:
-        axes.axvline(
+        draw = axes.axhline if axis == "y" else axes.axvline
+        draw(
             float(drawable([threshold])[0]),
             color=ACCENT,
             linewidth=1.6,

@@ -9,7 +9,7 @@ files have the strings "NaN", "Infinity" and "-Infinity" for them. Files of olde
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
@@ -369,3 +369,13 @@ class SweepRecord(_Record):
     address: str | None = None
     allowed_modules: tuple[str, ...] = Field((), description="Modules of the user's own that its trials may import.")
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
+
+    def section(self, name: str) -> Mapping[str, Any]:
+        """Return a section of the sweep file, empty where a record lacks it or has something else there.
+
+        A text is the section's `type`: `objective: area` is `objective: {type: area}`.
+        """
+        found = self.spec.get(name)
+        if isinstance(found, str):
+            return {"type": found}
+        return found if isinstance(found, Mapping) else {}

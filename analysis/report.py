@@ -22,6 +22,7 @@ from analysis.page import all_trials, answer, cards, charts, cost, head, how_sur
 from analysis.page.bounded import bounded
 from analysis.page.figures import draw_figures
 from analysis.page.source import Source
+from analysis.page_templates import make_environment, template_file
 from analysis.plot_style import CSS_DARK, CSS_LIGHT
 from analysis.records import BestRecord, IterationRecord, SettingsRecord, SweepRecord, TrialRecord
 from analysis.tables import iterations_frame, steps_to_solve_frame, trials_frame, write_csv
@@ -95,29 +96,24 @@ def build_report(
 def _render(**sections: Any) -> str:
     from markupsafe import Markup
 
-    environment = _environment()
-    scripts = [_file(environment, name) for name in _SCRIPTS]
-    return environment.get_template("report.html.j2").render(
-        **sections,
-        css_light=CSS_LIGHT,
-        css_dark=CSS_DARK,
-        # Markup marks text as safe HTML: these are files of this package.
-        styles=[Markup(_file(environment, name)) for name in _STYLES],  # noqa: S704
-        scripts=[Markup(script) for script in scripts],  # noqa: S704
-        script_hashes=[_hash(script) for script in scripts],
+    scripts = [template_file(name) for name in _SCRIPTS]
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            **sections,
+            css_light=CSS_LIGHT,
+            css_dark=CSS_DARK,
+            # Markup marks text as safe HTML: these are files of this package.
+            styles=[Markup(template_file(name)) for name in _STYLES],  # noqa: S704
+            scripts=[Markup(script) for script in scripts],  # noqa: S704
+            script_hashes=[_hash(script) for script in scripts],
+        )
     )
 
 
 def _environment() -> jinja2.Environment:
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("analysis", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = make_environment()
     environment.globals |= {
         "interval_text": wording.interval_text,
         "difference_text": wording.difference_text,
@@ -131,8 +127,3 @@ def _hash(script: str) -> str:
     """Return a script's hash as the content security policy names it."""
     digest = hashlib.sha256(script.encode("utf-8")).digest()
     return f"sha256-{base64.b64encode(digest).decode('ascii')}"
-
-
-def _file(environment: jinja2.Environment, name: str) -> str:
-    assert environment.loader is not None  # noqa: S101  (for the type checker: _environment sets it)
-    return environment.loader.get_source(environment, name)[0]

@@ -10,8 +10,7 @@ from policies.portable.file import BASELINE_KINDS
 
 def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
     """Return the return that counts as solved: the objective's own threshold, else the env's, else the stop rule's."""
-    objective = sweep.spec.get("objective")
-    own = finite_or_none(objective.get("threshold")) if isinstance(objective, Mapping) else None
+    own = finite_or_none(sweep.section("objective").get("threshold"))
     if own is not None:
         return own
     if best is not None and best.confirmation.threshold is not None:
@@ -22,7 +21,7 @@ def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
     env_spec = gymnasium.registry.get(env_of(sweep))
     if env_spec is not None and env_spec.reward_threshold is not None:
         return float(env_spec.reward_threshold)
-    stop = sweep.spec.get("stop") or {}
+    stop = sweep.section("stop")
     wanted = [finite_or_none(stop.get(name)) for name in ("evaluation_return", "training_return")]
     return next((value for value in wanted if value is not None), None)
 
@@ -41,8 +40,7 @@ def algorithm_of(sweep: SweepRecord) -> str:
 
 def about_of(sweep: SweepRecord) -> dict[str, str]:
     """Look up what the sweep file says of the sweep, for the head of the page: title, description, expected."""
-    told = sweep.spec.get("about")
-    told = told if isinstance(told, Mapping) else {}
+    told = sweep.section("about")
     return {name: str(told.get(name) or "") for name in ("title", "description", "expected")}
 
 

@@ -15,7 +15,7 @@ from analysis.plot_style import (
     add_legend,
     drawable,
     escape,
-    goal_line_across,
+    goal_line,
     new_figure,
     steps_axis,
     style_axes,
@@ -76,7 +76,7 @@ def seed_strips(
     axes.grid(visible=False, axis="y")
     if counts_env_steps:
         steps_axis(axes)
-    goal_line_across(axes, threshold)
+    goal_line(axes, threshold, axis="x")
     _add_keys(axes, strips)
     add_legend(figure, axes, [], size, below=True)
     return figure

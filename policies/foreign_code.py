@@ -164,21 +164,12 @@ def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
 
 
 def _sb3_dqn(values: DQNHyperparams, num_env_steps: int) -> tuple[dict[str, Any], list[str]]:
-    lacking = [
-        name
-        for name, differs in (
-            ("double_q", values.double_q),
-            ("dueling", values.dueling),
-            ("replay " + values.replay, values.replay != "uniform"),
-            ("td_loss mse", values.td_loss == "mse"),
-            ("optimizer rmsprop", values.optimizer == "rmsprop"),
-            ("target_network false", not values.target_network),
-            ("the schedule of epsilon", values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step"),
-            ("updates of the target by episodes", values.target_update_unit == "episode"),
-        )
-        if differs
-    ]
-    notes = [f"SB3's DQN lacks {', '.join(lacking)}."] if lacking else []
+    lacks = {
+        "double_q": values.double_q,
+        "dueling": values.dueling,
+        "replay " + values.replay: values.replay != "uniform",
+        "td_loss mse": values.td_loss == "mse",
+    }
     train_freq = max(1, round(values.train_freq / values.num_envs))
     return {
         "buffer_size": values.replay_capacity,
@@ -192,7 +183,7 @@ def _sb3_dqn(values: DQNHyperparams, num_env_steps: int) -> tuple[dict[str, Any]
         "exploration_fraction": min(1.0, values.epsilon_decay / max(1, num_env_steps)),
         "exploration_initial_eps": values.epsilon_initial,
         "exploration_final_eps": values.epsilon_final,
-    }, notes
+    }, _dqn_notes("SB3", lacks | _lacking_in_both(values))
 
 
 def _rllib_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
@@ -220,17 +211,6 @@ def _rllib_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
 
 
 def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
-    lacking = [
-        name
-        for name, differs in (
-            ("replay none", values.replay == "none"),
-            ("optimizer rmsprop", values.optimizer == "rmsprop"),
-            ("target_network false", not values.target_network),
-            ("the schedule of epsilon", values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step"),
-            ("updates of the target by episodes", values.target_update_unit == "episode"),
-        )
-        if differs
-    ]
     replay: dict[str, Any] = {"type": "EpisodeReplayBuffer", "capacity": values.replay_capacity}
     if values.replay == "prioritized":
         replay = replay | {
@@ -252,7 +232,22 @@ def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
         "num_steps_sampled_before_learning_starts": values.learning_starts,
         "epsilon": [[0, values.epsilon_initial], [decay, values.epsilon_final]],
         "replay_buffer_config": replay,
-    }, [f"RLlib's DQN lacks {', '.join(lacking)}."] if lacking else []
+    }, _dqn_notes("RLlib", {"replay none": values.replay == "none"} | _lacking_in_both(values))
+
+
+def _lacking_in_both(values: DQNHyperparams) -> dict[str, bool]:
+    """Return what neither library's DQN has, by its name, with whether the values ask for it."""
+    return {
+        "optimizer rmsprop": values.optimizer == "rmsprop",
+        "target_network false": not values.target_network,
+        "the schedule of epsilon": values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step",
+        "updates of the target by episodes": values.target_update_unit == "episode",
+    }
+
+
+def _dqn_notes(library: str, lacks: Mapping[str, bool]) -> list[str]:
+    lacking = [name for name, is_wanted in lacks.items() if is_wanted]
+    return [f"{library}'s DQN lacks {', '.join(lacking)}."] if lacking else []
 
 
 def _env_kwargs(name: str, env_args: Mapping[str, Any]) -> str:

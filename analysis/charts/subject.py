@@ -55,30 +55,29 @@ class Subject:
     @property
     def space(self) -> Mapping[str, Any]:
         """The space of the sweep file, which records may lack."""
-        space = self.sweep.spec.get("space")
-        return space if isinstance(space, Mapping) else {}
+        return self.sweep.section("space")
 
     @property
     def is_population(self) -> bool:
         """Whether trials change their values while they train."""
-        return _section(self.sweep, "scheduler").get("type") == "pbt" or any(trial.changes for trial in self.trials)
+        return self.sweep.section("scheduler").get("type") == "pbt" or any(trial.changes for trial in self.trials)
 
     @property
     def objective(self) -> Objective:
         """What settings are judged by; what needs a threshold that nobody knows is judged by its end."""
-        kind = _section(self.sweep, "objective").get("type", "final")
+        kind = self.sweep.section("objective").get("type", "final")
         if kind not in get_args(Objective) or (kind == "steps_to_threshold" and self._threshold is None):
             return "final"
         return cast("Objective", kind)
 
     @property
     def _threshold(self) -> float | None:
-        own = _section(self.sweep, "objective").get("threshold")
+        own = self.sweep.section("objective").get("threshold")
         return float(own) if isinstance(own, int | float) else self.goal
 
     @property
     def _num_env_steps(self) -> int:
-        stated = _section(self.sweep, "stop").get("num_env_steps")
+        stated = self.sweep.section("stop").get("num_env_steps")
         return stated if isinstance(stated, int) else max((trial.num_env_steps for trial in self.trials), default=0)
 
     @property
@@ -125,11 +124,3 @@ class Subject:
         if self.is_population or not known:
             return setting.trial_ids[0]
         return ", ".join(f"{name} {short_text(setting.point[name])}" for name in known)
-
-
-def _section(sweep: SweepRecord, name: str) -> Mapping[str, Any]:
-    """Return a section of the sweep file; one that is written as its type alone is understood."""
-    found = sweep.spec.get(name)
-    if isinstance(found, str):
-        return {"type": found}
-    return found if isinstance(found, Mapping) else {}

@@ -97,8 +97,7 @@ def _not_comparable(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[
 
 def _env_of(item: Wanted) -> dict[str, Any]:
     """Return the arguments of an environment; what is made of its observations doesn't change returns."""
-    env = item.sweep.spec.get("env")
-    return dict(env.get("args") or {}) if isinstance(env, dict) else {}
+    return dict(item.sweep.section("env").get("args") or {})
 
 
 def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:

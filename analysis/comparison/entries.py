@@ -11,6 +11,7 @@ from analysis.core_seconds import core_seconds
 from analysis.exports.frames import SweepData, num_solved, ranked_settings
 from analysis.objectives import SettingScores
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
+from analysis.report_data import env_of
 from analysis.selection import error_summary
 from analysis.statistics import iqm, moderated_means, seed_intervals, steps_to_threshold
 from analysis.tables import env_steps_to
@@ -95,14 +96,13 @@ def make_entry(wanted: Wanted, letter: str) -> Entry:
     mine = [trial for trial in data.trials if wanted.point_index in (None, trial.point_index)]
     costs = core_seconds(data.trials, wanted.cores)
     known = [costs[trial.trial_id] for trial in mine if trial.trial_id in costs]
-    env = wanted.sweep.spec.get("env")
     entry = Entry(
         letter=letter,
         name=wanted.name,
         sweep=wanted.sweep.name,
         is_sweep=wanted.point_index is None,
         algorithm=str(wanted.sweep.spec.get("algorithm", "?")),
-        env_id=str(env.get("id", "?")) if isinstance(env, dict) else str(env),
+        env_id=env_of(wanted.sweep),
         objective=data.objective,
         point_index=wanted.point_index if chosen is None else chosen.point_index,
         point=(mine[0].point if mine and wanted.point_index is not None else {}) if chosen is None else chosen.point,

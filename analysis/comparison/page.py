@@ -14,6 +14,7 @@ from analysis.comparison.wording import fact_rows, pair_lines
 from analysis.exports.frames import ranked_settings
 from analysis.exports.paper import Returns, curves_of
 from analysis.objectives import SettingScores
+from analysis.page_templates import make_environment, template_file
 from analysis.plot_style import (
     CSS_DARK,
     CSS_LIGHT,
@@ -61,33 +62,27 @@ def write_page(path: Path, comparison: Comparison, wanted: Mapping[str, Wanted])
     Raises:
         CannotRunError: The file cannot be written.
     """
-    import jinja2
     from markupsafe import Markup
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("analysis", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     ready = {
         entry.letter: judged_alike(wanted[entry.letter], comparison.objective, entry.threshold)
         for entry in comparison.entries
     }
-    assert environment.loader is not None  # noqa: S101  (for the type checker: it is set above)
-    style = environment.loader.get_source(environment, "report.css")[0]
-    page = environment.get_template("comparison.html.j2").render(
-        entries=comparison.entries,
-        rows=fact_rows(comparison),
-        pairs=pair_lines(comparison),
-        not_comparable=comparison.not_comparable,
-        notes=comparison.notes,
-        figures=_figures(comparison, ready),
-        css_light=CSS_LIGHT,
-        css_dark=CSS_DARK,
-        # Markup marks text as safe HTML: this is a file of this package.
-        style=Markup(style),  # noqa: S704
+    page = (
+        make_environment()
+        .get_template("comparison.html.j2")
+        .render(
+            entries=comparison.entries,
+            rows=fact_rows(comparison),
+            pairs=pair_lines(comparison),
+            not_comparable=comparison.not_comparable,
+            notes=comparison.notes,
+            figures=_figures(comparison, ready),
+            css_light=CSS_LIGHT,
+            css_dark=CSS_DARK,
+            # Markup marks text as safe HTML: this is a file of this package.
+            style=Markup(template_file("report.css")),  # noqa: S704
+        )
     )
     write_atomic(path, page)
     return path

@@ -42,7 +42,7 @@ def score_points(
     threshold: float | None,
 ) -> Scored:
     """Return the points of a sweep with their scores; the arguments are those of `what_mattered`."""
-    wish = _section(sweep, "objective")
+    wish = sweep.section("objective")
     objective: Objective = wish.get("type", "final")
     given = finite_or_none(wish.get("threshold"))
     goal = threshold if given is None else given
@@ -52,7 +52,7 @@ def score_points(
         return Scored(objective, (), (), 0, why_none)
     cut = [trial.num_env_steps for trial in ended if trial.status == "stopped"]
     steps = min(cut) if cut else None
-    whole = int(_section(sweep, "stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
+    whole = int(sweep.section("stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
     shown: dict[str, float | None] = {}
     for trial in ended:
         rows = [row for row in results.get(trial.trial_id, ()) if steps is None or row.num_env_steps <= steps]
@@ -100,7 +100,7 @@ def _why_none(
     objective: Objective,
     goal: float | None,
 ) -> str:
-    if _section(sweep, "scheduler").get("type") == "pbt" or any(trial.changes for trial in trials):
+    if sweep.section("scheduler").get("type") == "pbt" or any(trial.changes for trial in trials):
         return "Population based training changes values while a trial trains, so no value has a score of its own."
     if objective == "steps_to_threshold" and goal is None:
         return "The objective is steps_to_threshold, and the threshold is not known: set objective.threshold."
@@ -109,11 +109,3 @@ def _why_none(
     if all(trial.status == "failed" for trial in ended):
         return "All trials failed."
     return ""
-
-
-def _section(sweep: SweepRecord, name: str) -> Mapping[str, Any]:
-    """Return a section of the spec, which older versions don't have and nobody promises to be a mapping."""
-    found = sweep.spec.get(name)
-    if isinstance(found, str):
-        return {"type": found}
-    return found if isinstance(found, Mapping) else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from analysis.core_seconds import busy_seconds
@@ -66,8 +66,7 @@ def _wall_time(source: Source) -> list[tuple[str, str]]:
 
 def _saved(source: Source) -> str:
     """Say what ending trials before their cap saved; empty: there is no cap, or no trial has ended."""
-    stop = source.sweep.spec.get("stop")
-    cap = stop.get("num_env_steps") if isinstance(stop, Mapping) else None
+    cap = source.sweep.section("stop").get("num_env_steps")
     ended = [trial for trial in source.trials if trial.status in ("completed", "stopped")]
     if not isinstance(cap, int) or not ended:
         return ""

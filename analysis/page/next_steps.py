@@ -98,10 +98,8 @@ def _setting(source: Source) -> Iterator[Step]:
     if settings is None or source.is_population or not source.is_trained:
         return
     spec, best = source.sweep.spec, settings.best
-    fixed = spec.get("hyperparams")
-    fixed = dict(fixed) if isinstance(fixed, Mapping) else {}
     content = _trained(spec) | {
-        "hyperparams": fixed | best.point,
+        "hyperparams": {**source.sweep.section("hyperparams"), **best.point},
         "seeds_per_point": _SEEDS_OF_A_SETTING,
         "seed": _next_seed(spec),
     }
@@ -118,10 +116,10 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     if values is None:
         return
     spec = source.sweep.spec
-    env, stop = spec.get("env"), spec.get("stop")
+    env = spec.get("env")
     env = env if isinstance(env, Mapping) else {"id": str(env)}
     env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
-    cap = stop.get("num_env_steps") if isinstance(stop, Mapping) else None
+    cap = source.sweep.section("stop").get("num_env_steps")
     changed = [name for name in ("frame_stack", "pixels", "failure_penalty") if env.get(name) not in (None, 1, False)]
     note = f" The env's {', '.join(changed)} are left out." if changed else ""
     if spec.get("rl_module"):

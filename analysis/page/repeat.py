@@ -69,7 +69,7 @@ def hyperparam_table(sweep: SweepRecord) -> Table:
     known = next((name for name in FOREIGN_NAMES if name == algorithm), None)
     if known is None:
         return Table([], [])
-    space, fixed = (_mapping(sweep.spec.get(name)) for name in ("space", "hyperparams"))
+    space, fixed = (sweep.section(name) for name in ("space", "hyperparams"))
     rows = []
     for name, field in HYPERPARAMS_BY_ALGORITHM[known].model_fields.items():
         default = _text(field.get_default(call_default_factory=True))
@@ -86,10 +86,6 @@ def hyperparam_table(sweep: SweepRecord) -> Table:
         cells = [Cell(name, name), Cell(text, text, f"wide {kind}".strip()), Cell(default, default)]
         rows.append([*cells, *(Cell(other, other, "wide") for other in others)])
     return Table(["hyperparameter", "in this sweep", "default", *LIBRARIES.values()], rows)
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
 
 
 def _text(value: Any) -> str:

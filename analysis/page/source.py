@@ -64,14 +64,12 @@ class Source:
     @property
     def is_population(self) -> bool:
         """Whether trials change their hyperparameters while they train, so that none has a setting."""
-        scheduler = self.sweep.spec.get("scheduler")
-        return isinstance(scheduler, Mapping) and scheduler.get("type") == "pbt"
+        return self.sweep.section("scheduler").get("type") == "pbt"
 
     @property
     def cores_per_process(self) -> float:
         """How many cores a process that trains has: those that the sweep file gives a trial."""
-        resources = self.sweep.spec.get("resources")
-        resources = resources if isinstance(resources, Mapping) else {}
+        resources = self.sweep.section("resources")
         return float(resources.get("num_cpus") or 1 + int(resources.get("num_env_runners") or 0))
 
     @cached_property
@@ -82,10 +80,9 @@ class Source:
     @cached_property
     def ranked(self) -> list[SettingScores]:
         """All settings with their scores, best first, where `settings` lists the leading ones."""
-        settings, stop = self.settings, self.sweep.spec.get("stop")
+        settings, cap = self.settings, self.sweep.section("stop").get("num_env_steps")
         if settings is None:
             return []
-        cap = stop.get("num_env_steps") if isinstance(stop, Mapping) else None
         return rank_settings(
             self.trials, self.results, settings.objective,
             num_env_steps=int(cap or max((trial.num_env_steps for trial in self.trials), default=0)),

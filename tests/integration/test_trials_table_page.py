@@ -12,7 +12,8 @@ from report_sources import source_of
 from synthetic_sweep import make_sweep
 
 from analysis.page import all_trials
-from analysis.report import _environment, _file
+from analysis.page_templates import template_file
+from analysis.report import _environment
 from tests.narrowing import present
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -60,7 +61,7 @@ def test_the_table_is_sorted_filtered_and_shown_whole(tmp_path: Path) -> None:
     section = environment.get_template("sections/trials.html.j2").render(
         source=source, trials=all_trials.section(source)
     )
-    script = _file(environment, "report.js")
+    script = template_file("report.js")
     page = tmp_path / "table.html"
     page.write_text(f"<title></title>{section}<script>{script}</script><script>{STEPS}</script>", encoding="utf-8")
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-sync"

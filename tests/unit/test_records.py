@@ -156,3 +156,13 @@ def test_a_score_that_is_not_finite_is_none(store: SweepStore) -> None:
     for value in (math.nan, math.inf, -math.inf):
         record = present(SAMPLES[CheckpointRecord]).model_copy(update={"evaluation_return": value})
         assert CheckpointRecord.model_validate_json(record.model_dump_json()).evaluation_return is None
+
+
+@pytest.mark.parametrize(
+    ("written", "section"),
+    [({"type": "area", "seed": 1}, {"type": "area", "seed": 1}), ("area", {"type": "area"}), (None, {}), ([1], {})],
+)
+def test_a_section_of_the_sweep_file_is_a_mapping_whatever_was_written(written: Any, section: dict[str, Any]) -> None:
+    sweep = SYNTHETIC.sweep.model_copy(update={"spec": {"objective": written}})
+    assert dict(sweep.section("objective")) == section
+    assert dict(sweep.section("stop")) == {}

@@ -14,6 +14,7 @@ import random
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 from policies.errors import CannotRunError
 from policies.files import refuse_others
@@ -38,10 +39,7 @@ def held(path: Path, message: str, hint: str) -> Iterator[None]:
     try:
         descriptor = _opened(path, os.O_RDWR | os.O_CREAT)
     except OSError as error:
-        reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
-        raise CannotRunError(
-            f"The sweep's lock {path} cannot be written: {reason}.", "Check the folder and its permissions."
-        ) from error
+        raise _unusable(path, "written", error) from error
     try:
         if not _take(path, descriptor):
             raise CannotRunError(message, hint)
@@ -62,10 +60,7 @@ def is_held(path: Path) -> bool:
     except FileNotFoundError:
         return False
     except OSError as error:
-        reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
-        raise CannotRunError(
-            f"The sweep's lock {path} cannot be read: {reason}.", "Check the folder and its permissions."
-        ) from error
+        raise _unusable(path, "read", error) from error
     try:
         return not _try(descriptor, fcntl.LOCK_SH)
     except OSError:
@@ -73,6 +68,13 @@ def is_held(path: Path) -> bool:
         return False
     finally:
         os.close(descriptor)
+
+
+def _unusable(path: Path, use: Literal["read", "written"], error: OSError) -> CannotRunError:
+    reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
+    return CannotRunError(
+        f"The sweep's lock {path} cannot be {use}: {reason}.", "Check the folder and its permissions."
+    )
 
 
 def _opened(path: Path, flags: int) -> int:
