@@ -17,6 +17,8 @@ from analysis.wording import NONE, is_number, number, return_text
 
 MAX_STEPS_ROWS = 20
 """How many points the table of env steps to solve shows; the CSV file beside the report has them all."""
+COLLAPSED = "collapsed"
+"""The heading of the column that says which trials collapsed."""
 _ONE_DECIMAL = {"score", "training_return", "core_seconds", "best_score", "mean_score"}
 
 
@@ -27,7 +29,7 @@ class Cell(NamedTuple):
     """The value that the column sorts by; None: not known, which is last in any order."""
     text: str
     kind: str = ""
-    """CSS class: "winner", a trial status, or "wide" for text that may wrap."""
+    """CSS class: "winner", "collapsed", a trial status, or "wide" for text that may wrap."""
     href: str = ""
     """Where in the page the cell leads; empty: nowhere."""
 
@@ -57,6 +59,8 @@ def trial_table(
 ) -> Table:
     """Return all trials, first those that can win, in the order of the selection; the score is the first column.
 
+    Whether a trial collapsed is a column where any did.
+
     Args:
         trials: The trials of one sweep.
         results: Iterations by trial id, oldest first.
@@ -73,6 +77,8 @@ def trial_table(
     columns = {"score": "score", "trial_id": "trial", "status": "status"}
     columns |= {name: name for name in point_names(trials)}
     columns |= {"training_return": "training return"}
+    if frame["collapsed"].any():
+        columns["collapsed"] = COLLAPSED
     if goal is not None:
         columns["num_env_steps_to_solve"] = "env steps to solve"
     columns |= {"num_env_steps": "env steps", "core_seconds": "core-seconds", "seed": "seed"}
@@ -138,6 +144,9 @@ def _cell(name: str, value: Any) -> Cell:
 
     if pd.isna(value):
         return Cell(None, NONE)
+    if name == "collapsed":
+        text = "yes" if value else "no"
+        return Cell(text, text, "collapsed" if value else "")
     if name == "seed":  # a name more than a number
         return Cell(value, str(value))
     return Cell(value, return_text(value) if name in _ONE_DECIMAL else number(value))

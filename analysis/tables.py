@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from analysis.collapse import trial_collapsed
 from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
 from analysis.statistics import median_steps
@@ -30,6 +31,7 @@ _AFTER_POINT = [
     "score_num_env_steps",
     "training_return",
     "evaluation_return",
+    "collapsed",
     "num_env_steps_to_solve",
     "num_env_steps_to_threshold",
     "num_iterations",
@@ -114,12 +116,12 @@ def trials_frame(
 
     Columns: trial_id, status, one for each searched hyperparameter, seed, point_index, seed_index (trials of one
     point differ in their seeds alone), score (which the selection compares; missing if the trial cannot win),
-    score_num_env_steps (when it was reached), training_return, evaluation_return (the newest),
-    num_env_steps_to_solve (see `env_steps_to`; all missing without results and a threshold),
-    num_env_steps_to_threshold (see `env_steps_to_evaluation`; filled also where trials end before their training
-    return reaches it, as with `stop.evaluation_return`), num_iterations, num_env_steps, num_episodes, time_s,
-    stop_reason, num_failures, error (its first line). In a population, the searched values are those that the score was
-    reached with, and the last column is changes (see `describe_changes`).
+    score_num_env_steps (when it was reached), training_return, evaluation_return (the newest), collapsed (see
+    `collapse.trial_collapsed`; missing without results), num_env_steps_to_solve (see `env_steps_to`; all missing
+    without results and a threshold), num_env_steps_to_threshold (see `env_steps_to_evaluation`; filled also where
+    trials end before their training return reaches it, as with `stop.evaluation_return`), num_iterations,
+    num_env_steps, num_episodes, time_s, stop_reason, num_failures, error (its first line). In a population, the
+    searched values are those that the score was reached with, and the last column is changes (see `describe_changes`).
     """
     import pandas as pd
 
@@ -143,6 +145,7 @@ def trials_frame(
                 "score_num_env_steps": best.checkpoint.num_env_steps if best is not None else None,
                 "training_return": trial.training_return,
                 "evaluation_return": trial.evaluation_return,
+                "collapsed": trial_collapsed(trial, rows_of(trial)),
                 "num_env_steps_to_solve": env_steps_to(threshold, rows_of(trial)),
                 "num_env_steps_to_threshold": env_steps_to_evaluation(threshold, rows_of(trial)),
                 "num_iterations": trial.num_iterations,
@@ -160,7 +163,8 @@ def trials_frame(
     floats = ["score", "training_return", "evaluation_return", "time_s"]
     # Int64 (capital I) is pandas' integer that can be missing: env steps stay whole numbers in the CSV.
     counts = ["score_num_env_steps", "num_env_steps_to_solve", "num_env_steps_to_threshold"]
-    return frame.astype({**dict.fromkeys(floats, "float64"), **dict.fromkeys(counts, "Int64")})
+    types = {**dict.fromkeys(floats, "float64"), **dict.fromkeys(counts, "Int64"), "collapsed": "boolean"}
+    return frame.astype(types)
 
 
 def iterations_frame(results: Mapping[str, Sequence[IterationRecord]]) -> pd.DataFrame:

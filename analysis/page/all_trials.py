@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from analysis.collapse import COLLAPSE_MEANS
 from analysis.page.source import Source, point_text
 from analysis.records import TrialRecord
-from analysis.report_tables import Table, trial_table
+from analysis.report_tables import COLLAPSED, Table, trial_table
 from analysis.selection import error_summary
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ class AllTrials:
     failures: list[Failure]
     num_other_causes: int
     """How many causes are not listed."""
+    collapse_means: str
+    """When a trial collapsed; empty: none did."""
 
 
 def section(source: Source) -> AllTrials:
@@ -63,8 +66,9 @@ def section(source: Source) -> AllTrials:
         core_seconds=source.core_seconds,
         errors=_anchors(source.trials, listed),
     )
+    means = COLLAPSE_MEANS if COLLAPSED in table.headings else ""
     first = Table(table.headings, table.rows[:MAX_ROWS])
-    return AllTrials(first, len(table.rows), _json(table), listed, len(causes) - len(listed))
+    return AllTrials(first, len(table.rows), _json(table), listed, len(causes) - len(listed), means)
 
 
 def failures(trials: Sequence[TrialRecord]) -> list[Failure]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from analysis.answers import certainty
 from analysis.choice_words import COLUMNS, candidate_rows, chosen_from
+from analysis.collapse import collapses, collapses_text
 from analysis.page.scores import interval_of, score_means, score_text
 from analysis.page.source import Source, point_pairs
 from analysis.records import BestRecord, SettingRecord, SweepRecord, TrialRecord
@@ -63,6 +64,8 @@ class SettingCard:
     """How sure it is the best; empty: one seed a setting."""
     trial_ids: str
     num_failed: int
+    collapsed: str
+    """Which of them collapsed; empty: none."""
     is_the_winners: bool
     """Whether the policy to deploy was trained with it."""
 
@@ -164,6 +167,9 @@ def setting_card(source: Source) -> SettingCard | None:
         certainty="" if best.probability_best is None else certainty(settings),
         trial_ids=", ".join(best.trial_ids),
         num_failed=best.num_failed,
+        collapsed=collapses_text(
+            collapses(best.trial_ids, source.trials, source.results), num_trainings=len(best.trial_ids)
+        ),
         is_the_winners=source.winner in best.trial_ids,
     )
 
