@@ -6,18 +6,20 @@ import os
 import subprocess
 import sys
 import types
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fake_sweeps import RunCommand
+from sweep_folders import make_sweep_folder
 
 from tune_jobs.cli.commands import cli
 from tune_jobs.plan.machine import Machine
 
 ROOT = Path(__file__).parents[2]
 SMALL = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {uniform: [1e-4, 1e-2]}}\nnum_samples: 2\n"
-HEAVY = ("ray", "torch", "pandas", "matplotlib", "imageio", "PIL")
+HEAVY = ("ray", "torch", "pandas", "matplotlib", "scipy", "optuna", "imageio", "PIL")
 
 
 # -- dry runs and bad input, by the real validation
@@ -250,6 +252,14 @@ def test_the_schema_is_json_with_and_without_asking_for_it(run: RunCommand) -> N
     assert "properties" in json.loads(run("schema").stdout)
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A storage folder with one sweep."""
+    folder = tmp_path_factory.mktemp("finished")
+    make_sweep_folder(folder / "mine", iterations=1)
+    return folder
+
+
 def test_every_command_takes_json_and_has_a_one_line_help() -> None:
     for name, command in cli.commands.items():
         assert any("--json" in parameter.opts for parameter in command.params), name
@@ -262,19 +272,54 @@ def test_version_and_help(run: RunCommand) -> None:
     assert "130 interrupted" in " ".join(run("--help").stdout.split())
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [["--help"], ["launch", "cartpole-ppo", "--dry-run"], ["launch", "nope", "--dry-run"], ["schema"]],
-)
-def test_nothing_heavy_is_imported_before_it_is_needed(arguments: list[str]) -> None:
+def heavy_after(calls: Sequence[Sequence[str]], where: Path | None = None, **environment: str) -> tuple[str, list[str]]:
+    """What a fresh process prints where these commands are called in it, and what of HEAVY it has loaded then."""
     code = (
         "import sys, tune_jobs.cli.commands\n"
-        "try:\n"
-        f"    tune_jobs.cli.commands.cli({arguments!r})\n"
-        "except SystemExit:\n"
-        "    pass\n"
-        f"print('HEAVY', [name for name in {HEAVY!r} if name in sys.modules])\n"
+        f"for arguments in {calls!r}:\n"
+        "    sys.argv = ['tune-jobs', *arguments]\n"
+        "    try:\n"
+        "        tune_jobs.cli.commands.main()\n"
+        "    except SystemExit:\n"
+        "        pass\n"
+        f"print(*[name for name in {HEAVY!r} if name in sys.modules], sep=',')\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
-    assert done.stdout.splitlines()[-1] == "HEAVY []"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=where,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+    )  # fmt: skip
+    *printed, loaded = done.stdout.split("\n")[:-1]
+    return "\n".join(printed), [name for name in loaded.split(",") if name]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["launch", "cartpole-ppo", "--dry-run"], ["launch", "nope", "--dry-run"], ["schema"]]
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(arguments: list[str]) -> None:
+    assert heavy_after([arguments])[1] == []
+
+
+def test_help_imports_nothing_heavy() -> None:
+    printed, loaded = heavy_after([["--help"], ["--version"], *([name, "--help"] for name in cli.commands)])
+    assert printed.count("Usage: tune-jobs") == 1 + len(cli.commands)
+    assert loaded == []
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("tune-jobs ", "plain,launch"),
+        ("tune-jobs launch --", "plain,--dry-run"),
+        ("tune-jobs launch acro", "plain,acrobot-ppo"),
+        ("tune-jobs hyperparams ", "plain,dqn"),
+        ("tune-jobs status ", "plain,mine"),
+        ("tune-jobs evaluate mine/t", "plain,mine/t0001"),
+        ("tune-jobs status --storage ", "dir,"),
+    ],
+)
+def test_completion_imports_nothing_heavy(line: str, found: str, finished: Path) -> None:
+    # As the shell asks, see `click.shell_completion`.
+    asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split(" ")) - 1), "_TUNE_JOBS_COMPLETE": "bash_complete"}
+    printed, loaded = heavy_after([[]], finished, TUNE_JOBS_STORAGE=str(finished), **asked)
+    assert found in printed.splitlines()
+    assert loaded == []
