@@ -39,6 +39,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", "-.", ":")
 _MAX_GROUP_VALUES = len(PALETTE)
 MAX_DRAWN = 1e100
+_DPI_OF_SVG = 72
 _CSS_NAMES = {INK: "ink", MUTED: "muted", GRID: "grid", ACCENT: "accent"} | {
     color: f"series-{i}" for i, color in enumerate(PALETTE)
 }
@@ -205,8 +206,28 @@ def add_legend(
     legend.get_title().set_color(INK)
 
 
+def _fit(figure: Figure) -> None:
+    """Lay the figure out as SVG would have it, for every format that it is saved in from then on.
+
+    To lay it out takes as long as to draw it. And while a figure has an engine for its layout, even one that does
+    nothing, matplotlib draws it one more time, in vain, whenever it is saved.
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    engine = figure.get_layout_engine()
+    if engine is None:
+        return
+    FigureCanvasSVG(figure)  # becomes the figure's canvas, by which texts are measured
+    figure.set_dpi(_DPI_OF_SVG)
+    engine.execute(figure)
+    with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
+
+
 def to_png(figure: Figure, *, dpi: int = 160) -> bytes:
     """Return the figure as PNG on white."""
+    _fit(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
@@ -217,6 +238,7 @@ def to_pdf(figure: Figure) -> bytes:
 
     Its letters are Type 3 fonts, which take a tenth of the time; some journals want others (`analysis.exports.paper`).
     """
+    _fit(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
     return buffer.getvalue()
@@ -229,6 +251,7 @@ def to_svg_file(figure: Figure) -> str:
     """
     import matplotlib as mpl
 
+    _fit(figure)
     buffer = io.StringIO()
     # The salt makes the ids reproducible.
     with mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": "figure"}):

@@ -25,8 +25,6 @@ def write_figure(figure: Figure, path: Path, *, png: bool = False) -> str:
     """
     svg = to_svg_file(figure)
     write_atomic(path.with_suffix(".svg"), svg)
-    # What fits one format fits the others, and to fit it takes longer than to draw it.
-    figure.set_layout_engine("none")
     write_atomic(path.with_suffix(".pdf"), to_pdf(figure))
     if png:
         write_atomic(path.with_suffix(".png"), to_png(figure))

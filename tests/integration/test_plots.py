@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 from synthetic_sweep import Synthetic, make_points, make_sweep
 
+from analysis.page.files import write_figure
 from analysis.plot_style import (
     CSS_DARK,
     CSS_LIGHT,
@@ -206,6 +209,31 @@ def test_svg_follows_the_theme_and_keeps_its_ids_apart() -> None:
     assert {first or second for first, second in targets} <= set(re.findall(r'\bid="([^"]+)"', svg))
     assert 'aria-label="a &quot;label&quot;"' in svg
     assert svg == to_svg(score_per_episode([1.0, 2.0, 3.0], goal=2.0), label='a "label"', prefix="one")
+
+
+def test_a_figure_is_laid_out_once_and_drawn_once_a_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    def made() -> Figure:
+        return score_per_episode([1.0, 20.0, 300.0], goal=200.0, size=(3.8, 4.8))
+
+    expected = made()
+    expected.savefig(io.StringIO(), format="svg")
+    calls: list[str] = []
+    for owner, name in ((Figure, "draw"), (ConstrainedLayoutEngine, "execute")):
+        original = getattr(owner, name)
+
+        def counted(*args: Any, call: Any = original, told: str = name) -> Any:
+            calls.append(told)
+            return call(*args)
+
+        monkeypatch.setattr(owner, name, counted)
+    figure = made()
+    write_figure(figure, tmp_path / "figure", png=True)
+    assert calls == ["execute", "draw", "draw", "draw"]
+    positions = [[axes.get_position().bounds for axes in one.axes] for one in (figure, expected)]
+    assert np.allclose(positions[0], positions[1], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("text", ["$x^$", "$\\frac{1}$", "<script>alert(1)</script>", "--><img src=x>", "& < >"])
