@@ -11,8 +11,8 @@ from fake_sweeps import SWEEP, TRIALS, FakeSweeps, RunCommand, evaluation
 
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli.commands import cli
-from tune_jobs.cli.output import to_json
 from tune_jobs.sweeps.interrupted import SweepInterrupted
+from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.status import BestSoFar, SweepStatus
 
 ROOT = Path(__file__).parents[2]

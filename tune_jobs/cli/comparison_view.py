@@ -68,7 +68,7 @@ def _print_facts(console: Console, comparison: Comparison) -> None:
 
 def show_repetition(found: Repetition, *, as_json: bool) -> None:
     """Print what came of running a trial again."""
-    from tune_jobs.cli.output import to_json
+    from tune_jobs.sweeps.plain import to_json
 
     if as_json:
         print_json({**to_json(found), "equal": found.equal})

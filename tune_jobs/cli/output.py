@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from pydantic import BaseModel
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, return_text, setting_text
+from tune_jobs.sweeps.plain import to_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,8 +23,6 @@ if TYPE_CHECKING:
     from tune_jobs.spec.file import Preset
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
-# Derived values, so that readers of the JSON need not compute them.
-_DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
 _MAX_CANDIDATES = 8
 STATUS_STYLES: dict[TrialStatus, str] = {
     "completed": "green",
@@ -36,23 +32,6 @@ STATUS_STYLES: dict[TrialStatus, str] = {
     "paused": "yellow",
 }
 STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "running", "paused", "pending")
-
-
-def to_json(value: Any) -> Any:
-    """Turn records, dataclasses and paths into JSON-like data; a number that isn't finite becomes null."""
-    if isinstance(value, BaseModel):
-        data = {name: getattr(value, name) for name in type(value).model_fields}
-        data |= {name: getattr(value, name) for name in _DERIVED if hasattr(type(value), name)}
-        return to_json(data)
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
-        return value
-    return [to_json(item) for item in value] if isinstance(value, Iterable) else str(value)
 
 
 def print_json(value: Any) -> None:

@@ -76,6 +76,14 @@ class Sweep(Protocol):
         """Undo `create`, including everything that was written since."""
         ...
 
+    def delete(self) -> None:
+        """Remove the sweep, with everything in it. First its record goes: half of a sweep is none.
+
+        Raises:
+            CannotRunError: A process drives it, or it cannot be removed.
+        """
+        ...
+
     def rehearsal(self) -> AbstractContextManager[Sweep]:
         """Return a hidden sweep beside this one, which is created for the block and discarded after it.
 
@@ -93,6 +101,10 @@ class Sweep(Protocol):
             NotFoundError: There is no record.
             CheckpointError: It is damaged or of a newer format.
         """
+        ...
+
+    def record_stamp(self) -> tuple[int, ...]:
+        """Return what changes whenever the record is written, without reading it; empty: there is no record."""
         ...
 
     def write_record(self, record: SweepRecord) -> None:

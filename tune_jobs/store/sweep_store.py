@@ -114,6 +114,21 @@ class SweepStore:
             for folder in self._made:
                 folder.rmdir()
 
+    def delete(self) -> None:
+        """Remove the folder.
+
+        Raises:
+            CannotRunError: A process drives the sweep, or the folder cannot be removed.
+        """
+        try:
+            with self.lock():
+                remove_file(self.record_path)
+                shutil.rmtree(self.folder)
+        except OSError as error:
+            raise CannotRunError(
+                f"Sweep {self.name} cannot be removed as a whole: {error}.", f"Remove what is left of {self.folder}."
+            ) from error
+
     @contextlib.contextmanager
     def rehearsal(self) -> Iterator[SweepStore]:
         """Yield a sweep in a hidden folder beside this one, which is removed after the block.
@@ -137,6 +152,14 @@ class SweepStore:
         """
         refuse_link(self.record_path)
         return read_record(self.record_path, SweepRecord, "sweep")
+
+    def record_stamp(self) -> tuple[int, ...]:
+        """Return the inode, the size and the time of sweep.json."""
+        try:
+            found = self.record_path.lstat()
+        except OSError:
+            return ()
+        return found.st_ino, found.st_size, found.st_mtime_ns
 
     def write_record(self, record: SweepRecord) -> None:
         """Replace sweep.json."""

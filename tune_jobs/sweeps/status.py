@@ -167,7 +167,12 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
 
 
 def _status(store: Sweep) -> SweepStatus:
-    record, alive, trials = store.read_record(), store.is_driven(), store.read_trials()
+    return status_of(store, store.read_trials())
+
+
+def status_of(store: Sweep, trials: Sequence[TrialRecord]) -> SweepStatus:
+    """Return the status of a sweep whose trials' records have been read."""
+    record, alive = store.read_record(), store.is_driven()
     counts = Counter(trial.status for trial in trials)
     if record.state == "running" and not alive:
         # Its process was killed before it could write that it ended.

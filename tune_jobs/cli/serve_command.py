@@ -1,0 +1,52 @@
+"""The command that runs the service."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import click
+
+from tune_jobs.cli.base import storage_option
+
+
+@click.command()
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8265, show_default=True, help="0: any free port.")
+@click.option("--address", metavar="ADDRESS", help="Ray cluster that sweeps run on; without it, this machine.")
+@click.option(
+    "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
+    help="postgresql://USER@HOST/NAME.  [default: an SQLite file in the storage folder]",
+)  # fmt: skip
+@click.option("--env", "envs", multiple=True, metavar="PATTERN", help="Env ids that sweeps may name; may be repeated.")
+@click.option(
+    "--allow-module", "modules", multiple=True, metavar="NAME",
+    help="Let sweeps name environments and RLModules of this Python module. May be repeated.",
+)  # fmt: skip
+@click.option("--no-spare", is_flag=True, help="Keep no process warm for the next sweep: it takes about 300 MB.")
+@click.option("--drain", "drain_s", type=click.FloatRange(0), default=60.0, show_default=True,
+              help="Seconds that sweeps may take to save when the service ends.")  # fmt: skip
+@storage_option
+def serve(
+    *,
+    host: str,
+    port: int,
+    address: str | None,
+    database: str | None,
+    envs: tuple[str, ...],
+    modules: tuple[str, ...],
+    no_spare: bool,
+    drain_s: float,
+    storage: str | None,
+) -> None:
+    """Run the service: a queue of sweeps, a page that shows them live, and REST over the same sweep folder."""
+    from tune_jobs.service.config import ServiceConfig
+    from tune_jobs.service.serve import serve as run
+    from tune_jobs.sweeps.storage import storage_folder
+
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    config = ServiceConfig(
+        storage=storage_folder(storage), host=host, port=port, address=address, database=database,
+        modules=modules, envs=envs, keep_spare=not no_spare, drain_s=drain_s,
+    )  # fmt: skip
+    run(config, lambda url: click.echo(f"tune-jobs serves {config.storage} at {url}"))

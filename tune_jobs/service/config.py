@@ -1,0 +1,77 @@
+"""What an operator sets."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from policies.errors import SpecError
+from tune_jobs.service.job_files import SERVICE_FOLDER
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one request or one person may take; None: no limit."""
+
+    body_bytes: int = 1_000_000
+    trials: int = 10_000
+    """Of one sweep."""
+    env_steps: int | None = None
+    """Of one sweep, by its caps."""
+    sweeps: int | None = None
+    """That wait or run, of one person."""
+    watchers: int = 200
+    """Event streams at once."""
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """The service's settings.
+
+    Args:
+        storage: The folder for sweeps, absolute.
+        host: The address to listen on.
+        port: The port; 0: any that is free.
+        address: The Ray cluster that sweeps run on; None: this machine.
+        database: Its URL; None: an SQLite file in the storage folder.
+        modules: Modules of environments and RLModules that specs may name.
+        envs: Patterns (regular expressions) of env ids that specs may name; none: all that need no module.
+        limits: What one request or one person may take.
+        keep_spare: Whether a driver process is kept warm.
+        drain_s: How long sweeps may take to save when the service ends.
+    """
+
+    storage: Path
+    host: str = "127.0.0.1"
+    port: int = 8265
+    address: str | None = None
+    database: str | None = None
+    modules: tuple[str, ...] = ()
+    envs: tuple[str, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+    keep_spare: bool = True
+    drain_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        for pattern in self.envs:
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise SpecError(f"{pattern!r} is no pattern of env ids: {error}.") from error
+
+    @property
+    def folder(self) -> Path:
+        """The folder for what the service itself writes."""
+        return self.storage / SERVICE_FOLDER
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine can reach it."""
+        return self.host in LOOPBACK
+
+    def allows_env(self, env_id: str) -> bool:
+        """Whether a spec may name an environment; that its module is allowed is checked elsewhere."""
+        return not self.envs or any(re.fullmatch(pattern, env_id) for pattern in self.envs)

@@ -1,0 +1,1 @@
+"""The versions of the service's database, one after the other."""

@@ -1,0 +1,120 @@
+"""Open the service's database, and bring it to this version."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from alembic.util.exc import CommandError
+from sqlalchemy import Engine, create_engine, event, inspect, text
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+
+from policies.errors import CannotRunError
+
+BUSY_TIMEOUT_S = 10.0
+"""How long a call waits for another one that writes."""
+_MIGRATIONS = Path(__file__).with_name("migrations")
+
+
+def sqlite_url(file: Path) -> str:
+    """Return the URL of an SQLite database in a file."""
+    return f"sqlite:///{file}"
+
+
+def open_database(url: str) -> Engine:
+    """Open a database, make its tables if it is new, and migrate it if it is of an older version.
+
+    Args:
+        url: `sqlite:///FILE` or `postgresql://USER@HOST/NAME`.
+
+    Raises:
+        CannotRunError: The URL is wrong, or the database can't be reached, is damaged or of a newer version.
+    """
+    try:
+        parsed = make_url(url)
+        if parsed.drivername in ("postgresql", "postgres"):
+            parsed = parsed.set(drivername="postgresql+psycopg")
+        told = parsed.render_as_string(hide_password=True)
+        if parsed.get_backend_name() not in ("sqlite", "postgresql"):
+            raise CannotRunError(
+                f"{told}: the service keeps its queue in SQLite or PostgreSQL, not in {parsed.get_backend_name()}.",
+                "Give sqlite:///FILE or postgresql://USER@HOST/NAME.",
+            )
+        engine = create_engine(parsed, pool_pre_ping=True)
+    except (ArgumentError, NoSuchModuleError) as error:
+        raise CannotRunError(
+            f"{url!r} is no database URL.", "Give sqlite:///FILE or postgresql://USER@HOST/NAME."
+        ) from error
+    except ModuleNotFoundError as error:
+        raise CannotRunError(
+            "PostgreSQL needs the package psycopg.", 'Install it with pip install "tune-jobs[postgresql]".'
+        ) from error
+    if parsed.get_backend_name() == "sqlite":
+        event.listen(engine, "connect", _set_pragmas)
+        event.listen(engine, "begin", _begin_at_once)
+    try:
+        _migrate(engine, told)
+    except SQLAlchemyError as error:
+        engine.dispose()
+        raise CannotRunError(
+            f"The service's database {told} can't be used: {_reason(error)}.",
+            "Check the address, the permissions and the space left; a damaged SQLite file can be moved away: sweeps "
+            "are found again by their folders.",
+        ) from error
+    except CannotRunError:
+        engine.dispose()
+        raise
+    return engine
+
+
+def _set_pragmas(connection: Any, _record: Any) -> None:
+    if not isinstance(connection, sqlite3.Connection):
+        raise TypeError(f"an SQLite connection is a {type(connection)}")
+    # The driver would begin transactions by itself, deferred; `_begin_at_once` does it.
+    connection.isolation_level = None
+    for name, value in (
+        ("journal_mode", "WAL"),
+        # What was answered is on the disk, also when the power fails.
+        ("synchronous", "FULL"),
+        ("busy_timeout", str(int(1000 * BUSY_TIMEOUT_S))),
+        ("foreign_keys", "ON"),
+    ):
+        connection.execute(f"PRAGMA {name} = {value}")
+
+
+def _begin_at_once(connection: Any) -> None:
+    """Begin a transaction that may write: one that begins as a reader fails, not waits, when another one wrote."""
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def _migrate(engine: Engine, told: str) -> None:
+    # It tells each of its steps, as if somebody had asked.
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    config = Config()
+    config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
+    known = {item.revision for item in ScriptDirectory.from_config(config).walk_revisions()}
+    if inspect(engine).has_table("alembic_version"):
+        with engine.connect() as connection:
+            found = {row[0] for row in connection.execute(text("SELECT version_num FROM alembic_version"))}
+        if found - known:
+            raise CannotRunError(
+                f"The service's database {told} is of a newer version ({', '.join(sorted(found - known))}).",
+                "Run the version of tune-jobs that wrote it, or give another database.",
+            )
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        try:
+            command.upgrade(config, "head")
+        except CommandError as error:
+            raise CannotRunError(f"The service's database {told} can't be migrated: {error}.") from error
+
+
+def _reason(error: SQLAlchemyError) -> str:
+    said = str(error.orig) if isinstance(error, DBAPIError) else str(error)
+    return " ".join(said.split())[:300].rstrip(".")

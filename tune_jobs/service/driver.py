@@ -1,0 +1,117 @@
+"""The process that drives one sweep for the service.
+
+It is started before there is a job, so that what takes seconds to import is there when one comes, and waits on a
+socket. The job comes with the descriptor that holds the job's lock. From then on it needs the service no more: it has
+a session of its own, writes how the job ended into the job's file, and lives on if the service is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from policies.envs.modules import allow_modules
+from policies.errors import TuneJobsError
+from tune_jobs.process.interruption import end_in_order
+from tune_jobs.service.job_files import Ended, Holder, JobFiles
+from tune_jobs.sweeps.interrupted import SweepInterrupted
+
+READY = b"ready"
+_MAX_BYTES = 1 << 20
+
+
+def main(descriptor: int) -> None:
+    """Wait for a job, and do it.
+
+    Args:
+        descriptor: This end of the socket to the service. If the other one is closed before a job comes, this ends.
+    """
+    end_in_order()
+    with socket.socket(fileno=descriptor) as asked:
+        asked.set_inheritable(False)
+        warm_up()
+        # A service that was in a hurry has sent the job, and closed its end.
+        with contextlib.suppress(OSError):
+            asked.sendall(READY)
+        message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
+    if not message:
+        return
+    lock, log = descriptors
+    # The job's lock is this process's alone: one that it starts and that outlives it must not hold it.
+    os.set_inheritable(lock, False)  # noqa: FBT003 (takes no keyword)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.close(log)
+    request = json.loads(message)
+    files = JobFiles(Path(request["service"]), request["job"])
+    files.say_who(Holder(pid=os.getpid(), sweep=Path(request["sweep"]).name))
+    ended = _ended(request)
+    # Whatever comes now, the outcome is written.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    files.write_ended(ended)
+    os.close(lock)
+
+
+def warm_up() -> None:
+    """Import what driving a sweep needs."""
+    import tune_jobs.ray_tune.cluster
+    import tune_jobs.ray_tune.run_trials
+    import tune_jobs.sweeps.verbs  # noqa: F401
+
+
+def _ended(request: Mapping[str, Any]) -> Ended:
+    attempt = request["attempt"]
+    try:
+        allow_modules(request["modules"])
+        os.chdir(request["working_folder"])
+        result = _done(request)
+    except SweepInterrupted:
+        return Ended(attempt=attempt, outcome="interrupted")
+    except TuneJobsError as error:
+        return Ended(attempt=attempt, outcome="failed", message=str(error))
+    except BaseException as error:  # noqa: BLE001 (it is told)
+        traceback.print_exc()
+        return Ended(attempt=attempt, outcome="failed", message=f"{type(error).__name__}: {error}")
+    if result.interrupted:
+        return Ended(attempt=attempt, outcome="stopped")
+    failed = [trial for trial in result.trials if trial.status == "failed"]
+    told = [f"{len(failed)} of {len(result.trials)} trials failed."] if failed else []
+    return Ended(attempt=attempt, outcome="completed", message=" ".join([*told, *result.notes]) or None)
+
+
+def _done(request: Mapping[str, Any]) -> Any:
+    from tune_jobs.sweeps import verbs
+
+    folder, arguments = request["sweep"], request["arguments"]
+    common: dict[str, Any] = {"address": request["address"], "progress": "none"}
+    match request["verb"]:
+        case "extend":
+            from tune_jobs.spec.file import stored_spec
+            from tune_jobs.store.local_storage import open_sweep
+
+            # The job says how many samples there are to be in all, so that an attempt that follows a killed one adds
+            # none twice.
+            known = stored_spec(open_sweep(Path(folder)).read_record()).num_samples
+            missing = arguments["to_num_samples"] - known
+            if missing > 0:
+                return verbs.extend(folder, missing, **common)
+            return verbs.resume(folder, **common)
+        case "replicate":
+            return verbs.replicate(folder, top=arguments["top"], seeds=arguments["seeds"], **common)
+        case "retry":
+            return verbs.resume(folder, retry_failed=True, **common)
+        case _:
+            return verbs.resume(folder, **common)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

@@ -1,0 +1,1 @@
+"""The REST interface: routes, their models, and errors as problem documents."""

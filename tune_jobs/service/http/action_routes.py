@@ -1,0 +1,83 @@
+"""What is done with a sweep: stop, resume, extend, replicate, retry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import APIRouter
+
+from policies.errors import SpecError
+from tune_jobs.service.http.caller import AChanger, Caller, TheService
+from tune_jobs.service.http.models import Extend, Replicate
+from tune_jobs.service.http.problems import NotNowError
+from tune_jobs.service.jobs import Job, Verb
+from tune_jobs.service.service import Service
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.rules import check_extendable, check_replicable
+
+router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["actions"])
+
+
+@router.post("/stop", status_code=202)
+def stop(name: str, service: TheService, _: AChanger) -> list[Job]:
+    """Ask a sweep to stop: its trials save first. What waits is cancelled."""
+    seen = service.statuses.see(name)
+    changed = service.queue.request_stop(name)
+    sweep = service.storage.sweep(name)
+    if not changed and not seen.status.alive:
+        raise NotNowError(f"Sweep {name} neither waits nor runs: it is {seen.status.state}.")
+    if not changed:
+        # Somebody runs it from a terminal.
+        sweep.request_stop()
+    service.supervisor.wake()
+    return changed
+
+
+@router.post("/resume", status_code=202)
+def resume(name: str, service: TheService, caller: AChanger) -> Job:
+    """Run what is missing of a sweep."""
+    return _enqueue(service, caller, name, "drive", {})
+
+
+@router.post("/retry", status_code=202)
+def retry(name: str, service: TheService, caller: AChanger) -> Job:
+    """Run failed trials again, from their latest checkpoints, and whatever else is missing."""
+    seen = service.statuses.see(name)
+    if not seen.status.counts.get("failed"):
+        raise NotNowError(f"Sweep {name} has no failed trial.")
+    return _enqueue(service, caller, name, "retry", {})
+
+
+@router.post("/extend", status_code=202)
+def extend(name: str, more: Extend, service: TheService, caller: AChanger) -> Job:
+    """Add points to a sweep, and run them."""
+    spec = stored_spec(service.statuses.see(name).status.sweep)
+    check_extendable(spec)
+    # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
+    waiting = [job for job in service.queue.jobs("waiting", "running", sweep=name) if job.verb == "extend"]
+    known = max([spec.num_samples, *(job.arguments["to_num_samples"] for job in waiting)])
+    trials = len(service.statuses.see(name).trials) // max(1, spec.num_samples) * (known + more.num_samples)
+    limit = service.config.limits.trials
+    if trials > limit:
+        raise SpecError(f"The sweep would have about {trials:,} trials; here a sweep may have at most {limit:,}.")
+    return _enqueue(service, caller, name, "extend", {"to_num_samples": known + more.num_samples})
+
+
+@router.post("/replicate", status_code=202)
+def replicate(name: str, race: Replicate, service: TheService, caller: AChanger) -> Job:
+    """Train the leading settings again with fresh seeds."""
+    check_replicable(stored_spec(service.statuses.see(name).status.sweep))
+    return _enqueue(service, caller, name, "replicate", race.model_dump())
+
+
+def _enqueue(service: Service, caller: Caller, name: str, verb: Verb, arguments: Mapping[str, Any]) -> Job:
+    service.statuses.see(name)
+    for job in service.queue.jobs("waiting", "running", sweep=name):
+        if job.verb == verb and job.arguments == dict(arguments) and not job.stop_requested:
+            raise NotNowError(f"Sweep {name} has that job already: number {job.id}, which is {job.state}.")
+    last = service.queue.jobs(sweep=name)
+    num_cpus = last[-1].num_cpus if last else service.supervisor.num_cpus
+    job, _ = service.queue.begin(name, verb, arguments, owner=caller.name, num_cpus=num_cpus)
+    service.supervisor.wake()
+    return job

@@ -1,0 +1,129 @@
+"""What comes in and goes out, as models: the OpenAPI document is made of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from analysis.records import TrialStatus
+from tune_jobs.service.jobs import MAX_PRIORITY, Job
+from tune_jobs.service.submitting import Submission
+
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Priority = Annotated[int, Field(ge=-MAX_PRIORITY, le=MAX_PRIORITY, description="Higher ones go first.")]
+Tags = Annotated[list[Annotated[str, Field(min_length=1, max_length=50)]], Field(max_length=20)]
+Note = Annotated[str, Field(max_length=2_000, description="A text for people.")]
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class NewSweep(_Request):
+    """A sweep to be validated, planned or submitted: exactly one of preset, text and spec."""
+
+    preset: str | None = Field(None, max_length=200, description="Name of a preset.")
+    text: str | None = Field(None, max_length=1_000_000, description="A sweep file, YAML.")
+    spec: dict[str, Any] | None = Field(None, description="The content of a sweep file.")
+    overrides: list[str] = Field(default_factory=list, max_length=100, description="`a.b=value`, as for --set.")
+    name: Name | None = Field(None, description="Name of the sweep; null: the file's, or one that is free.")
+    priority: Priority = 0
+    note: Note = ""
+    tags: Tags = Field(default_factory=list)
+
+    def submission(self) -> Submission:
+        """Return it as the submitter has it."""
+        return Submission(**{name: getattr(self, name) for name in type(self).model_fields})
+
+
+class Change(_Request):
+    """What may be changed of a sweep; what is left out stays."""
+
+    priority: Priority | None = None
+    note: Note | None = None
+    tags: Tags | None = None
+
+
+class Extend(_Request):
+    """More points."""
+
+    num_samples: int = Field(ge=1, le=100_000, description="Random draws for each combination of the grids.")
+
+
+class Replicate(_Request):
+    """More seeds for the leading settings."""
+
+    top: int = Field(5, ge=2, le=1_000, description="How many settings race.")
+    seeds: int = Field(5, ge=1, le=1_000, description="How many more seeds a setting gets at most.")
+
+
+class Counts(BaseModel):
+    """Number of trials by status."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class SweepSummary(BaseModel):
+    """A sweep in a list."""
+
+    name: str
+    state: str = Field(description="created, running, interrupted, completed.")
+    owner: str | None = Field(description="Who submitted it; null: nobody did, here.")
+    note: str
+    tags: list[str]
+    job: Job | None = Field(description="Its job that waits or runs, else its last one.")
+    algorithm: str
+    env: str
+    created_at: float
+    started_at: float | None
+    ended_at: float | None
+    num_trials: int
+    counts: dict[TrialStatus, int]
+    num_env_steps: int
+    max_env_steps: int | None
+    env_steps_per_s: float | None
+    time_left_s: float | None
+    run_time_s: float
+    best: dict[str, Any] | None
+
+
+class SweepPage(BaseModel):
+    """A page of sweeps."""
+
+    sweeps: list[SweepSummary]
+    next_cursor: str | None = Field(description="Give it as `cursor` for the next page; null: this is the last.")
+
+
+class TrialPage(BaseModel):
+    """A page of trials."""
+
+    trials: list[dict[str, Any]]
+    next_cursor: str | None
+
+
+class Submitted(BaseModel):
+    """A sweep that was submitted."""
+
+    sweep: str
+    job: Job
+
+
+class Planned(BaseModel):
+    """What would run."""
+
+    spec: dict[str, Any]
+    plan: dict[str, Any]
+
+
+class Health(BaseModel):
+    """Whether the service lives."""
+
+    status: Literal["ok"]
+
+
+class Ready(BaseModel):
+    """Whether the service takes requests."""
+
+    status: Literal["ready", "draining", "not ready"]
+    problems: list[str]

@@ -1,0 +1,125 @@
+"""The files of a job beside the sweeps: who runs it, and how it ended.
+
+A driver lives on when the service is killed, so the service can't wait for it as a parent does. What is known of it is
+in files: a lock that the system frees when the driver ends, however it ends, and the outcome that it wrote before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from policies.errors import CannotRunError
+from policies.files import write_atomic
+from tune_jobs.store.locks import is_held
+
+SERVICE_FOLDER = ".service"
+"""In the storage folder; hidden, so that it is no sweep."""
+
+
+class Ended(BaseModel):
+    """How an attempt at a job ended."""
+
+    model_config = ConfigDict(frozen=True)
+
+    attempt: int
+    outcome: Literal["completed", "failed", "stopped", "interrupted"]
+    """Stopped: somebody asked the sweep to stop. Interrupted: a signal came, such as when the service is drained."""
+    message: str | None = None
+
+
+class Holder(BaseModel):
+    """A driver that runs a job."""
+
+    model_config = ConfigDict(frozen=True)
+
+    pid: int
+    sweep: str
+
+
+def held_jobs(folder: Path) -> list[Holder]:
+    """Return the drivers that run now, as the files of all jobs say."""
+    holders = (JobFiles(folder, path.stem).holder() for path in sorted((folder / "jobs").glob("*.lock")))
+    return [holder for holder in holders if holder is not None]
+
+
+class JobFiles:
+    """The files of one job.
+
+    Args:
+        folder: The service's folder.
+        uid: The job's random name: ids begin anew where the database was lost.
+    """
+
+    def __init__(self, folder: Path, uid: str) -> None:
+        self._folder = folder / "jobs"
+        self._lock = self._folder / f"{uid}.lock"
+        self._ended = self._folder / f"{uid}.json"
+        self.log = self._folder / f"{uid}.log"
+        """What the driver process prints besides the sweep's own log."""
+
+    def take(self) -> int | None:
+        """Return a descriptor that holds the job's lock until each copy of it is closed; None: a driver holds it.
+
+        Raises:
+            CannotRunError: The folder can't be written.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self._lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise CannotRunError(
+                f"The service can't write {self._lock}: {error.strerror}.", "Check the storage folder."
+            ) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            return None
+        return descriptor
+
+    def is_run(self) -> bool:
+        """Whether a driver runs the job now."""
+        return is_held(self._lock)
+
+    def say_who(self, who: Holder) -> None:
+        """Write into the lock who holds it."""
+        self._lock.write_text(who.model_dump_json(), encoding="utf-8")
+
+    def holder(self) -> Holder | None:
+        """Return the driver that runs the job; None: none does, or it has not yet said who it is."""
+        if not self.is_run():
+            return None
+        try:
+            return Holder.model_validate_json(self._lock.read_bytes())
+        except (OSError, ValidationError):
+            return None
+
+    def write_ended(self, ended: Ended) -> None:
+        """Write how an attempt ended."""
+        write_atomic(self._ended, ended.model_dump_json())
+
+    def read_ended(self, attempt: int) -> Ended | None:
+        """Return how an attempt ended; None: it has not, or its process died before it could say."""
+        try:
+            ended = Ended.model_validate_json(self._ended.read_bytes())
+        except (OSError, ValidationError):
+            return None
+        return ended if ended.attempt == attempt else None
+
+    def last_lines(self, count: int = 20) -> str:
+        """Return the end of what the driver printed."""
+        with contextlib.suppress(OSError), self.log.open("rb") as file:
+            file.seek(max(0, self.log.stat().st_size - 10_000))
+            return "\n".join(file.read().decode("utf-8", "replace").splitlines()[-count:])
+        return ""
+
+    def remove(self) -> None:
+        """Remove the files of a job that has ended."""
+        for path in (self._ended, self.log, self._lock):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,264 @@
+"""The queue: which jobs wait, run and have ended. Only this module changes the table of jobs.
+
+A job's state moves creating -> waiting -> running -> ended; a running one goes back to waiting when the service is
+drained. Each change is one transaction, so a service that is killed leaves either the former state or the next one.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import Connection, Engine, RowMapping, delete, insert, select, update
+from sqlalchemy.exc import IntegrityError
+
+from policies.errors import NotFoundError, SpecError
+from tune_jobs.service.database.tables import jobs, submissions
+from tune_jobs.service.jobs import Job, JobState, Outcome, Verb
+
+
+class KeyUsedError(SpecError):
+    """An idempotency key was used for another request."""
+
+
+class Queue:
+    """Jobs in a database.
+
+    Args:
+        engine: The database.
+        now: Returns seconds since 1970.
+    """
+
+    def __init__(self, engine: Engine, now: Any = time.time) -> None:
+        self._engine = engine
+        self._now = now
+
+    # -- coming in
+
+    def begin(
+        self,
+        sweep: str,
+        verb: Verb,
+        arguments: Mapping[str, Any],
+        *,
+        owner: str,
+        priority: int = 0,
+        num_cpus: float = 0.0,
+        key: tuple[str, str] | None = None,
+        state: JobState = "waiting",
+    ) -> tuple[Job, bool]:
+        """Add a job, unless a request with the same key has.
+
+        Args:
+            sweep: Name of the sweep.
+            verb: What is to be done.
+            arguments: What the verb needs.
+            owner: Who asks.
+            priority: Higher ones go first.
+            num_cpus: CPUs that it takes.
+            key: Idempotency key and the digest of the request; None: the request has no key.
+            state: `creating` for a sweep that is not written yet.
+
+        Returns:
+            The job, and whether it is new.
+
+        Raises:
+            KeyUsedError: The owner used the key for another request.
+        """
+        row = {
+            "uid": uuid.uuid4().hex, "sweep": sweep, "verb": verb, "arguments": dict(arguments), "owner": owner,
+            "priority": priority, "num_cpus": num_cpus, "state": state, "num_attempts": 0, "stop_requested": False,
+            "submitted_at": self._now(),
+        }  # fmt: skip
+        try:
+            with self._engine.begin() as connection:
+                if key is not None and (same := self._known(connection, owner, *key)) is not None:
+                    return same, False
+                job_id = connection.execute(insert(jobs).values(row).returning(jobs.c.id)).scalar_one()
+                if key is not None:
+                    values = {"owner": owner, "key": key[0], "digest": key[1], "job_id": job_id}
+                    connection.execute(insert(submissions).values(values | {"created_at": self._now()}))
+                return _job(connection, job_id), True
+        except IntegrityError:
+            # Two requests with one key came at once; in PostgreSQL both may look before one of them writes.
+            if key is None:
+                raise
+            with self._engine.begin() as connection:
+                known = self._known(connection, owner, *key)
+            if known is None:
+                raise
+            return known, False
+
+    def known(self, owner: str, key: str, digest: str) -> Job | None:
+        """Return the job that an earlier request with this key made; None: there was none.
+
+        Raises:
+            KeyUsedError: The owner used the key for another request.
+        """
+        with self._engine.begin() as connection:
+            return self._known(connection, owner, key, digest)
+
+    def _known(self, connection: Connection, owner: str, key: str, digest: str) -> Job | None:
+        found = connection.execute(
+            select(submissions.c.digest, submissions.c.job_id).where(
+                submissions.c.owner == owner, submissions.c.key == key
+            )
+        ).first()
+        if found is None:
+            return None
+        if found.digest != digest:
+            raise KeyUsedError(
+                f"The idempotency key {key!r} was used for another request.", "Give each new request a key of its own."
+            )
+        return _job(connection, found.job_id)
+
+    def created(self, job_id: int, *, num_cpus: float) -> Job:
+        """Let a job wait, as its sweep is written."""
+        return self._change(job_id, {"state": "waiting", "num_cpus": num_cpus}, ("creating",))
+
+    def forget(self, job_id: int) -> None:
+        """Remove a job whose sweep could not be written, and its key: the request may be sent again."""
+        with self._engine.begin() as connection:
+            connection.execute(delete(submissions).where(submissions.c.job_id == job_id))
+            connection.execute(delete(jobs).where(jobs.c.id == job_id, jobs.c.state == "creating"))
+
+    def rename(self, job_id: int, sweep: str) -> Job:
+        """Name the sweep of a job that is being created, as the name that was chosen is taken by now."""
+        return self._change(job_id, {"sweep": sweep}, ("creating",))
+
+    # -- to be run
+
+    def claim(self, num_cpus: float, may_run: Any = None) -> Job | None:
+        """Take the next job to run.
+
+        The highest priority goes first; among owners, the one with the fewest running jobs, then the one whose last job
+        started the longest ago. A job that is next but does not fit is waited for: smaller ones behind it would keep it
+        from ever running. With nothing running, everything fits. Jobs of one sweep run one after the other.
+
+        Args:
+            num_cpus: CPUs that there are.
+            may_run: Says of a sweep's name whether it may run now, such as that nobody else drives it; None: all may.
+        """
+        with self._engine.begin() as connection:
+            open_jobs = _jobs(connection, select(jobs).where(jobs.c.state.in_(("waiting", "running"))))
+            running = [job for job in open_jobs if job.state == "running"]
+            busy = {job.sweep for job in running}
+            first: dict[str, Job] = {}
+            for job in sorted((job for job in open_jobs if job.state == "waiting"), key=lambda job: job.id):
+                first.setdefault(job.sweep, job)
+            waiting = [job for name, job in first.items() if name not in busy and (may_run is None or may_run(name))]
+            if not waiting:
+                return None
+            owners = {job.owner for job in waiting}
+            job = _next(waiting, running, _last_started(connection, owners))
+            if running and sum(item.num_cpus for item in running) + job.num_cpus > num_cpus:
+                return None
+            values = {
+                "state": "running", "started_at": job.started_at or self._now(), "num_attempts": job.num_attempts + 1,
+            }  # fmt: skip
+            connection.execute(update(jobs).where(jobs.c.id == job.id, jobs.c.state == "waiting").values(values))
+            return _job(connection, job.id)
+
+    def again(self, job_id: int) -> Job:
+        """Note that a running job gets another driver process, as the last one died."""
+        return self._change(job_id, {"num_attempts": jobs.c.num_attempts + 1}, ("running",))
+
+    def give_back(self, job_id: int) -> Job:
+        """Let a running job wait again, as the service is drained."""
+        return self._change(job_id, {"state": "waiting", "stop_requested": False}, ("running",))
+
+    def end(self, job_id: int, outcome: Outcome, message: str | None = None) -> Job:
+        """End a job that waits or runs."""
+        values = {"state": "ended", "outcome": outcome, "message": message, "ended_at": self._now()}
+        return self._change(job_id, values, ("waiting", "running"))
+
+    # -- what people change
+
+    def request_stop(self, sweep: str) -> list[Job]:
+        """Cancel the waiting jobs of a sweep, and ask for the end of the running one; return those that changed."""
+        with self._engine.begin() as connection:
+            found = _jobs(
+                connection, select(jobs).where(jobs.c.sweep == sweep, jobs.c.state.in_(("waiting", "running")))
+            )
+            for job in found:
+                cancelled = {"state": "ended", "outcome": "cancelled", "ended_at": self._now()}
+                values = cancelled if job.state == "waiting" else {"stop_requested": True}
+                connection.execute(update(jobs).where(jobs.c.id == job.id, jobs.c.state == job.state).values(values))
+            return [_job(connection, job.id) for job in found]
+
+    def set_priority(self, sweep: str, priority: int) -> list[Job]:
+        """Change the priority of the waiting jobs of a sweep; return them."""
+        with self._engine.begin() as connection:
+            where = (jobs.c.sweep == sweep, jobs.c.state == "waiting")
+            connection.execute(update(jobs).where(*where).values(priority=priority))
+            return _jobs(connection, select(jobs).where(*where).order_by(jobs.c.id))
+
+    def remove_sweep(self, sweep: str) -> None:
+        """Forget the ended jobs of a sweep that is deleted, and their keys."""
+        with self._engine.begin() as connection:
+            ids = select(jobs.c.id).where(jobs.c.sweep == sweep, jobs.c.state == "ended")
+            connection.execute(delete(submissions).where(submissions.c.job_id.in_(ids)))
+            connection.execute(delete(jobs).where(jobs.c.sweep == sweep, jobs.c.state == "ended"))
+
+    # -- looking
+
+    def job(self, job_id: int) -> Job:
+        """Return a job.
+
+        Raises:
+            NotFoundError: There is none.
+        """
+        with self._engine.begin() as connection:
+            return _job(connection, job_id)
+
+    def jobs(self, *states: JobState, sweep: str | None = None) -> list[Job]:
+        """Return jobs in the order in which they came, of some states or all, of one sweep or all."""
+        query = select(jobs).order_by(jobs.c.id)
+        if states:
+            query = query.where(jobs.c.state.in_(states))
+        if sweep is not None:
+            query = query.where(jobs.c.sweep == sweep)
+        with self._engine.begin() as connection:
+            return _jobs(connection, query)
+
+    def _change(self, job_id: int, values: Mapping[str, Any], states: Sequence[JobState]) -> Job:
+        with self._engine.begin() as connection:
+            where = (jobs.c.id == job_id, jobs.c.state.in_(states))
+            connection.execute(update(jobs).where(*where).values(dict(values)))
+            return _job(connection, job_id)
+
+
+def _next(waiting: Sequence[Job], running: Sequence[Job], last_started: Mapping[str, float]) -> Job:
+    num_running = Counter(job.owner for job in running)
+    return min(
+        waiting,
+        key=lambda job: (-job.priority, num_running[job.owner], last_started.get(job.owner, 0.0), job.id),
+    )
+
+
+def _last_started(connection: Connection, owners: set[str]) -> dict[str, float]:
+    rows = connection.execute(
+        select(jobs.c.owner, jobs.c.started_at).where(jobs.c.owner.in_(owners), jobs.c.started_at.is_not(None))
+    )
+    last: dict[str, float] = {}
+    for owner, started in rows:
+        last[owner] = max(started, last.get(owner, 0.0))
+    return last
+
+
+def _jobs(connection: Connection, query: Any) -> list[Job]:
+    return [_as_job(row) for row in connection.execute(query).mappings()]
+
+
+def _job(connection: Connection, job_id: int) -> Job:
+    row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
+    if row is None:
+        raise NotFoundError(f"There is no job {job_id}.", "List the jobs: the queue names them.")
+    return _as_job(row)
+
+
+def _as_job(row: RowMapping) -> Job:
+    return Job.model_validate(dict(row))

@@ -1,0 +1,92 @@
+"""The parts of a running service, put together."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import Engine
+
+from policies.errors import CannotRunError
+from tune_jobs.plan.machine import local_machine
+from tune_jobs.service.config import ServiceConfig
+from tune_jobs.service.database.opening import open_database, sqlite_url
+from tune_jobs.service.labels import Labels
+from tune_jobs.service.queue import Queue
+from tune_jobs.service.statuses import Statuses
+from tune_jobs.service.submitting import Submitter
+from tune_jobs.service.supervisor import Supervisor, Surroundings
+from tune_jobs.store.contract import Storage
+from tune_jobs.store.local_storage import open_storage
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service and its parts."""
+
+    config: ServiceConfig
+    engine: Engine
+    storage: Storage
+    queue: Queue
+    labels: Labels
+    statuses: Statuses
+    submitter: Submitter
+    supervisor: Supervisor
+
+
+@contextlib.contextmanager
+def opened(config: ServiceConfig) -> Iterator[Service]:
+    """Open the database and run the queue for the block; sweeps that run at its end live on.
+
+    Raises:
+        CannotRunError: Another service has this storage folder, it can't be written, or the database can't be used.
+    """
+    with _alone(config.folder):
+        engine = open_database(config.database or sqlite_url(config.folder / "service.db"))
+        try:
+            storage, queue = open_storage(config.storage), Queue(engine)
+            # A cluster shares its CPUs among the trials of all sweeps by itself.
+            num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
+            where = Surroundings(config.storage, config.folder, config.address, num_cpus, config.modules)
+            supervisor = Supervisor(queue, storage, where, keep_spare=config.keep_spare)
+            supervisor.start()
+            try:
+                yield Service(
+                    config=config,
+                    engine=engine,
+                    storage=storage,
+                    queue=queue,
+                    labels=Labels(engine),
+                    statuses=Statuses(storage),
+                    submitter=Submitter(config, queue, storage),
+                    supervisor=supervisor,
+                )
+            finally:
+                supervisor.close()
+        finally:
+            engine.dispose()
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise CannotRunError(
+            f"The service can't write {folder}: {error.strerror}.", "Check the storage folder."
+        ) from error
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise CannotRunError(
+                f"Another service has the storage folder {folder.parent}.", "End it first, or give another --storage."
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,107 @@
+"""Start driver processes, and keep one that has everything imported before there is a job for it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from policies.errors import CannotRunError
+
+_ROOT = str(Path(__file__).parents[2])
+# With `-P`, nothing in the working directory can hide these packages.
+_BEGIN = """\
+import sys
+sys.path.insert(0, {root!r})
+import tune_jobs
+del sys.path[0]
+from tune_jobs.service.driver import main
+main({descriptor})
+"""
+
+
+class Driver:
+    """A driver process that has no job yet.
+
+    Raises:
+        CannotRunError: No process can be started.
+    """
+
+    def __init__(self) -> None:
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        code = _BEGIN.format(root=_ROOT, descriptor=theirs.fileno())
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 (this very Python)
+                [sys.executable, "-P", "-c", code],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                # It lives on when the service is killed, and a terminal's Ctrl-C is the service's alone.
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._socket.close()
+            raise CannotRunError(
+                f"No process can be started to run a sweep in ({sys.executable}): {error}.",
+                "See what limits the processes of this user, with `ulimit -u`.",
+            ) from error
+        finally:
+            theirs.close()
+
+    @property
+    def pid(self) -> int:
+        """The process's id."""
+        return self._process.pid
+
+    def is_usable(self) -> bool:
+        """Whether it lives."""
+        return self._process.poll() is None
+
+    def is_warm(self) -> bool:
+        """Whether it has imported everything."""
+        return bool(select.select([self._socket], [], [], 0)[0])
+
+    def give(self, request: Mapping[str, Any], lock: int, log: Path) -> None:
+        """Give it a job; from now on it needs nobody.
+
+        Args:
+            request: The job, see `driver`.
+            lock: A descriptor that holds the job's lock; the caller's copy is the caller's to close.
+            log: The file for what it prints.
+
+        Raises:
+            CannotRunError: It died before.
+        """
+        log.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        try:
+            socket.send_fds(self._socket, [json.dumps(request).encode()], [lock, descriptor])
+        except OSError as error:
+            raise CannotRunError(f"The process {self.pid} for the sweep died before it began: {error}.") from error
+        finally:
+            os.close(descriptor)
+
+    def poll(self) -> int | None:
+        """Return its exit code, which also frees what the system keeps of it; None: it runs."""
+        code = self._process.poll()
+        if code is not None:
+            # Not before: what it has said and nobody has read would make its end of a closed socket an error.
+            self._socket.close()
+        return code
+
+    def dismiss(self) -> None:
+        """End it, as no job comes."""
+        self._socket.close()
+        self._process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(5)
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()

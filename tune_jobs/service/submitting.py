@@ -1,0 +1,181 @@
+"""From a request to a job: validate, plan, and write a sweep, with nothing half-made if it fails."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from policies.envs.modules import allow_modules, allowed_again
+from policies.errors import SpecError
+from policies.guard.guard import guarding
+from tune_jobs.plan.machine import Machine, local_machine
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
+from tune_jobs.service.config import ServiceConfig
+from tune_jobs.service.jobs import Job
+from tune_jobs.service.queue import Queue
+from tune_jobs.spec.file import find_preset, load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name
+from tune_jobs.spec.yaml import parse_yaml
+from tune_jobs.store.contract import Storage
+from tune_jobs.sweeps.drive import write_new
+
+
+@dataclass(frozen=True)
+class Submission:
+    """What somebody sends: exactly one of preset, text and spec."""
+
+    preset: str | None = None
+    text: str | None = None
+    """A sweep file."""
+    spec: Mapping[str, Any] | None = None
+    """The content of one."""
+    overrides: Sequence[str] = ()
+    name: str | None = None
+    priority: int = 0
+    note: str = ""
+    tags: Sequence[str] = field(default_factory=tuple)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the request, by which a second one with the same idempotency key is known to be the same."""
+        data = {
+            "preset": self.preset, "text": self.text, "spec": self.spec, "overrides": list(self.overrides),
+            "name": self.name, "priority": self.priority, "note": self.note, "tags": list(self.tags),
+        }  # fmt: skip
+        return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+class Submitter:
+    """Makes sweeps and jobs.
+
+    Args:
+        config: The service's settings.
+        queue: The jobs.
+        storage: The sweeps.
+    """
+
+    def __init__(self, config: ServiceConfig, queue: Queue, storage: Storage) -> None:
+        self._config, self._queue, self._storage = config, queue, storage
+
+    @allowed_again()
+    @guarding(start=True)
+    def plan(self, submission: Submission) -> tuple[SweepSpec, SweepPlan]:
+        """Validate a sweep, and return what would run; nothing is written.
+
+        Raises:
+            SpecError: The sweep is wrong, or not allowed here.
+            CannotRunError: It cannot run here.
+        """
+        return self._planned(submission)
+
+    @allowed_again()
+    @guarding(start=True)
+    def submit(self, submission: Submission, *, owner: str, key: str | None = None) -> tuple[Job, bool]:
+        """Write a sweep and let it wait; return its job, and whether it is new.
+
+        Raises:
+            SpecError: The sweep is wrong or not allowed here, its name is taken, or the key was used for another one.
+            CannotRunError: It cannot run here.
+        """
+        keyed = None if key is None else (key, submission.digest)
+        if keyed is not None and (known := self._queue.known(owner, *keyed)) is not None:
+            return known, False
+        spec, plan = self._planned(submission)
+        name = self._free_name(submission, spec)
+        # The job comes first: a sweep whose job was never written would be begun twice where the request is repeated.
+        job, is_new = self._queue.begin(
+            name, "drive", {}, owner=owner, priority=submission.priority, key=keyed, state="creating"
+        )
+        if not is_new:
+            return job, False
+        try:
+            while True:
+                sweep = self._storage.sweep(job.sweep)
+                try:
+                    sweep.create()
+                    break
+                except SpecError:
+                    if _wanted(submission, spec) is not None:
+                        raise
+                    job = self._queue.rename(job.id, self._free_name(submission, spec))
+            try:
+                with sweep.lock():
+                    write_new(sweep, spec, plan, self._config.address, "created")
+            except BaseException:
+                sweep.discard()
+                raise
+        except BaseException:
+            self._queue.forget(job.id)
+            raise
+        return self._queue.created(job.id, num_cpus=num_cpus_of(plan)), True
+
+    def _planned(self, submission: Submission) -> tuple[SweepSpec, SweepPlan]:
+        allow_modules(self._config.modules)
+        spec = _spec_of(submission)
+        if not self._config.allows_env(spec.env.id):
+            raise SpecError(
+                f"env.id: the environment {spec.env.id!r} is not one that may be used here.",
+                "Choose one that the service's operator allows (serve --env).",
+            )
+        plan = make_plan(spec, self._machine(spec))
+        limits = self._config.limits
+        if len(plan.trials) > limits.trials:
+            raise SpecError(
+                f"The sweep has {len(plan.trials):,} trials; here a sweep may have at most {limits.trials:,}.",
+                "Lower num_samples, seeds_per_point or the grids.",
+            )
+        if limits.env_steps is not None and plan.max_env_steps > limits.env_steps:
+            raise SpecError(
+                f"The sweep may train {plan.max_env_steps:,} env steps; here it may train at most "
+                f"{limits.env_steps:,}.",
+                "Lower stop.num_env_steps or num_samples.",
+            )
+        return spec, plan
+
+    def _machine(self, spec: SweepSpec) -> Machine:
+        if self._config.address is None:
+            return local_machine()
+        return Machine(max(1, spec.cpus_per_trial), spec.resources.num_gpus, source=self._config.address)
+
+    def _free_name(self, submission: Submission, spec: SweepSpec) -> str:
+        wanted = _wanted(submission, spec)
+        if wanted is not None:
+            return self._storage.new_sweep(check_sweep_name(wanted)).name
+        stem, number = submission.preset or "sweep", 1
+        while self._storage.is_taken(stem if number == 1 else f"{stem}-{number}"):
+            number += 1
+        return stem if number == 1 else f"{stem}-{number}"
+
+
+def _wanted(submission: Submission, spec: SweepSpec) -> str | None:
+    return submission.name if submission.name is not None else spec.name
+
+
+def _spec_of(submission: Submission) -> SweepSpec:
+    given = [item for item in (submission.preset, submission.text, submission.spec) if item is not None]
+    if len(given) != 1:
+        raise SpecError(f"A sweep is given as one of preset, text and spec; there are {len(given)}.")
+    if submission.spec is not None:
+        return load_spec(submission.spec, submission.overrides)
+    if submission.preset is not None:
+        # Looked up by its name here, as a text may be the path of a file of this machine.
+        return load_spec(parse_yaml(find_preset(submission.preset).text, submission.preset), submission.overrides)
+    data = parse_yaml(submission.text or "", "the sweep file")
+    if not isinstance(data, dict):
+        raise SpecError("The sweep file holds no fields.", "Begin with env: and algorithm:, or with a preset.")
+    return load_spec(data, submission.overrides)
+
+
+def num_cpus_of(plan: SweepPlan) -> float:
+    """Return how many CPUs a sweep takes while it runs, at most those of its machine."""
+    packs, others, packed = plan.packs, len(plan.trials), 0.0
+    at_once = plan.max_concurrent
+    if packs is not None:
+        others -= len(packs.trial_ids)
+        at_once -= packs.max_concurrent
+        packed = packs.num_packs * packs.cpus_per_pack
+    alone = min(others, max(0, at_once)) * plan.cpus_per_trial
+    return float(min(max(1.0, packed + alone), plan.machine.num_cpus))

@@ -1,0 +1,282 @@
+"""Run the queue: start a driver for each job that may run, watch those that run, and find them again after a restart.
+
+Nothing here is believed because it was remembered: whether a driver lives is asked of the job's lock, and how it ended
+of the job's file. So a service that was killed, and began anew, does the same as one that was not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from policies.errors import TuneJobsError
+from tune_jobs.service.job_files import JobFiles, held_jobs
+from tune_jobs.service.jobs import Job
+from tune_jobs.service.queue import Queue
+from tune_jobs.service.spare import Driver
+from tune_jobs.store.contract import Storage, Sweep
+
+_log = logging.getLogger(__name__)
+
+TICK_S = 0.25
+MAX_ATTEMPTS = 5
+"""How many driver processes may die of one job before it counts as failed."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Where jobs run."""
+
+    storage_folder: Path
+    service_folder: Path
+    address: str | None
+    """The Ray cluster; None: this machine."""
+    num_cpus: float
+    modules: tuple[str, ...]
+    """Modules that specs may name; the operator's choice."""
+
+
+class Supervisor:
+    """The thread that runs the queue.
+
+    Args:
+        queue: The jobs.
+        storage: The sweeps.
+        where: Where they run.
+        keep_spare: Whether a driver process is kept warm.
+        on_end: Called with each job that has ended.
+    """
+
+    def __init__(
+        self,
+        queue: Queue,
+        storage: Storage,
+        where: Surroundings,
+        *,
+        keep_spare: bool = True,
+        on_end: Callable[[Job], None] = lambda _: None,
+    ) -> None:
+        self._queue, self._storage, self._where = queue, storage, where
+        self._keep_spare, self._on_end = keep_spare, on_end
+        self._spare: Driver | None = None
+        self._children: dict[int, Driver] = {}
+        self._retry_at: dict[int, float] = {}
+        self._interrupted: set[int] = set()
+        self._wake, self._end = threading.Event(), threading.Event()
+        self._draining = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="queue", daemon=True)
+
+    # -- from other threads
+
+    def start(self) -> None:
+        """Find what ran before, and begin."""
+        self.reconcile()
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Look at the queue now."""
+        self._wake.set()
+
+    def drain(self, timeout_s: float) -> bool:
+        """Start nothing more, let running sweeps save and their jobs wait again, and end.
+
+        Returns:
+            Whether all have saved in that time. Those that have not run on, and are found again.
+        """
+        self._draining.set()
+        self.wake()
+        deadline = time.monotonic() + timeout_s
+        while self._queue.jobs("running") and time.monotonic() < deadline:
+            time.sleep(TICK_S)
+        done = not self._queue.jobs("running")
+        self.close()
+        return done
+
+    def close(self) -> None:
+        """End the thread; drivers live on."""
+        self._end.set()
+        self.wake()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self._spare is not None:
+            self._spare.dismiss()
+            self._spare = None
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the queue is being run."""
+        return self._thread.is_alive()
+
+    @property
+    def is_draining(self) -> bool:
+        """Whether it starts nothing more."""
+        return self._draining.is_set()
+
+    @property
+    def num_cpus(self) -> float:
+        """CPUs that running sweeps share."""
+        return self._where.num_cpus
+
+    # -- the queue
+
+    def reconcile(self) -> None:
+        """Make queue and folders agree, after a start: folders are the truth.
+
+        A job whose sweep was never written is forgotten. Sweeps that were written but not begun, or whose driver was
+        killed, and that have no job, get one: the database was lost, or they were made by somebody else's hands.
+        """
+        open_jobs = self._queue.jobs("creating", "waiting", "running")
+        for job in open_jobs:
+            if job.state != "creating":
+                continue
+            if self._storage.sweep(job.sweep).exists():
+                self._queue.created(job.id, num_cpus=self._where.num_cpus)
+            else:
+                self._queue.forget(job.id)
+        known = {job.sweep for job in open_jobs}
+        ours = {holder.sweep for holder in held_jobs(self._where.service_folder)}
+        for sweep in self._storage.sweeps():
+            if sweep.name in known or (sweep.is_driven() and sweep.name not in ours):
+                continue
+            try:
+                state = sweep.read_record().state
+            except TuneJobsError as error:
+                _log.warning("Sweep %s is left alone: %s", sweep.name, error)
+                continue
+            if state in ("created", "running"):
+                self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.num_cpus)
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            try:
+                self._look()
+            except Exception:  # noqa: BLE001 (whatever it is, the queue has to go on)
+                # Such as a database that is away for a while: it is tried again, and the service says that it is so.
+                _log.exception("The queue could not be looked at; it is tried again.")
+                self._end.wait(1.0)
+            self._wake.wait(TICK_S)
+            self._wake.clear()
+
+    def _look(self) -> None:
+        for pid in [pid for pid, child in self._children.items() if child.poll() is not None]:
+            del self._children[pid]
+        for job in self._queue.jobs("running"):
+            self._look_at(job)
+        while not self._draining.is_set():
+            claimed = self._queue.claim(self._where.num_cpus, self._may_run)
+            if claimed is None:
+                break
+            self._start(claimed)
+        self._mind_spare()
+
+    def _may_run(self, name: str) -> bool:
+        """Whether nobody else drives a sweep, such as a person with a terminal."""
+        return not self._sweep(name).is_driven()
+
+    def _look_at(self, job: Job) -> None:
+        files = self._files(job)
+        if files.is_run():
+            if job.stop_requested:
+                # Again and again: the driver may not have begun to listen.
+                sweep = self._sweep(job.sweep)
+                if sweep.is_driven() and not sweep.stop_requested():
+                    sweep.request_stop()
+            elif self._draining.is_set():
+                self._interrupt(job, files)
+            return
+        ended = files.read_ended(job.num_attempts)
+        if ended is not None and ended.outcome != "interrupted":
+            self._finished(self._queue.end(job.id, ended.outcome, ended.message))
+        elif job.stop_requested:
+            self._finished(self._queue.end(job.id, "stopped"))
+        elif ended is not None or self._draining.is_set():
+            # Whoever wants the end of the sweep, and not of the process, asks for it: it goes on later.
+            self._queue.give_back(job.id)
+        else:
+            self._died(job, files)
+
+    def _died(self, job: Job, files: JobFiles) -> None:
+        """Let another driver go on, after a while, or give up."""
+        if job.num_attempts >= MAX_ATTEMPTS:
+            said = files.last_lines()
+            message = f"The process that ran the sweep died {job.num_attempts} times." + (f"\n{said}" if said else "")
+            self._finished(self._queue.end(job.id, "failed", message))
+        elif self._retry_at.setdefault(job.id, time.monotonic() + _wait_s(job.num_attempts)) <= time.monotonic():
+            del self._retry_at[job.id]
+            _log.warning("The driver of job %d (sweep %s) died; another one goes on.", job.id, job.sweep)
+            self._start(self._queue.again(job.id))
+
+    def _interrupt(self, job: Job, files: JobFiles) -> None:
+        """Let a driver save and end, once."""
+        holder = files.holder()
+        if holder is None or job.id in self._interrupted:
+            return
+        self._interrupted.add(job.id)
+        with contextlib.suppress(OSError):
+            os.kill(holder.pid, signal.SIGTERM)
+
+    def _finished(self, job: Job) -> None:
+        _log.info("Job %d (%s of sweep %s) has ended: %s.", job.id, job.verb, job.sweep, job.outcome)
+        self._on_end(job)
+
+    def _start(self, job: Job) -> None:
+        files = self._files(job)
+        lock = files.take()
+        if lock is None:
+            # A driver of an earlier life of the service runs it: it is watched like any other.
+            return
+        try:
+            driver = self._driver()
+            request = {
+                "service": str(self._where.service_folder),
+                "job": job.uid,
+                "attempt": job.num_attempts,
+                "sweep": str(self._sweep(job.sweep).folder),
+                "verb": job.verb,
+                "arguments": job.arguments,
+                "address": self._where.address,
+                "modules": self._where.modules,
+                "working_folder": str(self._where.storage_folder),
+            }
+            driver.give(request, lock, files.log)
+            self._children[driver.pid] = driver
+            _log.info("Job %d (%s of sweep %s) is run by process %d.", job.id, job.verb, job.sweep, driver.pid)
+        except TuneJobsError as error:
+            # It is looked at again, as one whose driver died.
+            _log.warning("Job %d can't be started: %s", job.id, error)
+        finally:
+            os.close(lock)
+
+    def _driver(self) -> Driver:
+        spare, self._spare = self._spare, None
+        if spare is not None and spare.is_usable():
+            return spare
+        return Driver()
+
+    def _mind_spare(self) -> None:
+        if not self._keep_spare or self._draining.is_set():
+            return
+        if self._spare is not None and not self._spare.is_usable():
+            self._spare = None
+        # While sweeps run, the next one waits for them; importing would only take their time.
+        if self._spare is None and not self._queue.jobs("running"):
+            with contextlib.suppress(TuneJobsError):
+                self._spare = Driver()
+
+    def _files(self, job: Job) -> JobFiles:
+        return JobFiles(self._where.service_folder, job.uid)
+
+    def _sweep(self, name: str) -> Sweep:
+        return self._storage.sweep(name)
+
+
+def _wait_s(num_attempts: int) -> float:
+    """Return how long to wait before the next attempt: what killed the last one may still be there."""
+    return min(30.0, 0.5 * 2.0 ** (num_attempts - 1))
