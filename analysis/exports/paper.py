@@ -133,21 +133,8 @@ def learning_figure(
     figure = new_figure(size)
     axes = figure.subplots()
     for number, (name, curve) in enumerate(curves):
-        color = PALETTE[number % len(PALETTE)]
         label = curve.label if len(sweeps) == 1 else f"{name}: {curve.label}" if top > 1 and curve.label else name
-        steps, mean = curve.num_env_steps, drawable(curve.mean)
-        # The dashes begin where the line ends, so that there is no gap.
-        whole = steps <= curve.first_end
-        after = np.flatnonzero(~whole)
-        seeds = counted(curve.num_seeds, "seed")
-        label = f"{label} ({seeds})" if label else seeds
-        axes.plot(steps[whole], mean[whole], color=color, linewidth=1.2, label=escape(label))
-        if after.size:
-            rest = slice(max(0, int(after[0]) - 1), None)
-            axes.plot(steps[rest], mean[rest], color=color, linewidth=1.0, linestyle=(0, (3, 2)))
-        if curve.lower is not None and curve.upper is not None:
-            low, high = drawable(curve.lower), drawable(curve.upper)
-            axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+        _draw_curve(axes, curve, label, PALETTE[number % len(PALETTE)])
     style_axes(axes, xlabel="env steps", ylabel=_AXES[returns])
     axes.grid(visible=True, color=GRID, linewidth=0.5)
     steps_axis(axes)
@@ -163,6 +150,23 @@ def learning_figure(
     handles, told = axes.get_legend_handles_labels()
     figure.legend(handles, told, loc="outside upper left", frameon=False, fontsize=_FONT_SIZE - 1, ncols=1)
     return figure
+
+
+def _draw_curve(axes: Axes, curve: Curve, label: str, color: str) -> None:
+    """Draw a curve with its band and, in the legend, its number of seeds."""
+    steps, mean = curve.num_env_steps, drawable(curve.mean)
+    whole = steps <= curve.first_end
+    seeds = counted(curve.num_seeds, "seed")
+    told = f"{label} ({seeds})" if label else seeds
+    axes.plot(steps[whole], mean[whole], color=color, linewidth=1.2, label=escape(told))
+    after = np.flatnonzero(~whole)
+    if after.size:
+        # The dashes begin where the line ends, so that there is no gap.
+        rest = slice(max(0, int(after[0]) - 1), None)
+        axes.plot(steps[rest], mean[rest], color=color, linewidth=1.0, linestyle=(0, (3, 2)))
+    if curve.lower is not None and curve.upper is not None:
+        low, high = drawable(curve.lower), drawable(curve.upper)
+        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
 
 
 def _fit_returns(axes: Axes, curves: Sequence[Curve], goal: float | None) -> None:

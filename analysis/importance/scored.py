@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,47 +50,51 @@ def score_points(
     why_none = _why_none(sweep, trials, ended, objective, goal)
     if why_none:
         return Scored(objective, (), (), 0, why_none)
-    cut = [trial.num_env_steps for trial in ended if trial.status == "stopped"]
-    steps = min(cut) if cut else None
+    first_cut = min((trial.num_env_steps for trial in ended if trial.status == "stopped"), default=None)
     whole = int(sweep.section("stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
-    shown: dict[str, float | None] = {}
-    for trial in ended:
-        rows = [row for row in results.get(trial.trial_id, ()) if steps is None or row.num_env_steps <= steps]
-        score = None
-        if trial.status != "failed":
-            score = score_of(trial, rows, objective, num_env_steps=steps or whole, threshold=goal)
-        shown[trial.trial_id] = finite_or_none(score)
-    known = [score for score in shown.values() if score is not None]
+
+    def shown(trial: TrialRecord) -> float | None:
+        """Return what a trial scored at the env steps that all are judged at; None: it failed, or showed nothing."""
+        if trial.status == "failed":
+            return None
+        rows = results.get(trial.trial_id, ())
+        if first_cut is not None:
+            rows = [row for row in rows if row.num_env_steps <= first_cut]
+        return finite_or_none(score_of(trial, rows, objective, num_env_steps=first_cut or whole, threshold=goal))
+
+    found = [shown(trial) for trial in ended]
+    known = [score for score in found if score is not None]
     if not known:
         return Scored(objective, (), (), 0, "No trial showed a score.")
     worst = min(known)
     seeds: defaultdict[int, list[float]] = defaultdict(list)
     values: dict[int, dict[str, Any]] = {}
-    for trial in ended:
-        score = shown[trial.trial_id]
+    for trial, score in zip(ended, found, strict=True):
         seeds[trial.point_index].append(worst if score is None else score)
         values[trial.point_index] = trial.point
-    notes = []
-    if lost := len(ended) - len(known):
-        notes.append(
-            f"{counted(lost, 'trial')} without a score counted as the worst, having failed or ended no episode."
-        )
-    if steps is not None:
-        notes.append(
-            f"The scheduler ended {len(cut):,} of {counted(len(ended), 'trial')} early. All are judged at {steps:,} "
-            "env steps, which each of them has done, so this is about the beginning of training."
-        )
-    if waiting := len(trials) - len(ended):
-        notes.append(f"Left out, as they have not ended: {counted(waiting, 'trial')}.")
     return Scored(
         objective,
         tuple(values.values()),
         # Divided first, as the sum of scores that are nearly too large for a float is too large.
         tuple(math.fsum(score / len(scores) for score in scores) for scores in seeds.values()),
         len(ended),
-        notes=tuple(notes),
-        num_env_steps=steps,
+        notes=tuple(_notes(ended, first_cut, num_lost=len(ended) - len(known), num_waiting=len(trials) - len(ended))),
+        num_env_steps=first_cut,
     )
+
+
+def _notes(ended: Sequence[TrialRecord], first_cut: int | None, *, num_lost: int, num_waiting: int) -> Iterator[str]:
+    """Say what the scores are not; `first_cut` is the env step at which a scheduler ended the first trial, if any."""
+    if num_lost:
+        yield f"{counted(num_lost, 'trial')} without a score counted as the worst, having failed or ended no episode."
+    if first_cut is not None:
+        num_cut = sum(trial.status == "stopped" for trial in ended)
+        yield (
+            f"The scheduler ended {num_cut:,} of {counted(len(ended), 'trial')} early. All are judged at {first_cut:,} "
+            "env steps, which each of them has done, so this is about the beginning of training."
+        )
+    if num_waiting:
+        yield f"Left out, as they have not ended: {counted(num_waiting, 'trial')}."
 
 
 def _why_none(

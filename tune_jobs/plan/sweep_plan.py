@@ -17,11 +17,12 @@ from analysis.numbering import planned_places
 from analysis.records import FINISHED, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
 from policies.envs.make import EnvInfo
-from policies.errors import CannotRunError, SpecError
+from policies.errors import SpecError
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
+from tune_jobs.plan.concurrency import max_concurrent
 from tune_jobs.plan.engine_choice import PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
 from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
@@ -43,7 +44,6 @@ MAX_TRIALS = 100_000
 
 # The size of what is made once per sweep, rounded up: videos, report, Ray Tune's own state.
 _SWEEP_BYTES = 20_000_000
-_FOR_EVER = "It would wait forever."
 
 _Point = tuple[dict[str, Any] | None, Hyperparams | None]
 """The sampled values and all hyperparameters; both are None if the search method chooses them at the trial's start."""
@@ -129,30 +129,15 @@ def make_plan(
     check_env_args(spec)
     env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
     check_rl_module(spec)
-    num_trials = num_points_of(spec) * spec.seeds_per_point + sum(len(item.points) for item in replications)
-    if num_trials > MAX_TRIALS:
-        raise SpecError(
-            f"The sweep has {num_trials:,} trials; at most {MAX_TRIALS:,} can be planned.",
-            "Lower num_samples or seeds_per_point, or make the grids smaller.",
-        )
-    concurrent = _max_concurrent(spec, machine, num_trials)
+    concurrent = max_concurrent(spec, machine, _num_trials(spec, replications))
     points = _points(spec)
     known = [values for _, values in points if values is not None]
     check_env_rules(spec, env, known)
     trials, engine_notes = _trials(spec, env, points, records, replications)
-    first_trials = [trial for trial in trials if trial.seed_index == 0]
-    idle = idle_notes(
-        spec,
-        env,
-        [values for _, values in points],
-        [_is_packed(trial) for trial in first_trials],
-        may_refuse=not records,
-    )
+    are_packed = [_is_packed(trial) for trial in trials if trial.seed_index == 0]
+    idle = idle_notes(spec, env, [values for _, values in points], are_packed, may_refuse=not records)
     sizes = _sizes(spec, known)
-    ended = {record.trial_id for record in records if record.status in FINISHED}
-    if retry_failed:
-        ended -= {record.trial_id for record in records if record.status == "failed"}
-    to_run = [trial for trial in trials if trial.trial_id not in ended]
+    to_run = _to_run(trials, records, retry_failed=retry_failed)
     members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
@@ -178,6 +163,17 @@ def make_plan(
 def num_points_of(spec: SweepSpec) -> int:
     """Return the number of a sweep's points."""
     return spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+
+
+def _num_trials(spec: SweepSpec, replications: Sequence[ReplicationRecord]) -> int:
+    """Return the number of a sweep's trials; too many are refused."""
+    number = num_points_of(spec) * spec.seeds_per_point + sum(len(item.points) for item in replications)
+    if number > MAX_TRIALS:
+        raise SpecError(
+            f"The sweep has {number:,} trials; at most {MAX_TRIALS:,} can be planned.",
+            "Lower num_samples or seeds_per_point, or make the grids smaller.",
+        )
+    return number
 
 
 def _points(spec: SweepSpec) -> list[_Point]:
@@ -229,6 +225,16 @@ def _trials(
         trial.model_copy(update={"engine": engine}) for trial, engine in zip(trials, choice.engines, strict=True)
     )
     return tuple(planned), choice.notes
+
+
+def _to_run(trials: Sequence[TrialPlan], records: Sequence[TrialRecord], *, retry_failed: bool) -> list[TrialPlan]:
+    """Return the trials that have not ended, and those that failed where they run again."""
+    ended = {
+        record.trial_id
+        for record in records
+        if record.status in FINISHED and not (retry_failed and record.status == "failed")
+    }
+    return [trial for trial in trials if trial.trial_id not in ended]
 
 
 def _is_packed(trial: TrialPlan) -> bool:
@@ -311,48 +317,6 @@ def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int) -
     else:
         shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
     return f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
-
-
-def _max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
-    """Return how many trials run at once; a trial that would wait forever is refused."""
-    cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
-    _refuse_too_large(spec, machine)
-    # Env runners are placed one by one and may be on other nodes; the rest of a trial is one process on one node.
-    whole = cpus if spec.resources.num_env_runners == 0 else 0
-    limits = [machine.fitting(whole, gpus), machine.num_cpus // cpus, num_trials]
-    if spec.resources.max_concurrent is not None:
-        limits.append(spec.resources.max_concurrent)
-    return max(1, int(min(limits)))
-
-
-def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
-    cpus, gpus, runners = spec.cpus_per_trial, spec.resources.num_gpus, spec.resources.num_env_runners
-    made_of = (
-        f" (1 process and {counted(runners, 'env runner')})" if runners and spec.resources.num_cpus is None else ""
-    )
-    if cpus > machine.num_cpus:
-        hint = machine.more
-        if machine.num_cpus >= 1:
-            most = int(machine.num_cpus)
-            setting = f"num_env_runners to at most {most - 1}" if runners else f"num_cpus to at most {most}"
-            hint = f"set resources.{setting}, or {hint}"
-        raise CannotRunError(
-            f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
-            f"{hint[0].upper()}{hint[1:]}.",
-        )
-    if gpus > machine.num_gpus:
-        raise CannotRunError(
-            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {_FOR_EVER}",
-            "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
-        )
-    main = cpus - runners
-    if machine.nodes and not any(main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes):
-        nodes = ", ".join(f"{node_cpus:g} and {node_gpus:g}" for node_cpus, node_gpus in machine.nodes)
-        raise CannotRunError(
-            f"One trial's process needs {counted(main, 'CPU')} and {gpus:g} GPU{'s' * (gpus != 1)} on one node; no "
-            f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {_FOR_EVER}",
-            "Lower resources.num_cpus or resources.num_gpus.",
-        )
 
 
 def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:

@@ -1,0 +1,56 @@
+"""How many trials run at once on a machine; a trial that would wait forever is refused, with the numbers."""
+
+from __future__ import annotations
+
+from analysis.wording import counted
+from policies.errors import CannotRunError
+from tune_jobs.plan.machine import Machine
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+_FOR_EVER = "It would wait forever."
+
+
+def max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
+    """Return how many trials run at once, each in a process of its own.
+
+    Raises:
+        CannotRunError: One trial needs more than the machine has.
+    """
+    cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
+    _refuse_too_large(spec, machine)
+    # Env runners are placed one by one and may be on other nodes; the rest of a trial is one process on one node.
+    whole = cpus if spec.resources.num_env_runners == 0 else 0
+    limits = [machine.fitting(whole, gpus), machine.num_cpus // cpus, num_trials]
+    if spec.resources.max_concurrent is not None:
+        limits.append(spec.resources.max_concurrent)
+    return max(1, int(min(limits)))
+
+
+def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
+    cpus, gpus, runners = spec.cpus_per_trial, spec.resources.num_gpus, spec.resources.num_env_runners
+    made_of = (
+        f" (1 process and {counted(runners, 'env runner')})" if runners and spec.resources.num_cpus is None else ""
+    )
+    if cpus > machine.num_cpus:
+        hint = machine.more
+        if machine.num_cpus >= 1:
+            most = int(machine.num_cpus)
+            setting = f"num_env_runners to at most {most - 1}" if runners else f"num_cpus to at most {most}"
+            hint = f"set resources.{setting}, or {hint}"
+        raise CannotRunError(
+            f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
+            f"{hint[0].upper()}{hint[1:]}.",
+        )
+    if gpus > machine.num_gpus:
+        raise CannotRunError(
+            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {_FOR_EVER}",
+            "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
+        )
+    main = cpus - runners
+    if machine.nodes and not any(main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes):
+        nodes = ", ".join(f"{node_cpus:g} and {node_gpus:g}" for node_cpus, node_gpus in machine.nodes)
+        raise CannotRunError(
+            f"One trial's process needs {counted(main, 'CPU')} and {gpus:g} GPU{'s' * (gpus != 1)} on one node; no "
+            f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {_FOR_EVER}",
+            "Lower resources.num_cpus or resources.num_gpus.",
+        )
