@@ -143,7 +143,9 @@ class Queue:
             may_run: Says of a sweep's name whether it may run now, such as that nobody else drives it; None: all may.
         """
         with self._engine.begin() as connection:
-            open_jobs = _jobs(connection, select(jobs).where(jobs.c.state.in_(("waiting", "running"))))
+            # Whoever claims at the same time waits here, and sees what this one took (SQLite has one writer anyway).
+            query = select(jobs).where(jobs.c.state.in_(("waiting", "running"))).with_for_update()
+            open_jobs = _jobs(connection, query)
             running = [job for job in open_jobs if job.state == "running"]
             busy = {job.sweep for job in running}
             first: dict[str, Job] = {}
@@ -180,9 +182,8 @@ class Queue:
     def request_stop(self, sweep: str) -> list[Job]:
         """Cancel the waiting jobs of a sweep, and ask for the end of the running one; return those that changed."""
         with self._engine.begin() as connection:
-            found = _jobs(
-                connection, select(jobs).where(jobs.c.sweep == sweep, jobs.c.state.in_(("waiting", "running")))
-            )
+            query = select(jobs).where(jobs.c.sweep == sweep, jobs.c.state.in_(("waiting", "running")))
+            found = _jobs(connection, query.with_for_update())
             for job in found:
                 cancelled = {"state": "ended", "outcome": "cancelled", "ended_at": self._now()}
                 values = cancelled if job.state == "waiting" else {"stop_requested": True}
