@@ -26,8 +26,25 @@ _aten = torch.ops.aten
 Floats = NDArray[np.float32]
 
 
+# torch's own elu and silu compute the last few numbers of an array by another routine than the others, so that a number
+# would depend on how many other networks there are. exp and expm1 do not.
+
+
+def _elu(x: Tensor) -> Tensor:
+    return torch.where(x > 0.0, x, torch.expm1(x))
+
+
 def _elu_backward(gradient: Tensor, kept: Tensor) -> Tensor:
-    return _aten.elu_backward(gradient, 1.0, 1.0, 1.0, False, kept)  # type: ignore[no-any-return]  # noqa: FBT003
+    return torch.where(kept > 0.0, gradient, gradient * torch.exp(kept))
+
+
+def _silu(x: Tensor) -> Tensor:
+    return x / (torch.exp(-x) + 1.0)
+
+
+def _silu_backward(gradient: Tensor, kept: Tensor) -> Tensor:
+    sigmoid = 1.0 / (torch.exp(-kept) + 1.0)
+    return gradient * sigmoid * (1.0 + kept * (1.0 - sigmoid))
 
 
 def _relu_backward(gradient: Tensor, kept: Tensor) -> Tensor:
@@ -59,8 +76,8 @@ _ACTIVATIONS = {
     "linear": _Activation(),
     "relu": _Activation(torch.relu_, _relu_backward, of_few=_relu_of_few),
     "tanh": _Activation(torch.tanh_, _aten.tanh_backward, of_few=_tanh_of_few),
-    "silu": _Activation(functional.silu, _aten.silu_backward, keeps_input=True),
-    "elu": _Activation(functional.elu, _elu_backward, keeps_input=True),
+    "silu": _Activation(_silu, _silu_backward, keeps_input=True),
+    "elu": _Activation(_elu, _elu_backward, keeps_input=True),
     "gelu": _Activation(functional.gelu, _aten.gelu_backward, keeps_input=True),
 }
 

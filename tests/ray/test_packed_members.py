@@ -16,6 +16,7 @@ from packed_rllib import MODULE, PPOMember, assert_same_stats, learner_of, state
 from trials import make_task
 
 from policies.acting.policy import NetworkPolicy
+from policies.activations import ACTIVATIONS
 from policies.errors import CheckpointError
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.vector import EnvKind
@@ -113,18 +114,22 @@ def test_a_member_does_not_depend_on_the_others(env_id: str, shared: dict[str, A
         assert packed.num_optimizer_steps == alone.num_optimizer_steps
 
 
-@pytest.mark.parametrize("size", [32, 64])
-def test_of_equal_sizes_a_member_does_not_depend_on_the_others_to_the_bit(size: int) -> None:
+@pytest.mark.parametrize("shared", [
+    {"hidden_sizes": (32,)}, {"hidden_sizes": (64,)}, {"hidden_sizes": (64,), "num_envs": 1},
+    # Arrays whose lengths are no multiples of what a processor computes at once.
+    *({"hidden_sizes": (21,), "minibatch_size": 50, "activation": activation} for activation in ACTIVATIONS),
+])  # fmt: skip
+def test_of_equal_sizes_a_member_does_not_depend_on_the_others_to_the_bit(shared: dict[str, Any]) -> None:
     """Nothing is padded: each matrix of its own has the shape that it has alone, and so its sums are the same.
 
     Of episodes that are truncated after 50 steps one member has many where another has none.
     """
 
     def weights_beside(num_others: int) -> dict[str, bytes]:
-        stack = make_stack("CartPole-v1", {"max_episode_steps": 50}, hidden_sizes=(size,))
-        add(stack, "watched", 77, hidden_sizes=(size,))
+        stack = make_stack("CartPole-v1", {"max_episode_steps": 50}, **shared)
+        add(stack, "watched", 77, **shared)
         for index in range(num_others):
-            add(stack, f"o{index}", index, hidden_sizes=(size,), lr=1e-3 * (index + 1))
+            add(stack, f"o{index}", index, **{**shared, "lr": 1e-3 * (index + 1)})
         for _ in range(20):
             stack.train_iteration()
         found = {name: value.tobytes() for name, value in stack.member("watched").weights.items()}

@@ -50,6 +50,8 @@ def advantages_and_targets(
 
 def standardise(advantages: Floats) -> Floats:
     """Scale each row, (M, R), to mean 0 and standard deviation 1, as RLlib does: a deviation is at least 1e-4."""
+    # NumPy sums a row in another order where it does not lie in one piece, as rows of packs with one env each may not.
+    advantages = np.ascontiguousarray(advantages)
     mean = advantages.mean(axis=1, keepdims=True)
     std = advantages.std(axis=1, keepdims=True)
     out: Floats = ((advantages - mean) / np.maximum(std, np.float32(1e-4))).astype(np.float32)
