@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.packed.sizes import group_key
 from policies.return_statistics import ReturnStatistics
 
 Weights = dict[str, NDArray[Any]]
@@ -156,14 +157,6 @@ MAX_GROUP = 8
 """The networks of this many members, with their activations, fit a core's cache; larger groups are no faster."""
 
 
-def size_class(num_units: int) -> int:
-    """Return the size that a hidden layer is padded to: 8, 12, 16, 24, 32, 48, ...; at most a third is padding."""
-    size = 8
-    while size < num_units:
-        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
-    return size
-
-
 def group_members(
     members: Sequence[Member[H]], max_size: int = MAX_GROUP, also: Callable[[Member[H]], Any] = lambda _: 0
 ) -> list[list[Member[H]]]:
@@ -175,9 +168,8 @@ def group_members(
         also: Returns a sortable value that the members of a group must share as well.
     """
 
-    def key(member: Member[H]) -> tuple[str, tuple[int, ...], Any]:
-        sizes = tuple(map(size_class, member.hyperparams.hidden_sizes))
-        return member.hyperparams.activation, sizes, also(member)
+    def key(member: Member[H]) -> tuple[Any, Any]:
+        return group_key(member.hyperparams), also(member)
 
     groups = []
     for _, alike in itertools.groupby(sorted(members, key=key), key=key):

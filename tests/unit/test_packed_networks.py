@@ -14,10 +14,11 @@ from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import PPOHyperparams
-from policies.packed.member import MAX_GROUP, group_members, network_layouts, size_class
+from policies.packed.member import MAX_GROUP, group_members, network_layouts
 from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm
 from policies.packed.rows import StackedRows
+from policies.packed.sizes import is_padded_beside, size_class
 from tests.narrowing import present
 from tests.rounding import assert_rounded, close
 
@@ -330,6 +331,28 @@ def test_groups_are_of_one_activation_and_like_sizes() -> None:
 def _members_by_key(members: Sequence[Member[PPOHyperparams]]) -> list[int]:
     keys = [(m.hyperparams.activation, size_class(m.hyperparams.hidden_sizes[0])) for m in members]
     return [keys.count(key) for key in set(keys)]
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "expected"),
+    [
+        ({"hidden_sizes": (21, 18)}, {"hidden_sizes": (24, 18)}, True),
+        ({"hidden_sizes": (24, 18)}, {"hidden_sizes": (21, 18)}, False),
+        ({"hidden_sizes": (21, 24)}, {"hidden_sizes": (24, 21)}, True),
+        ({"hidden_sizes": (32,)}, {"hidden_sizes": (64,)}, False),
+        ({"hidden_sizes": (21,)}, {"hidden_sizes": (24,), "activation": "relu"}, False),
+        ({"hidden_sizes": (21,)}, {"hidden_sizes": (21, 24)}, False),
+        ({"hidden_sizes": (21,)}, {"hidden_sizes": (21,), "lr": 1e-2}, False),
+    ],
+)
+def test_a_member_is_padded_beside_a_wider_one_of_its_group(
+    ours: dict[str, Any], theirs: dict[str, Any], expected: bool
+) -> None:
+    one, two = random_member("a", **ours), random_member("b", **theirs)
+    assert is_padded_beside(one.hyperparams, two.hyperparams) is expected
+    (group,) = (found for found in group_members([one, two]) if one in found)
+    sizes = StackedRows(group, 4, 3, "cpu").networks.sizes[1:-1]
+    assert (sizes != one.hyperparams.hidden_sizes) is expected
 
 
 def test_networks_of_other_depth_are_not_grouped() -> None:

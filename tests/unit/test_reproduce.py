@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -212,11 +213,54 @@ def test_a_trial_that_failed_is_repeated_into_the_iteration_in_which_it_did(stor
     assert any("the repetition did not" in note for note in found.notes)
 
 
-def test_the_others_of_its_process_are_told(store: SweepStore, again: Again) -> None:
-    for trial_id in ("t0000", "t0001", "t0003"):
-        update(store, trial_id, engine="packed", node="a", pid=7)
-    notes = tune_jobs.reproduce("mine/t0001", storage=store.folder.parent).notes
-    assert any("in a process with 2 other trials, and repeated alone" in note for note in notes)
+def packed_sweep(folder: Path, space: dict[str, list[Any]], **spec: Any) -> SweepStore:
+    """A sweep of a grid whose trials packs trained."""
+    grid = {name: {"grid": values} for name, values in space.items()}
+    store = make_sweep_folder(folder, **{"space": grid, "num_samples": 1, "seeds_per_point": 1, **spec})
+    for trial in store.read_trials():
+        update(store, trial.trial_id, engine="packed", node="a", pid=7, ran_with=HERE)
+    return store
+
+
+def notes_of(store: SweepStore, trial_id: str) -> tuple[str, ...]:
+    return tune_jobs.reproduce(store.folder / "trials" / trial_id).notes
+
+
+def test_wider_layers_of_its_pack_are_told_as_its_own_may_have_been_padded(tmp_path: Path, again: Again) -> None:
+    store = packed_sweep(tmp_path / "mine", {"hidden_sizes": [[17], [24], [20], [64], [24, 24]]})
+    (told,) = notes_of(store, "t0000")
+    assert "padded to the wider ones of t0001, t0002: then the last bits of its sums depend on those" in told
+    (told,) = notes_of(store, "t0002")
+    assert "the wider ones of t0001: then" in told
+    for trial_id in ("t0001", "t0003", "t0004"):
+        assert notes_of(store, trial_id) == ()
+    # One that another engine trained was in no stack.
+    update(store, "t0001", engine="rllib")
+    assert notes_of(store, "t0002") == ()
+    many = packed_sweep(tmp_path / "many", {"hidden_sizes": [[17], [18], [19], [20], [21], [22]]})
+    (told,) = notes_of(many, "t0000")
+    assert "the wider ones of t0001, t0002, t0003 and 2 others: then" in told
+
+
+def test_of_one_size_or_in_stacks_of_their_own_trials_depend_on_no_others(tmp_path: Path, again: Again) -> None:
+    same = packed_sweep(tmp_path / "same", {"hidden_sizes": [[21]], "lr": [1e-3, 1e-2]}, seeds_per_point=2)
+    assert [notes_of(same, trial.trial_id) for trial in same.read_trials()] == [()] * 4
+    space: dict[str, list[Any]] = {"hidden_sizes": [[21], [24]], "num_epochs": [3, 4]}
+    apart = packed_sweep(tmp_path / "apart", space)
+    epochs = {trial.trial_id: trial.hyperparams["num_epochs"] for trial in apart.read_trials()}
+    for trial in apart.read_trials():
+        told = re.findall("t000[0-9]", "".join(notes_of(apart, trial.trial_id)))
+        assert len(told) == (trial.hyperparams["hidden_sizes"] == [21])
+        assert all(epochs[name] == epochs[trial.trial_id] for name in told)
+
+
+def test_on_a_gpu_the_number_of_trials_may_matter(tmp_path: Path, again: Again) -> None:
+    store = packed_sweep(tmp_path / "mine", {"hidden_sizes": [[64]], "lr": [1e-3, 1e-2]})
+    record = store.read_record()
+    spec = {**record.spec, "resources": {**record.spec["resources"], "num_gpus": 1}}
+    store.write_record(record.model_copy(update={"spec": spec}))
+    (told,) = notes_of(store, "t0000")
+    assert "on a GPU the last bits of its sums may depend on how many" in told
 
 
 def test_a_kept_repetition_is_a_sweep_of_its_own(store: SweepStore, again: Again, tmp_path: Path) -> None:

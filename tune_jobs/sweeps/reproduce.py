@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from analysis.comparison.repetition import Changed, Repetition, causes, first_difference
 from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialPlan, TrialRecord
@@ -19,7 +19,9 @@ from policies.envs.modules import allow_modules
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env, measure_step
-from tune_jobs.plan.engine_choice import PackPlan
+from policies.hyperparams import TrainedHyperparams, make_hyperparams
+from policies.packed.sizes import is_padded_beside
+from tune_jobs.plan.engine_choice import PackPlan, pack_key
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.process.ran_with import versions
@@ -40,6 +42,7 @@ from tune_jobs.sweeps.storage import expanded
 
 _LONG_S = 1e9
 _WEIGHTS = "policy.safetensors"
+_MAX_NAMED = 3
 
 
 @checked
@@ -244,17 +247,8 @@ def _notes(store: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out
         notes.append(f"The trial is {trial.status}: it was repeated as far as it was recorded.")
     if trial.status == "failed" or repeated.status == "failed":
         notes.append(_failures(trial, repeated))
-    others = [
-        other
-        for other in store.read_trials()
-        if other.engine == trial.engine == "packed" and (other.node, other.pid) == (trial.node, trial.pid)
-        and other.trial_id != trial.trial_id and trial.pid is not None
-    ]  # fmt: skip
-    if others:
-        notes.append(
-            f"It was trained in a process with {counted(len(others), 'other trial')}, and repeated alone: the "
-            "last bits of its sums may depend on the others of its pack, its random numbers do not."
-        )
+    if trial.engine == "packed" and (depends := _depends_on_pack(store, trial)):
+        notes.append(depends)
     if not is_known:
         here = ", ".join(f"{name} {value}" for name, value in repeated.ran_with.items() if name not in versions())
         notes.append(
@@ -262,6 +256,33 @@ def _notes(store: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out
             f"are: {here}."
         )
     return notes
+
+
+def _depends_on_pack(store: Sweep, trial: TrialRecord) -> str:
+    """Say why a trial's sums may have been rounded otherwise in its pack (decision 10); empty: they were not."""
+    spec = stored_spec(store.read_record())
+    # Of all packed trials: records have the process that each ran in last, which after a resume is another one.
+    packed = {
+        item.trial_id: cast("TrainedHyperparams", make_hyperparams(spec.algorithm, dict(item.hyperparams)))
+        for item in store.read_trials()
+        if item.engine == "packed" and item.has_point
+    }
+    ours = packed.pop(trial.trial_id)
+    beside = {name: theirs for name, theirs in packed.items() if pack_key(theirs) == pack_key(ours)}
+    wider = [name for name, theirs in beside.items() if is_padded_beside(ours, theirs)]
+    if wider:
+        more = f" and {counted(len(wider) - _MAX_NAMED, 'other')}" if len(wider) > _MAX_NAMED else ""
+        return (
+            "It was repeated alone. In its pack its layers may have been padded to the wider ones of "
+            f"{', '.join(wider[:_MAX_NAMED])}{more}: then the last bits of its sums depend on those, its random "
+            "numbers do not."
+        )
+    if beside and spec.resources.num_gpus:
+        return (
+            "It was repeated alone: on a GPU the last bits of its sums may depend on how many trials of its pack are "
+            "computed together, its random numbers do not."
+        )
+    return ""
 
 
 def _failures(trial: TrialRecord, repeated: TrialRecord) -> str:
