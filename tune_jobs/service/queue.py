@@ -143,8 +143,9 @@ class Queue:
             may_run: Says of a sweep's name whether it may run now, such as that nobody else drives it; None: all may.
         """
         with self._engine.begin() as connection:
-            # Whoever claims at the same time waits here, and sees what this one took (SQLite has one writer anyway).
-            query = select(jobs).where(jobs.c.state.in_(("waiting", "running"))).with_for_update()
+            # Whoever claims at the same time waits here, and sees what this one took (SQLite has one writer). All
+            # lock in one order, so that no two wait for each other.
+            query = select(jobs).where(jobs.c.state.in_(("waiting", "running"))).order_by(jobs.c.id).with_for_update()
             open_jobs = _jobs(connection, query)
             running = [job for job in open_jobs if job.state == "running"]
             busy = {job.sweep for job in running}
@@ -182,7 +183,9 @@ class Queue:
     def request_stop(self, sweep: str) -> list[Job]:
         """Cancel the waiting jobs of a sweep, and ask for the end of the running one; return those that changed."""
         with self._engine.begin() as connection:
-            query = select(jobs).where(jobs.c.sweep == sweep, jobs.c.state.in_(("waiting", "running")))
+            query = (
+                select(jobs).where(jobs.c.sweep == sweep, jobs.c.state.in_(("waiting", "running"))).order_by(jobs.c.id)
+            )
             found = _jobs(connection, query.with_for_update())
             for job in found:
                 cancelled = {"state": "ended", "outcome": "cancelled", "ended_at": self._now()}
