@@ -22,7 +22,6 @@ from policies.envs.modules import allow_modules
 from policies.errors import TuneJobsError
 from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
-from tune_jobs.sweeps.interrupted import SweepInterrupted
 
 READY = b"ready"
 _MAX_BYTES = 1 << 20
@@ -37,11 +36,14 @@ def main(descriptor: int) -> None:
     end_in_order()
     with socket.socket(fileno=descriptor) as asked:
         asked.set_inheritable(False)
-        warm_up()
-        # A service that was in a hurry has sent the job, and closed its end.
-        with contextlib.suppress(OSError):
-            asked.sendall(READY)
-        message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
+        try:
+            warm_up()
+            # A service that was in a hurry has sent the job, and closed its end.
+            with contextlib.suppress(OSError):
+                asked.sendall(READY)
+            message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
+        except (KeyboardInterrupt, ConnectionError):
+            return
     if not message:
         return
     lock, log = descriptors
@@ -74,7 +76,7 @@ def _ended(request: Mapping[str, Any]) -> Ended:
         allow_modules(request["modules"])
         os.chdir(request["working_folder"])
         result = _done(request)
-    except SweepInterrupted:
+    except KeyboardInterrupt:  # SweepInterrupted is one, too
         return Ended(attempt=attempt, outcome="interrupted")
     except TuneJobsError as error:
         return Ended(attempt=attempt, outcome="failed", message=str(error))

@@ -22,7 +22,7 @@ import sys
 sys.path.insert(0, {root!r})
 import tune_jobs
 del sys.path[0]
-from tune_jobs.service.driver import main
+from {module} import main
 main({descriptor})
 """
 
@@ -30,13 +30,16 @@ main({descriptor})
 class Driver:
     """A driver process that has no job yet.
 
+    Args:
+        module: The module whose `main` it calls with the descriptor of its end of the socket.
+
     Raises:
         CannotRunError: No process can be started.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, module: str = "tune_jobs.service.driver") -> None:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        code = _BEGIN.format(root=_ROOT, descriptor=theirs.fileno())
+        code = _BEGIN.format(root=_ROOT, module=module, descriptor=theirs.fileno())
         try:
             self._process = subprocess.Popen(  # noqa: S603 (this very Python)
                 [sys.executable, "-P", "-c", code],

@@ -52,6 +52,7 @@ class Supervisor:
         where: Where they run.
         keep_spare: Whether a driver process is kept warm.
         on_end: Called with each job that has ended.
+        make_driver: Starts a driver process.
     """
 
     def __init__(
@@ -62,9 +63,10 @@ class Supervisor:
         *,
         keep_spare: bool = True,
         on_end: Callable[[Job], None] = lambda _: None,
+        make_driver: Callable[[], Driver] = Driver,
     ) -> None:
         self._queue, self._storage, self._where = queue, storage, where
-        self._keep_spare, self._on_end = keep_spare, on_end
+        self._keep_spare, self._on_end, self._make_driver = keep_spare, on_end, make_driver
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
         self._retry_at: dict[int, float] = {}
@@ -258,7 +260,7 @@ class Supervisor:
         spare, self._spare = self._spare, None
         if spare is not None and spare.is_usable():
             return spare
-        return Driver()
+        return self._make_driver()
 
     def _mind_spare(self) -> None:
         if not self._keep_spare or self._draining.is_set():
@@ -268,7 +270,7 @@ class Supervisor:
         # While sweeps run, the next one waits for them; importing would only take their time.
         if self._spare is None and not self._queue.jobs("running"):
             with contextlib.suppress(TuneJobsError):
-                self._spare = Driver()
+                self._spare = self._make_driver()
 
     def _files(self, job: Job) -> JobFiles:
         return JobFiles(self._where.service_folder, job.uid)
