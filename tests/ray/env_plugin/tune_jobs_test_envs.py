@@ -121,6 +121,38 @@ class Trouble(gym.Env[NDArray[np.float32], np.int64]):
         raise TimeoutError("nothing ended the process")
 
 
+class Laps(gym.Env[NDArray[np.float32], np.int64]):
+    """Eight steps an episode, all episodes alike whatever their seeds; the reward is larger in later steps.
+
+    Args:
+        pause_s: Seconds that every step takes.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, *, pause_s: float = 0.0) -> None:
+        self.observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = gym.spaces.Discrete(2)
+        self.pause_s, self.ticks = pause_s, 0
+
+    def _observation(self) -> NDArray[np.float32]:
+        return np.array([np.cos(self.ticks), np.sin(self.ticks)], np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        super().reset(seed=seed)
+        self.ticks = 0
+        return self._observation(), {}
+
+    def step(self, action: np.int64) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        if self.pause_s:
+            time.sleep(self.pause_s)
+        reward = float(self.ticks**2) if action == self.ticks % 2 else -1.0
+        self.ticks += 1
+        return self._observation(), reward, self.ticks >= 8, False, {}
+
+
 class Shades(gym.Env[NDArray[Any], Any]):
     """Images of noise, higher than they are wide; the right action tells in which half the noise is brighter.
 
@@ -213,6 +245,7 @@ def register() -> None:
     for env_id, entry_point, limit in (
         ("TestTicks-v0", Ticks, 7),
         ("TestTrouble-v0", Trouble, None),
+        ("TestLaps-v0", Laps, None),
         ("TestShades-v0", Shades, None),
         ("TestPrecise-v0", Precise, None),
     ):
