@@ -2,7 +2,8 @@
 # make test    install the test tools too, then lint, types and every test that can run here
 # make unit    the tests of tests/unit, which start next to nothing and take under a minute: while one works
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
-# make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table
+# make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table;
+#              then service, drivers and database a hundred times
 # make bench   the benchmarks, beside their peers, in one table
 # make bench-choice   what each way to choose a setting loses, from trainings that were done before (docs/choice.md)
 # make docs    the site of all documentation, into site/: open site/index.html
@@ -77,6 +78,7 @@ learn: $(VENV)/installed-test
 
 kills: $(VENV)/installed-test
 	$(BIN)/python -m tests.kills
+	TUNE_JOBS_NUM_KILLS=50 $(BIN)/python -m pytest --quiet tests/integration/test_service_kills.py
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m tests.benchmarks
