@@ -9,6 +9,7 @@ from typing import Any
 
 import click.testing
 import pytest
+from fake_results import COMPARISON, EQUAL, IMPORTANCE
 
 from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, SweepRecord, TrialRecord
 from tune_jobs.cli.commands import cli
@@ -136,6 +137,7 @@ def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSweeps:
         "launch": result,
         "resume": result,
         "extend": result,
+        "replicate": result,
         "stop": True,
         "status": status,
         "list_sweeps": [status],
@@ -144,6 +146,10 @@ def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSweeps:
         "evaluate": (evaluation("x", 195.0), evaluation("random", 20.0)),
         "video": {"mp4": Path("a.mp4")},
         "report": Path("index.html"),
+        "compare": COMPARISON,
+        "export": {"trials": Path("mine-csv/trials.csv"), "settings": Path("mine-csv/settings.csv")},
+        "importance": IMPORTANCE,
+        "reproduce": EQUAL,
     }
 
     def make(name: str) -> Callable[..., Any]:

@@ -76,7 +76,8 @@ class CommandGroup(click.Group):
 def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
     from tune_jobs.sweeps.interrupted import SweepInterrupted
 
-    if isinstance(interruption, SweepInterrupted):
+    # Of a repetition nothing is kept that could be resumed.
+    if isinstance(interruption, SweepInterrupted) or command == "reproduce":
         return _UNCHANGED[command]
     return "What is done is kept; `tune-jobs resume SWEEP` continues it." if command in _UNCHANGED else ""
 
