@@ -1,8 +1,11 @@
 """Which trials collapsed: ended far below what they had learnt.
 
-A trial's evaluations are compared with where it began: its first evaluation or its first training return, whichever is
-lower. The first evaluation may come when much is learnt already, and early training returns are those of a policy that
-explores. What counts is the share of that gain which is lost, so that the sign and size of returns do not matter.
+What a trial has learnt is how far its best evaluation is above where it began: above its first evaluation or its first
+training return, whichever is lower. The first evaluation may come when much is learnt already, and early training
+returns are those of a policy that explores. It collapsed if by its last evaluation more than half of that gain is lost,
+so that the sign and size of returns do not matter. Evaluations of trials that hardly learn go up and down by chance,
+and lose half of a small gain easily: a trial that gained less than a fifth of what the one that learnt most did is not
+said to have collapsed.
 """
 
 from __future__ import annotations
@@ -16,9 +19,12 @@ from analysis.wording import counted, return_text
 
 SHARE = 0.5
 """A trial collapsed if its last evaluation lost more than this share of what its best one had gained."""
+LEAST_GAIN = 0.2
+"""What a trial must have gained to lose, as a share of the largest gain of its sweep."""
 COLLAPSE_MEANS = (
     "A trial collapsed if, by its last evaluation, it had lost more than half of what its best one had gained over "
-    "where it began: over its first evaluation or its first training return, whichever is lower."
+    "where it began: over its first evaluation or its first training return, whichever is lower. Those that gained "
+    "less than a fifth of what the best trial did don't count."
 )
 _MAX_NAMED = 3
 
@@ -34,26 +40,50 @@ class Collapse:
     """Its last."""
 
 
-def trial_collapsed(trial: TrialRecord, iterations: Sequence[IterationRecord]) -> bool | None:
-    """Return whether a trial collapsed; None: it has not ended, or has fewer than two evaluations.
+@dataclass(frozen=True)
+class _Curve:
+    """A trial's evaluations and where it began, in quarters: those are exact, and all their differences finite."""
+
+    evaluations: list[float]
+    began: float
+
+    @property
+    def gain(self) -> float:
+        return max(self.evaluations) - self.began
+
+
+def collapsed_trials(
+    trials: Sequence[TrialRecord], results: Mapping[str, Sequence[IterationRecord]]
+) -> dict[str, bool | None]:
+    """Return whether each trial of a sweep collapsed, by its id; None: it has not ended, or has no two evaluations.
 
     A trial that was never evaluated above where it began had nothing to lose, and has not collapsed; nor has a
     baseline, which learns nothing. A trial of a population is judged by its own evaluations, whatever weights it
     copied.
 
     Args:
-        trial: The trial.
-        iterations: Its iterations, oldest first.
+        trials: The trials of one sweep.
+        results: Iterations by trial id, oldest first; a trial may have none.
     """
+    curves = {trial.trial_id: _curve_of(results.get(trial.trial_id, ())) for trial in trials}
+    most = max((curve.gain for curve in curves.values() if curve is not None), default=0.0)
+    return {trial.trial_id: _collapsed(trial, curves[trial.trial_id], most) for trial in trials}
+
+
+def _curve_of(iterations: Sequence[IterationRecord]) -> _Curve | None:
     evaluations = _evaluations(iterations)
-    if trial.status not in FINISHED or len(evaluations) < 2:
+    if len(evaluations) < 2:
         return None
-    if trial.engine == "baseline":
+    trained = next((item.training_return for item in iterations if item.training_return is not None), evaluations[0])
+    return _Curve([value / 4.0 for value in evaluations], min(trained, evaluations[0]) / 4.0)
+
+
+def _collapsed(trial: TrialRecord, curve: _Curve | None, most: float) -> bool | None:
+    if trial.status not in FINISHED or curve is None:
+        return None
+    if trial.engine == "baseline" or curve.gain < LEAST_GAIN * most:
         return False
-    began = next((item.training_return for item in iterations if item.training_return is not None), evaluations[0])
-    # A quarter of each number is exact, and the difference of any two quarters is finite.
-    quarters = [value / 4.0 for value in evaluations]
-    return bool(has_collapsed(quarters, share=SHARE, baseline=min(began / 4.0, quarters[0])))
+    return bool(has_collapsed(curve.evaluations, share=SHARE, baseline=curve.began))
 
 
 def collapses(
@@ -63,17 +93,12 @@ def collapses(
 
     Args:
         trial_ids: The trials that are asked about; those that are not among `trials` are left out.
-        trials: The trials of one sweep.
+        trials: All trials of the sweep.
         results: Iterations by trial id, oldest first.
     """
-    by_id = {trial.trial_id: trial for trial in trials}
-    found = []
-    for trial_id in trial_ids:
-        iterations = results.get(trial_id, ())
-        if trial_id in by_id and trial_collapsed(by_id[trial_id], iterations):
-            evaluations = _evaluations(iterations)
-            found.append(Collapse(trial_id, max(evaluations), evaluations[-1]))
-    return found
+    known = collapsed_trials(trials, results)
+    evaluations = {trial_id: _evaluations(results[trial_id]) for trial_id in trial_ids if known.get(trial_id)}
+    return [Collapse(trial_id, max(values), values[-1]) for trial_id, values in evaluations.items()]
 
 
 def collapses_text(found: Sequence[Collapse], num_trainings: int) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.collapse import trial_collapsed
+from analysis.collapse import collapsed_trials
 from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
 from analysis.statistics import median_steps
@@ -117,7 +117,7 @@ def trials_frame(
     Columns: trial_id, status, one for each searched hyperparameter, seed, point_index, seed_index (trials of one
     point differ in their seeds alone), score (which the selection compares; missing if the trial cannot win),
     score_num_env_steps (when it was reached), training_return, evaluation_return (the newest), collapsed (see
-    `collapse.trial_collapsed`; missing without results), num_env_steps_to_solve (see `env_steps_to`; all missing
+    `collapse.collapsed_trials`; missing without results), num_env_steps_to_solve (see `env_steps_to`; all missing
     without results and a threshold), num_env_steps_to_threshold (see `env_steps_to_evaluation`; filled also where
     trials end before their training return reaches it, as with `stop.evaluation_return`), num_iterations,
     num_env_steps, num_episodes, time_s, stop_reason, num_failures, error (its first line). In a population, the
@@ -128,7 +128,7 @@ def trials_frame(
     def rows_of(trial: TrialRecord) -> Sequence[IterationRecord]:
         return (results or {}).get(trial.trial_id, ())
 
-    names = point_names(trials)
+    names, collapsed = point_names(trials), collapsed_trials(trials, results or {})
     rows = []
     for trial in sorted(trials, key=lambda item: item.index):
         best = score_trial(trial)
@@ -145,7 +145,7 @@ def trials_frame(
                 "score_num_env_steps": best.checkpoint.num_env_steps if best is not None else None,
                 "training_return": trial.training_return,
                 "evaluation_return": trial.evaluation_return,
-                "collapsed": trial_collapsed(trial, rows_of(trial)),
+                "collapsed": collapsed[trial.trial_id],
                 "num_env_steps_to_solve": env_steps_to(threshold, rows_of(trial)),
                 "num_env_steps_to_threshold": env_steps_to_evaluation(threshold, rows_of(trial)),
                 "num_iterations": trial.num_iterations,

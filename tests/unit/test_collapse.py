@@ -10,7 +10,7 @@ import pytest
 from report_sources import setting, settings_of, source_of
 from synthetic_sweep import Synthetic, make_sweep
 
-from analysis.collapse import Collapse, collapses, collapses_text, trial_collapsed
+from analysis.collapse import Collapse, collapsed_trials, collapses, collapses_text
 from analysis.page import all_trials, cards
 from analysis.records import ChangeRecord, IterationRecord, TrialRecord
 from analysis.tables import trials_frame, write_csv
@@ -32,6 +32,11 @@ def curve(evaluations: Sequence[float | None], *, training: Sequence[float | Non
 def trial(index: int = 0, **given: Any) -> TrialRecord:
     values: dict[str, Any] = {"status": "completed", "point": {"lr": 0.1}, **given}
     return TrialRecord(trial_id=f"t{index:04d}", index=index, point_index=index, seed=index, **values)
+
+
+def trial_collapsed(one: TrialRecord, iterations: Sequence[IterationRecord]) -> bool | None:
+    """Of a trial by itself, which is the one that learnt most."""
+    return collapsed_trials([one], {one.trial_id: iterations})[one.trial_id]
 
 
 COLLAPSED = [20.0, 500.0, 21.0]
@@ -76,6 +81,17 @@ def test_it_is_not_known_before_the_end_or_of_fewer_than_two_evaluations() -> No
         assert trial_collapsed(trial(status=status), curve(COLLAPSED)) is None
     for status in ("stopped", "failed"):
         assert trial_collapsed(trial(status=status), curve(COLLAPSED)) is True
+
+
+def test_a_trial_that_hardly_learnt_has_little_to_lose() -> None:
+    curves = {"t0000": HELD, "t0001": [20.0, 110.0, 20.0], "t0002": [20.0, 116.0, 20.0], "t0003": [20.0, 23.0, 19.0]}
+    results = {trial_id: curve(values) for trial_id, values in curves.items()}
+    trials = [trial(index) for index in range(4)]
+    found = collapsed_trials(trials, results)
+    # A fifth of what t0000 gained, 480, is 96.
+    assert found == {"t0000": False, "t0001": False, "t0002": True, "t0003": False}
+    # Where none of them learnt more, that was the most there was to learn.
+    assert collapsed_trials(trials[3:], results) == {"t0003": True}
 
 
 def test_a_baseline_learns_nothing_that_it_could_lose() -> None:
