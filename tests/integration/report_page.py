@@ -2,6 +2,11 @@
 
 from collections.abc import Sequence
 from html.parser import HTMLParser
+from pathlib import Path
+
+from synthetic_sweep import Synthetic
+
+from analysis.report import build_report
 
 
 class Page(HTMLParser):
@@ -40,3 +45,18 @@ class Page(HTMLParser):
             self.text.append(data)
             if self.rows and ("td" in self.open or "th" in self.open):
                 self.rows[-1][-1] += data.strip()
+
+
+def report(tmp_path: Path, synthetic: Synthetic, videos: dict[str, Path] | None = None) -> tuple[Path, str, Page]:
+    """Write the report of a sweep; its path, its HTML and what is on the page."""
+    path = build_report(
+        tmp_path,
+        target=tmp_path / "report",
+        sweep=synthetic.sweep,
+        trials=synthetic.trials,
+        results=synthetic.results,
+        best=synthetic.best,
+        videos=videos or {},
+    )
+    html = path.read_text(encoding="utf-8")
+    return path, html, Page(html)

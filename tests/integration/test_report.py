@@ -1,8 +1,7 @@
-"""The report: complete, self-contained, safe, and right on poor sweeps."""
+"""The report of a sweep that went well: complete, self-contained, and what each part of it says."""
 
 import base64
 import hashlib
-import math
 import re
 from pathlib import Path
 
@@ -14,26 +13,11 @@ from synthetic_sweep import Synthetic, make_points, make_sweep, with_choice
 
 from analysis.answers import certainty
 from analysis.choice_words import candidate_rows
-from analysis.page.cards import winner_card
-from analysis.records import CheckpointRecord
-from analysis.report import build_report
-from analysis.report_data import goal_of
 from analysis.wording import (
     NONE,
-    difference_text,
-    duration,
-    moment,
-    number,
-    return_text,
-    seed_range,
-    setting_text,
-    shown_path,
 )
-from policies.hyperparams import Algorithm
-from tests.integration.report_page import Page
+from tests.integration.report_page import Page, report
 from tests.narrowing import present
-
-HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>{{ 7*7 }}"
 
 CHARTS = (
     "hyperparameters", "heat_map", "parallel_coordinates", "curves_of_settings", "performance_profile", "best_so_far",
@@ -42,20 +26,6 @@ CHARTS = (
 
 Made = tuple[Synthetic, Path, str, Page]
 """A sweep, the path of its report, its HTML and what is on the page."""
-
-
-def report(tmp_path: Path, synthetic: Synthetic, videos: dict[str, Path] | None = None) -> tuple[Path, str, Page]:
-    path = build_report(
-        tmp_path,
-        target=tmp_path / "report",
-        sweep=synthetic.sweep,
-        trials=synthetic.trials,
-        results=synthetic.results,
-        best=synthetic.best,
-        videos=videos or {},
-    )
-    html = path.read_text(encoding="utf-8")
-    return path, html, Page(html)
 
 
 @pytest.fixture(scope="module")
@@ -192,40 +162,6 @@ def test_what_the_sweep_file_says_of_the_sweep_stands_at_the_head(tmp_path: Path
     assert "sweep file:" not in typical[-1].words
 
 
-def test_a_sweep_without_a_winner_says_why(tmp_path: Path) -> None:
-    synthetic = make_sweep(failed=range(20))
-    assert synthetic.best is None
-    _, _, page = report(tmp_path, synthetic)
-    assert "No winner No trial of 20 is usable: 20 failed. First error (t0000): RuntimeError" in page.words
-    assert "Policy to deploy" not in page.words
-
-
-def test_an_unconfirmed_sweep_names_the_leader_and_the_command(tmp_path: Path) -> None:
-    synthetic = make_sweep(pending=range(6, 20), with_best=False)
-    synthetic.sweep = synthetic.sweep.model_copy(update={"state": "interrupted"})
-    _, _, page = report(tmp_path, synthetic)
-    assert "not confirmed on fresh seeds yet" in page.words
-    assert f"tune-jobs best {tmp_path}" in page.words
-    assert f"tune-jobs resume {tmp_path}" in page.words
-
-
-@pytest.mark.parametrize("kind", ["one trial", "no trials", "nothing ran", "dqn", "no threshold"])
-def test_any_sweep_gives_a_page(tmp_path: Path, kind: str) -> None:
-    synthetic = {
-        "one trial": lambda: make_sweep(points=[{}]),
-        "no trials": lambda: make_sweep(points=[]),
-        "nothing ran": lambda: make_sweep(pending=range(20)),
-        "dqn": lambda: make_sweep(points=[{"double_q": i, "lr": 1e-3} for i in (True, False)], algorithm="dqn"),
-        "no threshold": lambda: make_sweep(env_id="Own-v0", threshold=None),
-    }[kind]()
-    _, html, page = report(tmp_path, synthetic)
-    assert ("No winner" in page.words) == (synthetic.best is None)
-    assert "nan" not in page.words.lower().split()
-    assert "None" not in page.words
-    if kind == "no threshold":
-        assert '<span class="badge">no threshold</span>' in html
-
-
 def test_the_leading_settings_are_shown_with_seeds_intervals_and_ties(tmp_path: Path) -> None:
     synthetic = make_sweep(points=make_points(1, np.random.default_rng(0)), seeds_per_point=3, failed={4})
     settings = present(present(synthetic.best).settings)
@@ -276,66 +212,6 @@ def test_steps_to_solve_are_told_seed_by_seed(tmp_path: Path) -> None:
     assert "(the median of 3 seeds)" in page.words
 
 
-@pytest.mark.parametrize(
-    ("points", "threshold", "sentence"),
-    [
-        ([{"lr": 1e-7}], 195.0, "No trial reached a mean training return of 195 over 100 episodes."),
-        ([{"lr": 3e-3}], None, None),
-        ([{}], 195.0, "The sweep's one point reaches"),
-    ],
-)
-def test_the_sentence_suits_the_sweep(
-    tmp_path: Path, points: list[dict[str, float]], threshold: float | None, sentence: str | None
-) -> None:
-    env_id = "CartPole-v0" if threshold else "Own-v0"
-    synthetic = make_sweep(points=points, threshold=threshold, env_id=env_id)
-    if threshold is None:
-        synthetic.sweep = synthetic.sweep.model_copy(update={"spec": synthetic.sweep.spec | {"stop": {}}})
-    _, _, page = report(tmp_path, synthetic)
-    assert ("Env steps to solve" in page.words) == (sentence is not None)
-    assert sentence is None or sentence in page.words
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "heading"), [("random", "Random play on"), ("constant", "A constant action on"), ("dqn", "DQN on")]
-)
-def test_a_baseline_has_no_before_and_after(tmp_path: Path, algorithm: Algorithm, heading: str) -> None:
-    synthetic = make_sweep(points=[{}], algorithm=algorithm)
-    (tmp_path / "v.mp4").write_bytes(b"v")
-    _, _, page = report(tmp_path, synthetic, {"before": tmp_path / "v.mp4", "after": tmp_path / "v.mp4"})
-    assert f"{heading} CartPole-v0" in page.words
-    assert ("After training" in page.words) == (algorithm == "dqn")
-
-
-def test_hostile_text_is_never_html(tmp_path: Path) -> None:
-    synthetic = make_sweep(
-        points=[{"activation": HOSTILE, "lr": 1e-3}, {"activation": "$relu$", "lr": 2e-3}],
-        failed={1},
-        env_id=HOSTILE,
-        name=HOSTILE,
-        error=HOSTILE,
-    )
-    synthetic.sweep = synthetic.sweep.model_copy(
-        update={"versions": {HOSTILE: HOSTILE}, "address": HOSTILE, "git_commit": HOSTILE}
-    )
-    (tmp_path / "v.mp4").write_bytes(b"v")
-    _, html, page = report(tmp_path, synthetic, {HOSTILE: tmp_path / "v.mp4"})
-    assert [tag for tag, _ in page.tags].count("script") == 4
-    assert not any(tag == "img" for tag, _ in page.tags)
-    assert not any(name.startswith("on") for _, attrs in page.tags for name in attrs)
-    assert "<script>alert" not in html
-    assert "{{ 7*7 }}" in page.words
-
-
-def test_a_winner_the_selection_has_moved_from_is_called_out(tmp_path: Path) -> None:
-    synthetic = make_sweep(points=[{"lr": 1e-3}, {"lr": 3e-3}])
-    assert not winner_card(present(synthetic.best), synthetic.trials, synthetic.sweep, tmp_path)["stale"]
-    old = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1)
-    synthetic.best = present(synthetic.best).model_copy(update={"checkpoint": old})
-    _, _, page = report(tmp_path, synthetic)
-    assert "There are other candidates by now" in page.words
-
-
 def test_the_policys_card_shows_what_it_was_chosen_from(tmp_path: Path) -> None:
     synthetic = make_sweep()
     best = with_choice(present(synthetic.best), synthetic.trials)
@@ -348,63 +224,3 @@ def test_the_policys_card_shows_what_it_was_chosen_from(tmp_path: Path) -> None:
         assert " ".join(row.cells) in page.words
     assert "There are other candidates by now" not in page.words
     assert "Round 2 could not be played: the motor broke" in page.words
-
-
-def test_returns_that_are_not_finite_cost_only_their_interval(tmp_path: Path) -> None:
-    synthetic = make_sweep()
-    broken = present(synthetic.best).confirmation.model_copy(update={"returns": (float("nan"),) * 100})
-    best = present(synthetic.best).model_copy(update={"confirmation": broken})
-    card = winner_card(best, synthetic.trials, synthetic.sweep, tmp_path)
-    assert card["interval"] is None
-    assert card["gain"] is None
-
-
-def test_episodes_that_are_not_finite_are_left_out_of_the_figure(tmp_path: Path) -> None:
-    synthetic = make_sweep(points=[{"lr": 3e-3}])
-    row = synthetic.results["t0000"][0]
-    synthetic.results["t0000"][0] = row.model_copy(update={"episode_returns": (float("nan"), float("inf"), 9.0)})
-    path, _, _ = report(tmp_path, synthetic)
-    assert (path.parent / "figures" / "score_per_episode.png").is_file()
-
-
-@pytest.mark.parametrize(
-    ("env_id", "threshold", "stop", "goal"),
-    [
-        ("CartPole-v1", 123.0, {}, 123.0),
-        ("CartPole-v1", 0.0, {}, 0.0),
-        ("CartPole-v1", None, {"training_return": 7.0}, 475.0),
-        ("Own-v0", None, {"training_return": 0.0, "evaluation_return": None}, 0.0),
-        ("evil_module:Own-v0", None, {}, None),
-    ],
-)
-def test_the_goal_is_the_threshold_of_the_env_or_the_stop_rule(
-    env_id: str, threshold: float | None, stop: dict[str, float | None], goal: float | None
-) -> None:
-    synthetic = make_sweep(points=[{"lr": 1e-3}], env_id=env_id, threshold=195.0)
-    confirmation = present(synthetic.best).confirmation.model_copy(update={"threshold": threshold})
-    best = present(synthetic.best).model_copy(update={"confirmation": confirmation})
-    sweep = synthetic.sweep.model_copy(update={"spec": synthetic.sweep.spec | {"stop": stop}})
-    assert goal_of(sweep, best) == goal
-
-
-def test_paths_below_the_current_folder_are_relative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert shown_path(tmp_path / "sweeps" / "a") == "sweeps/a"
-    assert shown_path(tmp_path.parent) == str(tmp_path.parent)
-
-
-def test_numbers_read_well() -> None:
-    assert [number(v) for v in (None, 0, 50176, 0.00123456, 1e-7, 200.0, True, "relu")] == [
-        NONE, "0", "50,176", "0.001235", "1e-07", "200", "True", "relu",
-    ]  # fmt: skip
-    assert [duration(v) for v in (0.0, 42.2, 70.4, 7500)] == ["0.0 s", "42 s", "1 min 10 s", "2 h 5 min"]
-    assert [duration(v, tenths=False) for v in (0.4, 9.7, 59.6)] == ["0 s", "10 s", "1 min 0 s"]
-    assert [duration(v, none="-") for v in (math.nan, math.inf)] == ["-", "-"]
-    assert [return_text(v) for v in (None, 0.0, -78.25, -0.04)] == [NONE, "0.0", "-78.2", "0.0"]
-    assert [difference_text(v) for v in (12.34, -0.06, -0.04, 0.0)] == ["+12.3", "-0.1", "+0.0", "+0.0"]
-    assert [setting_text(v) for v in (None, 4096, 1e-3, 100000.0, [64, 64], True, "relu")] == [
-        "-", "4096", "0.001", "1e+05", "64x64", "True", "relu",
-    ]  # fmt: skip
-    assert moment(0.0) == "1970-01-01 00:00 UTC"
-    assert moment(None) == NONE
-    assert [seed_range(s) for s in ((), (3,), (3, 4, 5), (3, 5))] == ["none", "3", "3 (3 to 5)", "2 (3, 5)"]

@@ -1,5 +1,6 @@
-"""Every hyperparameter arrives in the pack; see `packed_ppo_cases`."""
+"""Every hyperparameter arrives in the pack; see `packed_ppo_cases` and `packed_ppo_batches`."""
 
+import packed_ppo_batches  # noqa: F401 (its cases register themselves)
 import packed_ppo_cases
 import pytest
 

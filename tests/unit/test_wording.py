@@ -1,0 +1,41 @@
+"""Numbers, times, seeds and paths as a reader sees them."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from analysis.wording import (
+    NONE,
+    difference_text,
+    duration,
+    moment,
+    number,
+    return_text,
+    seed_range,
+    setting_text,
+    shown_path,
+)
+
+
+def test_paths_below_the_current_folder_are_relative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert shown_path(tmp_path / "sweeps" / "a") == "sweeps/a"
+    assert shown_path(tmp_path.parent) == str(tmp_path.parent)
+
+
+def test_numbers_read_well() -> None:
+    assert [number(v) for v in (None, 0, 50176, 0.00123456, 1e-7, 200.0, True, "relu")] == [
+        NONE, "0", "50,176", "0.001235", "1e-07", "200", "True", "relu",
+    ]  # fmt: skip
+    assert [duration(v) for v in (0.0, 42.2, 70.4, 7500)] == ["0.0 s", "42 s", "1 min 10 s", "2 h 5 min"]
+    assert [duration(v, tenths=False) for v in (0.4, 9.7, 59.6)] == ["0 s", "10 s", "1 min 0 s"]
+    assert [duration(v, none="-") for v in (math.nan, math.inf)] == ["-", "-"]
+    assert [return_text(v) for v in (None, 0.0, -78.25, -0.04)] == [NONE, "0.0", "-78.2", "0.0"]
+    assert [difference_text(v) for v in (12.34, -0.06, -0.04, 0.0)] == ["+12.3", "-0.1", "+0.0", "+0.0"]
+    assert [setting_text(v) for v in (None, 4096, 1e-3, 100000.0, [64, 64], True, "relu")] == [
+        "-", "4096", "0.001", "1e+05", "64x64", "True", "relu",
+    ]  # fmt: skip
+    assert moment(0.0) == "1970-01-01 00:00 UTC"
+    assert moment(None) == NONE
+    assert [seed_range(s) for s in ((), (3,), (3, 4, 5), (3, 5))] == ["none", "3", "3 (3 to 5)", "2 (3, 5)"]
