@@ -16,7 +16,7 @@ JOURNAL = "journal.jsonl"
 
 def main(descriptor: int) -> None:
     """Do what the real driver does, with a sweep that only waits."""
-    driver.warm_up = lambda: None
+    driver.warm_up = lambda stack, settings: None
     driver._done = _done
     driver.main(descriptor)
 

@@ -25,9 +25,9 @@ def service(tmp_path: Path, database_url: str, monkeypatch: pytest.MonkeyPatch) 
     """A service over an empty storage folder; its queue stands still until `supervisor` is woken."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
     monkeypatch.setattr(
-        module, "Supervisor", functools.partial(Supervisor, make_driver=functools.partial(Driver, "fake_driver"))
+        module, "Supervisor", functools.partial(Supervisor, make_driver=functools.partial(Driver, module="fake_driver"))
     )
-    config = ServiceConfig(storage=tmp_path / "sweeps", database=database_url, keep_spare=False)
+    config = ServiceConfig(storage=tmp_path / "sweeps", database=database_url, spare_idle_s=0.0)
     with opened(config) as made:
         # The tests that want sweeps to run start it themselves.
         made.supervisor.close()

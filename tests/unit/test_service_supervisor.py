@@ -40,11 +40,12 @@ class Place:
         self.queue = Queue(self.engine)
         self.ended: list[Job] = []
 
-    def new_service(self, *, num_cpus: float = 2.0, keep_spare: bool = False) -> Supervisor:
+    def new_service(self, *, num_cpus: float = 2.0, spare_idle_s: float = 0.0) -> Supervisor:
         return Supervisor(
             self.queue, open_storage(self.folder),
             Surroundings(self.folder, self.service_folder, None, num_cpus, ()),
-            keep_spare=keep_spare, on_end=self.ended.append, make_driver=functools.partial(Driver, "fake_driver"),
+            spare_idle_s=spare_idle_s, on_end=self.ended.append,
+            make_driver=functools.partial(Driver, module="fake_driver"),
         )  # fmt: skip
 
     def add(self, name: str, *, seconds: float = 0.0, state: str = "created", **how: Any) -> SweepStore:
@@ -110,7 +111,8 @@ def test_jobs_are_run_and_end_as_their_sweeps_do(place: Place, service: Supervis
     good, bad = place.until_all_end()
     assert (good.outcome, good.message) == ("completed", None)
     assert (bad.outcome, bad.message) == ("failed", "ValueError: it broke")
-    assert place.ended == [good, bad]
+    place.wait(lambda: len(place.ended) == 2, "it is not told")
+    assert sorted(place.ended, key=lambda job: job.id) == [good, bad]
 
 
 def test_a_sweep_is_stopped_and_goes_on_when_it_is_asked_for(place: Place, service: Supervisor) -> None:
@@ -248,7 +250,7 @@ def test_a_sweep_that_somebody_else_drives_is_waited_for(place: Place, service: 
 
 
 def test_a_warm_process_takes_the_next_sweep(place: Place) -> None:
-    service = place.new_service(keep_spare=True)
+    service = place.new_service(spare_idle_s=600.0)
     service.start()
     place.wait(lambda: service._spare is not None and service._spare.is_warm(), "none became warm")
     assert service._spare is not None
@@ -264,8 +266,21 @@ def test_a_warm_process_takes_the_next_sweep(place: Place) -> None:
         os.kill(spare, 0)
 
 
+def test_what_is_kept_warm_ends_when_no_sweep_comes(place: Place) -> None:
+    service = place.new_service(spare_idle_s=5.0)
+    service.start()
+    place.wait(lambda: service.spare() is not None, "none is kept")
+    place.wait(lambda: service.spare() is None, "it is kept for ever")
+    place.submit("a")
+    place.until_all_end()
+    place.wait(lambda: service.spare() is not None, "no other one is kept")
+    place.wait(lambda: (service.spare() or {}).get("warm"), "none became warm")
+    assert (service.spare() or {})["memory_bytes"] > 10**6
+    service.close()
+
+
 def test_a_warm_process_ends_with_a_service_that_is_killed(place: Place) -> None:
-    driver = Driver("fake_driver")
+    driver = Driver({}, module="fake_driver")
     place.wait(driver.is_warm, "it never became warm")
     driver._socket.close()
     place.wait(lambda: driver.poll() is not None, "it lives on")

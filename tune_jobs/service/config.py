@@ -40,19 +40,19 @@ class ServiceConfig:
         modules: Modules of environments and RLModules that specs may name.
         envs: Patterns (regular expressions) of env ids that specs may name; none: all that need no module.
         limits: What one request or one person may take.
-        keep_spare: Whether a driver process is kept warm.
+        spare_idle_s: How long a driver process with a Ray of its own is kept warm while no sweep comes; 0: not at all.
         drain_s: How long sweeps may take to save when the service ends.
     """
 
     storage: Path
     host: str = "127.0.0.1"
-    port: int = 8265
+    port: int = 8470
     address: str | None = None
     database: str | None = None
     modules: tuple[str, ...] = ()
     envs: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
-    keep_spare: bool = True
+    spare_idle_s: float = 1_800.0
     drain_s: float = 60.0
 
     def __post_init__(self) -> None:

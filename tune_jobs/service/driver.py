@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from policies.envs.modules import allow_modules
-from policies.errors import TuneJobsError
+from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
 
@@ -34,25 +34,29 @@ def main(descriptor: int) -> None:
         descriptor: This end of the socket to the service. If the other one is closed before a job comes, this ends.
     """
     end_in_order()
-    with socket.socket(fileno=descriptor) as asked:
-        asked.set_inheritable(False)
-        try:
-            warm_up()
-            # A service that was in a hurry has sent the job, and closed its end.
-            with contextlib.suppress(OSError):
-                asked.sendall(READY)
-            message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
-        except (KeyboardInterrupt, ConnectionError):
-            return
-    if not message:
-        return
-    lock, log = descriptors
+    with contextlib.ExitStack() as stack:
+        with socket.socket(fileno=descriptor) as asked:
+            asked.set_inheritable(False)
+            try:
+                settings = asked.recv(_MAX_BYTES)
+                if not settings:
+                    return
+                warm_up(stack, json.loads(settings))
+                with contextlib.suppress(OSError):
+                    asked.sendall(READY)
+                message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
+            except (KeyboardInterrupt, ConnectionError):
+                return
+        if message:
+            _do(json.loads(message), *descriptors)
+
+
+def _do(request: Mapping[str, Any], lock: int, log: int) -> None:
     # The job's lock is this process's alone: one that it starts and that outlives it must not hold it.
     os.set_inheritable(lock, False)  # noqa: FBT003 (takes no keyword)
     os.dup2(log, 1)
     os.dup2(log, 2)
     os.close(log)
-    request = json.loads(message)
     files = JobFiles(Path(request["service"]), request["job"])
     files.say_who(Holder(pid=os.getpid(), sweep=Path(request["sweep"]).name))
     ended = _ended(request)
@@ -63,18 +67,31 @@ def main(descriptor: int) -> None:
     os.close(lock)
 
 
-def warm_up() -> None:
-    """Import what driving a sweep needs."""
+def warm_up(stack: contextlib.ExitStack, settings: Mapping[str, Any]) -> None:
+    """Import what driving a sweep needs, and start Ray if that is asked for.
+
+    Args:
+        stack: Ends Ray when this process ends.
+        settings: The modules that sweeps may name, the folder to be in, and whether Ray is started.
+    """
+    allow_modules(settings["modules"])
+    os.chdir(settings["working_folder"])
     import tune_jobs.ray_tune.cluster
     import tune_jobs.ray_tune.run_trials
     import tune_jobs.sweeps.verbs  # noqa: F401
+
+    if settings["warm_ray"]:
+        from tune_jobs.plan.machine import local_machine
+        from tune_jobs.ray_tune.warm import warm_ray
+
+        # If Ray can't be started, the sweep says so, in its own words.
+        with contextlib.suppress(CannotRunError):
+            stack.enter_context(warm_ray(local_machine()))
 
 
 def _ended(request: Mapping[str, Any]) -> Ended:
     attempt = request["attempt"]
     try:
-        allow_modules(request["modules"])
-        os.chdir(request["working_folder"])
         result = _done(request)
     except KeyboardInterrupt:  # SweepInterrupted is one, too
         return Ended(attempt=attempt, outcome="interrupted")

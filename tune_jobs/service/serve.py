@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import socket
 from collections.abc import Callable
@@ -33,7 +34,9 @@ def serve(config: ServiceConfig, on_start: Callable[[str], None] = lambda _: Non
         port = listening.getsockname()[1]
         host = f"[{config.host}]" if ":" in config.host else config.host
         server = _Server(service, config, app, lambda: on_start(f"http://{host}:{port}"))
-        server.run(sockets=[listening])
+        # The server raises the signal that ended it once more; it has done what the signal asked for.
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])
 
 
 class _Server(uvicorn.Server):

@@ -52,7 +52,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             # A cluster shares its CPUs among the trials of all sweeps by itself.
             num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
             where = Surroundings(config.storage, config.folder, config.address, num_cpus, config.modules)
-            supervisor = Supervisor(queue, storage, where, keep_spare=config.keep_spare)
+            supervisor = Supervisor(queue, storage, where, spare_idle_s=config.spare_idle_s)
             supervisor.start()
             try:
                 yield Service(

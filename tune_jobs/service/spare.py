@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 from policies.errors import CannotRunError
 
+_PATIENCE_S = 5.0
 _ROOT = str(Path(__file__).parents[2])
 # With `-P`, nothing in the working directory can hide these packages.
 _BEGIN = """\
@@ -31,13 +33,14 @@ class Driver:
     """A driver process that has no job yet.
 
     Args:
+        settings: What it needs to know before there is a job, see `driver.warm_up`.
         module: The module whose `main` it calls with the descriptor of its end of the socket.
 
     Raises:
         CannotRunError: No process can be started.
     """
 
-    def __init__(self, module: str = "tune_jobs.service.driver") -> None:
+    def __init__(self, settings: Mapping[str, Any], module: str = "tune_jobs.service.driver") -> None:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         code = _BEGIN.format(root=_ROOT, module=module, descriptor=theirs.fileno())
         try:
@@ -57,6 +60,7 @@ class Driver:
             ) from error
         finally:
             theirs.close()
+        self._socket.sendall(json.dumps(dict(settings)).encode())
 
     @property
     def pid(self) -> int:
@@ -69,7 +73,10 @@ class Driver:
 
     def is_warm(self) -> bool:
         """Whether it has imported everything."""
-        return bool(select.select([self._socket], [], [], 0)[0])
+        try:
+            return bool(select.select([self._socket], [], [], 0)[0])
+        except (OSError, ValueError):  # another thread has just dismissed it
+            return False
 
     def give(self, request: Mapping[str, Any], lock: int, log: Path) -> None:
         """Give it a job; from now on it needs nobody.
@@ -102,9 +109,34 @@ class Driver:
     def dismiss(self) -> None:
         """End it, as no job comes."""
         self._socket.close()
-        self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(5)
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.wait()
+        # It ends by itself when it sees that; while it starts Ray it does not look.
+        for number in (None, signal.SIGTERM, signal.SIGKILL):
+            if number is not None:
+                self._process.send_signal(number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_PATIENCE_S)
+                return
+
+
+def memory_of_tree(pid: int) -> int | None:
+    """Return the bytes of memory of a process and its descendants, shared pages counted by share; None: not known.
+
+    Source:
+        Pss in /proc/PID/smaps_rollup, proc(5).
+    """
+    parents, found = {}, 0
+    try:
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdigit():
+                with contextlib.suppress(OSError, ValueError, IndexError):
+                    parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+        tree = {pid}
+        while more := {child for child, parent in parents.items() if parent in tree} - tree:
+            tree |= more
+        for member in tree:
+            with contextlib.suppress(OSError, ValueError, IndexError):
+                lines = Path(f"/proc/{member}/smaps_rollup").read_text().splitlines()
+                found += 1024 * next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    except OSError:
+        return None
+    return found or None

@@ -12,15 +12,16 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from policies.errors import TuneJobsError
 from tune_jobs.service.job_files import JobFiles, held_jobs
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
-from tune_jobs.service.spare import Driver
+from tune_jobs.service.spare import Driver, memory_of_tree
 from tune_jobs.store.contract import Storage, Sweep
 
 _log = logging.getLogger(__name__)
@@ -50,7 +51,7 @@ class Supervisor:
         queue: The jobs.
         storage: The sweeps.
         where: Where they run.
-        keep_spare: Whether a driver process is kept warm.
+        spare_idle_s: How long a driver process is kept warm while no sweep comes, in seconds; 0: not at all.
         on_end: Called with each job that has ended.
         make_driver: Starts a driver process.
     """
@@ -61,12 +62,13 @@ class Supervisor:
         storage: Storage,
         where: Surroundings,
         *,
-        keep_spare: bool = True,
+        spare_idle_s: float = 1_800.0,
         on_end: Callable[[Job], None] = lambda _: None,
-        make_driver: Callable[[], Driver] = Driver,
+        make_driver: Callable[[Mapping[str, Any]], Driver] = Driver,
     ) -> None:
         self._queue, self._storage, self._where = queue, storage, where
-        self._keep_spare, self._on_end, self._make_driver = keep_spare, on_end, make_driver
+        self._spare_idle_s, self._on_end, self._make_driver = spare_idle_s, on_end, make_driver
+        self._idle_since = time.monotonic()
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
         self._retry_at: dict[int, float] = {}
@@ -107,9 +109,9 @@ class Supervisor:
         self.wake()
         if self._thread.is_alive():
             self._thread.join()
-        if self._spare is not None:
-            self._spare.dismiss()
-            self._spare = None
+        spare, self._spare = self._spare, None
+        if spare is not None:
+            spare.dismiss()
 
     @property
     def is_alive(self) -> bool:
@@ -120,6 +122,13 @@ class Supervisor:
     def is_draining(self) -> bool:
         """Whether it starts nothing more."""
         return self._draining.is_set()
+
+    def spare(self) -> dict[str, Any] | None:
+        """Return whether the process that is kept for the next sweep is warm, and its memory; None: there is none."""
+        spare = self._spare
+        if spare is None:
+            return None
+        return {"warm": spare.is_usable() and spare.is_warm(), "memory_bytes": memory_of_tree(spare.pid)}
 
     @property
     def num_cpus(self) -> float:
@@ -244,8 +253,6 @@ class Supervisor:
                 "verb": job.verb,
                 "arguments": job.arguments,
                 "address": self._where.address,
-                "modules": self._where.modules,
-                "working_folder": str(self._where.storage_folder),
             }
             driver.give(request, lock, files.log)
             self._children[driver.pid] = driver
@@ -260,17 +267,32 @@ class Supervisor:
         spare, self._spare = self._spare, None
         if spare is not None and spare.is_usable():
             return spare
-        return self._make_driver()
+        return self._make_driver(self._settings(warm=False))
+
+    def _settings(self, *, warm: bool) -> dict[str, Any]:
+        return {
+            "modules": self._where.modules,
+            "working_folder": str(self._where.storage_folder),
+            # A cluster has its own.
+            "warm_ray": warm and self._where.address is None,
+        }
 
     def _mind_spare(self) -> None:
-        if not self._keep_spare or self._draining.is_set():
+        if self._draining.is_set():
             return
         if self._spare is not None and not self._spare.is_usable():
             self._spare = None
-        # While sweeps run, the next one waits for them; importing would only take their time.
-        if self._spare is None and not self._queue.jobs("running"):
+        if self._queue.jobs("running"):
+            # The next one waits for them; importing would only take their time.
+            self._idle_since = time.monotonic()
+        elif time.monotonic() - self._idle_since >= self._spare_idle_s:
+            if self._spare is not None:
+                _log.info("No sweep came for %g s: what was kept warm for one ends.", self._spare_idle_s)
+                spare, self._spare = self._spare, None
+                spare.dismiss()
+        elif self._spare is None:
             with contextlib.suppress(TuneJobsError):
-                self._spare = self._make_driver()
+                self._spare = self._make_driver(self._settings(warm=True))
 
     def _files(self, job: Job) -> JobFiles:
         return JobFiles(self._where.service_folder, job.uid)

@@ -52,6 +52,7 @@ def me(service: TheService, caller: TheCaller) -> dict[str, Any]:
         "version": version("tune-jobs"),
         "num_cpus": service.supervisor.num_cpus if service.config.address is None else None,
         "address": service.config.address,
+        "spare": service.supervisor.spare(),
     }
 
 
