@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 
 import click
@@ -29,6 +30,14 @@ from tune_jobs.cli.base import storage_option
 )  # fmt: skip
 @click.option("--drain", "drain_s", type=click.FloatRange(0), default=60.0, show_default=True,
               help="Seconds that sweeps may take to save when the service ends.")  # fmt: skip
+@click.option("--webhook", "webhooks", multiple=True, metavar="URL", help="Told what happens. May be repeated.")
+@click.option(
+    "--webhook-secret", metavar="SECRET", envvar="TUNE_JOBS_WEBHOOK_SECRET", show_envvar=True,
+    help="What messages to webhooks are signed with (Standard Webhooks); better set by the variable.",
+)  # fmt: skip
+@click.option("--run-command", metavar="COMMAND", help="Run when something happens, with the message as its input.")
+@click.option("--stuck", "stuck_s", type=click.FloatRange(1), default=900.0, show_default=True, metavar="SECONDS",
+              help="A running sweep that takes no env step for so long is told to be stuck.")  # fmt: skip
 @storage_option
 def serve(
     *,
@@ -40,6 +49,10 @@ def serve(
     modules: tuple[str, ...],
     spare_idle_s: float,
     drain_s: float,
+    webhooks: tuple[str, ...],
+    webhook_secret: str | None,
+    run_command: str | None,
+    stuck_s: float,
     storage: str | None,
 ) -> None:
     """Run the service: a queue of sweeps, a page that shows them live, and REST over the same sweep folder."""
@@ -51,5 +64,7 @@ def serve(
     config = ServiceConfig(
         storage=storage_folder(storage), host=host, port=port, address=address, database=database,
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,
+        webhooks=webhooks, webhook_secret=webhook_secret, stuck_s=stuck_s,
+        command=tuple(shlex.split(run_command or "")),
     )  # fmt: skip
     run(config, lambda url: click.echo(f"tune-jobs serves {config.storage} at {url}"))

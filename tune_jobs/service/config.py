@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from policies.errors import SpecError
+from tune_jobs.service.events import STUCK_S
 from tune_jobs.service.job_files import SERVICE_FOLDER
+from tune_jobs.service.telling import COMMAND, check_target
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
@@ -41,6 +44,10 @@ class ServiceConfig:
         envs: Patterns (regular expressions) of env ids that specs may name; none: all that need no module.
         limits: What one request or one person may take.
         spare_idle_s: How long a driver process with a Ray of its own is kept warm while no sweep comes; 0: not at all.
+        webhooks: URLs that are told what happens.
+        webhook_secret: What these messages are signed with; None: they are not.
+        command: A command that is run when something happens, with its arguments; none: nothing is run.
+        stuck_s: How long a running sweep may take no env step before it counts as stuck.
         drain_s: How long sweeps may take to save when the service ends.
     """
 
@@ -53,14 +60,25 @@ class ServiceConfig:
     envs: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
     spare_idle_s: float = 1_800.0
+    webhooks: tuple[str, ...] = ()
+    webhook_secret: str | None = None
+    command: tuple[str, ...] = ()
+    stuck_s: float = STUCK_S
     drain_s: float = 60.0
 
     def __post_init__(self) -> None:
+        for url in self.webhooks:
+            check_target(url)
         for pattern in self.envs:
             try:
                 re.compile(pattern)
             except re.error as error:
                 raise SpecError(f"{pattern!r} is no pattern of env ids: {error}.") from error
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Who is told what happens."""
+        return (*self.webhooks, *([COMMAND + json.dumps(self.command)] if self.command else []))
 
     @property
     def folder(self) -> Path:

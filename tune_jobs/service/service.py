@@ -15,11 +15,13 @@ from policies.errors import CannotRunError
 from tune_jobs.plan.machine import local_machine
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database, sqlite_url
+from tune_jobs.service.events import Watch
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.submitting import Submitter
 from tune_jobs.service.supervisor import Supervisor, Surroundings
+from tune_jobs.service.telling import Teller
 from tune_jobs.store.contract import Storage
 from tune_jobs.store.local_storage import open_storage
 
@@ -52,21 +54,24 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             # A cluster shares its CPUs among the trials of all sweeps by itself.
             num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
             where = Surroundings(config.storage, config.folder, config.address, num_cpus, config.modules)
-            supervisor = Supervisor(queue, storage, where, spare_idle_s=config.spare_idle_s)
-            supervisor.start()
-            try:
+            statuses = Statuses(storage)
+            teller = Teller(engine, config.targets, secret=config.webhook_secret)
+            watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s)
+            supervisor = Supervisor(queue, storage, where, spare_idle_s=config.spare_idle_s, on_end=watch.ended)
+            with contextlib.ExitStack() as stack:
+                for part in (teller, watch, supervisor):
+                    part.start()
+                    stack.callback(part.close)
                 yield Service(
                     config=config,
                     engine=engine,
                     storage=storage,
                     queue=queue,
                     labels=Labels(engine),
-                    statuses=Statuses(storage),
+                    statuses=statuses,
                     submitter=Submitter(config, queue, storage),
                     supervisor=supervisor,
                 )
-            finally:
-                supervisor.close()
         finally:
             engine.dispose()
 

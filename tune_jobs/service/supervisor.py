@@ -19,7 +19,7 @@ from typing import Any
 
 from policies.errors import TuneJobsError
 from tune_jobs.service.job_files import JobFiles, held_jobs
-from tune_jobs.service.jobs import Job
+from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver, memory_of_tree
 from tune_jobs.store.contract import Storage, Sweep
@@ -52,7 +52,7 @@ class Supervisor:
         storage: The sweeps.
         where: Where they run.
         spare_idle_s: How long a driver process is kept warm while no sweep comes, in seconds; 0: not at all.
-        on_end: Called with each job that has ended.
+        on_end: Called with each job that has ended; after a kill perhaps again.
         make_driver: Starts a driver process.
     """
 
@@ -204,9 +204,9 @@ class Supervisor:
             return
         ended = files.read_ended(job.num_attempts)
         if ended is not None and ended.outcome != "interrupted":
-            self._finished(self._queue.end(job.id, ended.outcome, ended.message))
+            self._finish(job, ended.outcome, ended.message)
         elif job.stop_requested:
-            self._finished(self._queue.end(job.id, "stopped"))
+            self._finish(job, "stopped")
         elif ended is not None or self._draining.is_set():
             # Whoever wants the end of the sweep, and not of the process, asks for it: it goes on later.
             self._queue.give_back(job.id)
@@ -218,7 +218,7 @@ class Supervisor:
         if job.num_attempts >= MAX_ATTEMPTS:
             said = files.last_lines()
             message = f"The process that ran the sweep died {job.num_attempts} times." + (f"\n{said}" if said else "")
-            self._finished(self._queue.end(job.id, "failed", message))
+            self._finish(job, "failed", message)
         elif self._retry_at.setdefault(job.id, time.monotonic() + _wait_s(job.num_attempts)) <= time.monotonic():
             del self._retry_at[job.id]
             _log.warning("The driver of job %d (sweep %s) died; another one goes on.", job.id, job.sweep)
@@ -233,9 +233,11 @@ class Supervisor:
         with contextlib.suppress(OSError):
             os.kill(holder.pid, signal.SIGTERM)
 
-    def _finished(self, job: Job) -> None:
-        _log.info("Job %d (%s of sweep %s) has ended: %s.", job.id, job.verb, job.sweep, job.outcome)
-        self._on_end(job)
+    def _finish(self, job: Job, outcome: Outcome, message: str | None = None) -> None:
+        _log.info("Job %d (%s of sweep %s) has ended: %s.", job.id, job.verb, job.sweep, outcome)
+        # First it is told: whoever is killed in between tells it twice, and not never.
+        self._on_end(job.model_copy(update={"state": "ended", "outcome": outcome, "message": message}))
+        self._queue.end(job.id, outcome, message)
 
     def _start(self, job: Job) -> None:
         files = self._files(job)

@@ -99,3 +99,18 @@ audit = Table(
     sqlite_autoincrement=True,
 )
 """Who did what, and what the answer was."""
+
+messages = Table(
+    "messages",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("event", String(50), nullable=False),
+    Column("target", Text, nullable=False),
+    Column("body", Text, nullable=False),
+    Column("created_at", Float, nullable=False),
+    Column("next_at", Float),
+    Column("num_attempts", Integer, nullable=False),
+    Column("error", Text),
+    Index("ix_messages_next_at", "next_at"),
+)
+"""What is to be told, to whom, and when it is tried next; null: it is done, or given up."""

@@ -1,0 +1,198 @@
+"""Tell webhooks and a command what happened: a sweep ended, failed, has a new best policy, or is stuck.
+
+What is to be told is in the database before it is sent, so a service that is killed tells it later: each at least once,
+perhaps twice. A receiver knows a message that it has by its id.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import json
+import logging
+import os
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.request
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+from sqlalchemy import Engine, delete, insert, or_, select, update
+
+from policies.errors import SpecError
+from tune_jobs.service.database.tables import messages
+
+Event = Literal["sweep.ended", "sweep.failed", "sweep.stopped", "sweep.best", "sweep.stuck"]
+
+COMMAND = "command:"
+"""What a target begins with that is a command, not a URL."""
+WAITS_S = (5.0, 30.0, 120.0, 600.0, 3_600.0, 6 * 3_600.0, 12 * 3_600.0)
+"""How long to wait after each attempt that failed; after the last one it is given up."""
+_ENCODED = "whsec_"
+_TIMEOUT_S = 15.0
+_COMMAND_TIMEOUT_S = 60.0
+_KEPT_S = 7 * 24 * 3_600.0
+_log = logging.getLogger(__name__)
+
+
+def check_target(url: str) -> str:
+    """Return the URL of a webhook.
+
+    Raises:
+        SpecError: It is not one of http or https.
+    """
+    if not url.startswith(("http://", "https://")) or len(url) > 2_000:
+        raise SpecError(f"{url[:80]!r} is no URL of a webhook.", "Begin it with https:// or http://.")
+    return url
+
+
+def signature(secret: str, message_id: str, timestamp: int, body: str) -> str:
+    """Return what the header `webhook-signature` says.
+
+    Args:
+        secret: The secret that both sides know; after `whsec_` it is base64.
+        message_id: The header `webhook-id`.
+        timestamp: The header `webhook-timestamp`, seconds since 1970.
+        body: The body.
+
+    Source:
+        Standard Webhooks 1.0, "Webhook headers": HMAC-SHA256 of id, timestamp and body with dots between, base64.
+    """
+    signed = f"{message_id}.{timestamp}.{body}".encode()
+    key = base64.b64decode(secret.removeprefix(_ENCODED)) if secret.startswith(_ENCODED) else secret.encode()
+    return "v1," + base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
+
+
+class Teller:
+    """Sends what is to be told, in a thread.
+
+    Args:
+        engine: The database.
+        targets: URLs of webhooks, and commands as `command:` and a JSON list.
+        secret: What webhooks are signed with; None: they are not.
+        now: Returns seconds since 1970.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        targets: Sequence[str],
+        *,
+        secret: str | None = None,
+        now: Callable[[], float] = time.time,
+    ) -> None:
+        self._engine, self._targets, self._secret, self._now = engine, tuple(targets), secret, now
+        self._wake, self._end = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="telling", daemon=True)
+
+    def start(self) -> None:
+        """Begin to send."""
+        if self._targets:
+            self._thread.start()
+
+    def close(self) -> None:
+        """End; what is not yet sent is sent by the next service."""
+        self._end.set()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(_TIMEOUT_S)
+
+    def tell(self, event: Event, body: Mapping[str, Any]) -> None:
+        """Note what happened, for each target."""
+        if not self._targets:
+            return
+        now = self._now()
+        text = json.dumps({"type": event, "timestamp": now, "data": dict(body)}, sort_keys=True)
+        rows = [
+            {"id": f"msg_{uuid.uuid4().hex}", "event": event, "target": target, "body": text, "created_at": now,
+             "next_at": now, "num_attempts": 0}
+            for target in self._targets
+        ]  # fmt: skip
+        with self._engine.begin() as connection:
+            connection.execute(insert(messages), rows)
+        self._wake.set()
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            try:
+                self.send_due()
+            except Exception:  # noqa: BLE001 (such as a database that is away for a while)
+                _log.exception("Messages could not be sent; they are tried again.")
+                self._end.wait(5.0)
+            self._wake.wait(1.0)
+            self._wake.clear()
+
+    def send_due(self) -> int:
+        """Send what is due now; return how many arrived."""
+        now = self._now()
+        with self._engine.begin() as connection:
+            done = or_(messages.c.next_at.is_(None), messages.c.target.not_in(self._targets))
+            connection.execute(delete(messages).where(done, messages.c.created_at < now - _KEPT_S))
+            query = select(messages).where(messages.c.next_at <= now, messages.c.target.in_(self._targets))
+            due = connection.execute(query.order_by(messages.c.created_at).limit(100)).mappings().all()
+        arrived = 0
+        for row in due:
+            if self._end.is_set():
+                break
+            error = self._sent(row["id"], row["event"], row["target"], row["body"])
+            attempts = row["num_attempts"] + 1
+            arrived += error is None
+            wait = None if error is None or attempts > len(WAITS_S) else WAITS_S[attempts - 1]
+            if error is not None:
+                _log.warning("%s could not be told %s (attempt %d): %s", row["target"], row["event"], attempts, error)
+            values = {
+                "num_attempts": attempts, "error": error, "next_at": None if wait is None else self._now() + wait,
+            }  # fmt: skip
+            with self._engine.begin() as connection:
+                connection.execute(update(messages).where(messages.c.id == row["id"]).values(values))
+        return arrived
+
+    def _sent(self, message_id: str, event: str, target: str, body: str) -> str | None:
+        """Send one message; return why it did not arrive, if it did not."""
+        if target.startswith(COMMAND):
+            return _run_command(json.loads(target.removeprefix(COMMAND)), message_id, event, body)
+        timestamp = int(self._now())
+        headers = {
+            "Content-Type": "application/json", "User-Agent": "tune-jobs",
+            "webhook-id": message_id, "webhook-timestamp": str(timestamp),
+        }  # fmt: skip
+        if self._secret is not None:
+            headers["webhook-signature"] = signature(self._secret, message_id, timestamp, body)
+        request = urllib.request.Request(target, data=body.encode(), headers=headers, method="POST")  # noqa: S310 (checked)
+        try:
+            with _opener.open(request, timeout=_TIMEOUT_S) as answer:
+                answer.read(1_000)
+        except urllib.error.HTTPError as error:
+            return f"it answered {error.code}"
+        except (OSError, ValueError) as error:
+            return str(getattr(error, "reason", error))[:500]
+        return None
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """A redirect counts as a failure: the operator named one place, and no other gets what happened."""
+
+    def redirect_request(self, *_: Any, **__: Any) -> None:
+        return None
+
+
+_opener = urllib.request.build_opener(_NoRedirects)
+
+
+def _run_command(command: Sequence[str], message_id: str, event: str, body: str) -> str | None:
+    told = {"TUNE_JOBS_MESSAGE_ID": message_id, "TUNE_JOBS_EVENT": event}
+    try:
+        done = subprocess.run(  # noqa: S603 (the operator's own)
+            list(command), input=body.encode(), env=os.environ | told, capture_output=True,
+            timeout=_COMMAND_TIMEOUT_S, check=False, start_new_session=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError) as error:
+        return str(error)[:500]
+    if done.returncode == 0:
+        return None
+    said = done.stderr.decode("utf-8", "replace").strip()
+    return f"exit code {done.returncode}" + (f": {said[-300:]}" if said else "")
