@@ -28,6 +28,8 @@ class Limits:
     """That wait or run, of one person."""
     watchers: int = 200
     """Event streams at once."""
+    players: int = 4
+    """Episodes that are played for pages at once."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,114 @@
+"""Watching a policy play over HTTP: events in order, what can't be played, and that a player ends with its watcher."""
+
+import contextlib
+import json
+import os
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from fastapi.testclient import TestClient
+from services import client, postgresql, service  # noqa: F401 (fixtures)
+from sweep_folders import make_sweep_folder
+
+from tune_jobs.service.database.opening import sqlite_url
+from tune_jobs.service.http import play_routes
+from tune_jobs.service.http.app import make_app
+from tune_jobs.service.service import Service
+
+# ruff: noqa: F811 - fixtures are named as arguments
+
+
+@pytest.fixture
+def database_url(tmp_path: Path) -> str:
+    return sqlite_url(tmp_path / "service.db")
+
+
+@pytest.fixture(autouse=True)
+def finished(service: Service) -> None:
+    make_sweep_folder(service.config.storage / "done")
+
+
+def events(text: str) -> list[tuple[str, dict[str, Any]]]:
+    found = []
+    for block in text.strip().split("\n\n"):
+        kind, data = block.split("\n")
+        found.append((kind.removeprefix("event: "), json.loads(data.removeprefix("data: "))))
+    return found
+
+
+def test_an_episode_from_its_beginning_to_its_end(client: TestClient) -> None:
+    answer = client.get("/api/v1/sweeps/done/play", params={"trial": "t0003", "seed": 5, "speed": 10})
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    (first, info), *steps, (last, end) = events(answer.text)
+    assert (first, info["env_id"], info["seed"], info["is_drawn"]) == ("info", "CartPole-v1", 5, True)
+    assert {kind for kind, _ in steps} == {"step"}
+    assert [step["num_env_steps"] for _, step in steps] == list(range(len(steps)))
+    assert all(step["picture"] for _, step in steps)
+    assert (last, end["total"], end["over"]) == ("end", steps[-1][1]["total"], True)
+
+
+def test_a_random_policy_beside_it(client: TestClient) -> None:
+    answer = client.get("/api/v1/sweeps/done/play", params={"random": True, "speed": 10})
+    (_, info), *_, (last, _) = events(answer.text)
+    assert (info["description"], last) == ("random policy", "end")
+
+
+@pytest.mark.parametrize(("query", "status", "told"), [
+    ({"trial": "t9999"}, 404, "t9999"),
+    ({"trial": "../../x"}, 404, "x"),
+    ({"trial": "t0003", "iteration": 1}, 404, "it has those of iterations"),
+    ({}, 404, "no best policy"),
+    ({"trial": "t0003", "seed": -1}, 422, "seed"),
+    ({"trial": "t0003", "speed": 0}, 422, "speed"),
+])  # fmt: skip
+def test_what_cannot_be_played(client: TestClient, query: dict[str, Any], status: int, told: str) -> None:
+    answer = client.get("/api/v1/sweeps/done/play", params=query)
+    assert answer.status_code == status, answer.text
+    assert told in answer.text
+
+
+def test_no_more_are_played_than_the_limit_allows(client: TestClient, service: Service) -> None:
+    object.__setattr__(service.config.limits, "players", 0)
+    assert client.get("/api/v1/sweeps/done/play", params={"trial": "t0003"}).status_code == 429
+
+
+def test_an_env_that_fails_is_said(client: TestClient, service: Service) -> None:
+    record = service.storage.sweep("done").read_record()
+    spec = record.spec | {"env": {"id": "Acrobot-v1", "args": {}}}
+    service.storage.sweep("done").write_record(record.model_copy(update={"spec": spec}))
+    answer = client.get("/api/v1/sweeps/done/play", params={"trial": "t0003"})
+    ((kind, told),) = events(answer.text)
+    assert kind == "problem"
+    assert "Acrobot-v1" in told["detail"]
+
+
+@pytest.fixture
+def url(service: Service) -> Iterator[str]:
+    """The address of a real server."""
+    server = uvicorn.Server(uvicorn.Config(make_app(service), port=0, log_level="error"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join()
+
+
+def test_a_player_ends_with_its_watcher(url: str) -> None:
+    with urllib.request.urlopen(f"{url}/api/v1/sweeps/done/play?trial=t0003&speed=0.1", timeout=60) as answer:
+        assert answer.readline() == b"event: info\n"
+        (pid,) = play_routes._playing
+    deadline = time.monotonic() + 30
+    with contextlib.suppress(ProcessLookupError):
+        while True:
+            os.kill(pid, 0)
+            assert time.monotonic() < deadline, "the player lives on"
+            time.sleep(0.05)
+    assert not play_routes._playing

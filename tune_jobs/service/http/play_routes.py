@@ -1,0 +1,124 @@
+"""Watch a policy play: an episode as server-sent events, played by a process of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import anyio
+from fastapi import APIRouter, Query
+from fastapi.responses import StreamingResponse
+
+from policies.errors import NotFoundError
+from tune_jobs.service.http.caller import TheService
+from tune_jobs.service.http.problems import TooManyError
+from tune_jobs.service.player import LEAST_SPEED, MOST_SPEED
+from tune_jobs.service.service import Service
+from tune_jobs.spec.file import stored_spec
+
+router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["watch it play"])
+
+_ROOT = str(Path(__file__).parents[3])
+_BEGIN = f"""\
+import sys
+sys.path.insert(0, {_ROOT!r})
+import tune_jobs
+del sys.path[0]
+from tune_jobs.service.player import main
+main()
+"""
+_MAX_LINE = 8 * 1024**2
+_PATIENCE_S = 60.0
+"""How long an environment may take for one step before the episode is ended."""
+_playing: set[int] = set()
+
+
+@router.get("/play")
+async def play(
+    name: str,
+    service: TheService,
+    *,
+    trial: Annotated[str | None, Query(max_length=20, description="A trial; without it, the best policy.")] = None,
+    iteration: Annotated[int | None, Query(ge=0, description="Of its checkpoint; without it, the latest.")] = None,
+    random: Annotated[bool, Query(description="A random policy instead.")] = False,
+    seed: Annotated[int, Query(ge=0, le=2**32 - 1, description="Seed of the episode.")] = 0,
+    speed: Annotated[float, Query(ge=LEAST_SPEED, le=MOST_SPEED, description="1: the env's own time.")] = 1.0,
+) -> StreamingResponse:
+    """Play one greedy episode: the events `info`, `step` after step, and `end`, or `problem`."""
+    request = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
+    limit = service.config.limits.players
+    if len(_playing) >= limit:
+        raise TooManyError(f"{limit} episodes are being played.", "Close one, or wait for its end.")
+    # An abandoned connection ends the generator, and with it the process.
+    return StreamingResponse(
+        _events({**request, "seed": seed, "speed": speed}, str(service.config.storage)),
+        media_type="text/event-stream",
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+    )
+
+
+def _request(service: Service, name: str, trial: str | None, iteration: int | None, random: bool) -> dict[str, Any]:  # noqa: FBT001
+    record = service.statuses.see(name).status.sweep
+    spec = stored_spec(record)
+    sweep = service.storage.sweep(name)
+    if random:
+        policy = "random"
+    elif trial is None:
+        if not sweep.has_best():
+            raise NotFoundError(f"Sweep {name} has no best policy yet.", "Choose a trial that has a checkpoint.")
+        policy = str(sweep.best_folder)
+    else:
+        kept = sweep.trial(trial).checkpoint_iterations()
+        if not kept or (iteration is not None and iteration not in kept):
+            has = f"it has those of iterations {', '.join(map(str, kept))}" if kept else "it has none yet"
+            raise NotFoundError(f"Trial {trial} of sweep {name} has no such checkpoint: {has}.")
+        policy = str(sweep.trial(trial).checkpoint_folder(kept[-1] if iteration is None else iteration))
+    modules = sorted({*service.config.modules, *record.allowed_modules})
+    return {"policy": policy, "env_id": spec.env.id, "env_args": spec.env.wrapped_args, "modules": modules}
+
+
+async def _events(request: dict[str, Any], folder: str) -> AsyncIterator[str]:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-P", "-c", _BEGIN,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL,
+        cwd=folder, start_new_session=True, limit=_MAX_LINE,
+    )  # fmt: skip
+    _playing.add(process.pid)
+    try:
+        if process.stdin is None or process.stdout is None:
+            raise RuntimeError("the player has no pipes")
+        process.stdin.write(json.dumps(request).encode())
+        process.stdin.close()
+        last = ""
+        while True:
+            try:
+                line = await asyncio.wait_for(process.stdout.readline(), _PATIENCE_S)
+            except TimeoutError:
+                yield _event(
+                    "problem", {"detail": f"The environment took over {_PATIENCE_S:g} s for a step.", "hint": ""}
+                )
+                return
+            if not line:
+                break
+            told = json.loads(line)
+            last = told.pop("event")
+            yield _event(last, told)
+        if last not in ("end", "problem"):
+            yield _event("problem", {"detail": "The environment ended the process that played it.", "hint": ""})
+    finally:
+        _playing.discard(process.pid)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        with anyio.CancelScope(shield=True):
+            await process.wait()
+
+
+def _event(kind: str, data: Any) -> str:
+    return f"event: {kind}\ndata: {json.dumps(data)}\n\n"
