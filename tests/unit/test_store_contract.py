@@ -29,6 +29,7 @@ from analysis.records import (
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from tune_jobs.store.contract import Sweep, Trial
+from tune_jobs.store.results_tail import ResultsMark
 
 # -- names, and that there is a sweep
 
@@ -73,7 +74,7 @@ def test_a_discarded_sweep_is_gone_with_all_that_it_had(harness: Harness, sweep:
     assert sweep.read_trials() == []
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/a", "../mine", "a\0"])
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/a", "../mine", "a\0", "x" * 256])
 def test_no_name_leads_out_of_the_storage(harness: Harness, sweep: Sweep, name: str) -> None:
     for ask in (harness.storage().sweep, harness.storage().is_taken):
         with pytest.raises(NotFoundError):
@@ -272,3 +273,103 @@ def test_of_damaged_results_the_others_are_read(
     assert trial.scores_of({2, 3, 9}) == {3: [(300, None)]}
     harness.put("mine", RESULTS, harness.content("mine", RESULTS) * 2)
     assert trial.scores_of([1, 3])[3] == [(300, None)] * 2
+
+
+# -- for those who look again and again
+
+
+def test_what_was_appended_is_read_once(trial: Trial, another: Reopen) -> None:
+    reader = another().trial("t0000")
+    nothing = reader.read_new_points(ResultsMark())
+    assert (nothing.points, nothing.replaced) == ((), False)
+    trial.append_iterations([make_iteration(1), make_iteration(2, training_return=2.0, evaluation_return=-1.0)])
+    first = reader.read_new_points(nothing.mark)
+    assert [point.iteration for point in first.points] == [1, 2]
+    last = first.points[1]
+    assert (last.num_env_steps, last.training_return, last.evaluation_return) == (200, 2.0, -1.0)
+    assert not reader.read_new_points(first.mark).points
+    trial.append_iterations([make_iteration(3)])
+    second = reader.read_new_points(first.mark)
+    assert [point.iteration for point in second.points] == [3]
+    assert not second.replaced
+    # Whoever begins anew gets all.
+    assert len(another().trial("t0000").read_new_points(ResultsMark()).points) == 3
+
+
+def test_half_a_line_is_read_when_it_is_whole(harness: Harness, trial: Trial) -> None:
+    trial.append_iterations([make_iteration(1)])
+    whole = harness.content("mine", RESULTS)
+    line = make_iteration(2).model_dump_json().encode() + b"\n"
+    harness.put("mine", RESULTS, whole + line[:20])
+    first = trial.read_new_points(ResultsMark())
+    assert [point.iteration for point in first.points] == [1]
+    harness.put("mine", RESULTS, whole + line[:40])
+    more = trial.read_new_points(first.mark)
+    assert not more.points
+    harness.put("mine", RESULTS, whole + line)
+    assert [point.iteration for point in trial.read_new_points(more.mark).points] == [2]
+
+
+@pytest.mark.parametrize("kept", [0, 1, 2])
+def test_results_that_were_replaced_are_read_anew(trial: Trial, another: Reopen, kept: int) -> None:
+    """A trial that continues from a checkpoint drops what came after it."""
+    records = [make_iteration(number) for number in (1, 2, 3)]
+    trial.append_iterations(records)
+    before = another().trial("t0000").read_new_points(ResultsMark())
+    trial.keep_iterations(records[:kept])
+    # By then it may have more lines than before, and in place of those that were read.
+    trial.append_iterations([make_iteration(number, training_return=9.0) for number in range(kept + 1, 6)])
+    after = another().trial("t0000").read_new_points(before.mark)
+    assert after.replaced
+    assert [(point.iteration, point.training_return) for point in after.points] == [
+        (number, None if number <= kept else 9.0) for number in range(1, 6)
+    ]
+
+
+def test_results_that_are_gone_are_read_as_none(harness: Harness, trial: Trial) -> None:
+    trial.append_iterations([make_iteration(1)])
+    before = trial.read_new_points(ResultsMark())
+    harness.remove("mine", RESULTS)
+    after = trial.read_new_points(before.mark)
+    assert (after.points, after.replaced) == ((), True)
+    assert not trial.read_new_points(after.mark).replaced
+
+
+def test_new_results_that_contradict_are_weighed_as_all_are(harness: Harness, trial: Trial) -> None:
+    def put(*numbers: int) -> None:
+        lines = [make_iteration(number).model_dump_json().encode() + b"\n" for number in numbers]
+        harness.put("mine", RESULTS, b"".join([b"\xff no result\n", *lines]))
+
+    put(1, 2, 900)
+    first = trial.read_new_points(ResultsMark())
+    assert [point.iteration for point in first.points] == [1, 2, 900]
+    put(1, 2, 900, 3, 4)
+    second = trial.read_new_points(first.mark)
+    assert second.replaced
+    assert [point.iteration for point in second.points] == [1, 2, 3, 4]
+    assert [record.iteration for record in trial.read_iterations()] == [1, 2, 3, 4]
+
+
+def test_stamps_tell_which_trials_were_written(sweep: Sweep, another: Reopen) -> None:
+    assert another().trial_stamps() == {}
+    for index in (0, 1):
+        sweep.trial(f"t{index:04d}").write_record(make_trial(index))
+    sweep.trial("t0002").append_iterations([make_iteration(1)])
+    before = another().trial_stamps()
+    assert set(before) == {"t0000", "t0001"}
+    assert another().trial_stamps() == before
+    sweep.trial("t0001").write_record(make_trial(1, status="running"))
+    after = another().trial_stamps()
+    assert {trial_id for trial_id in after if after[trial_id] != before[trial_id]} == {"t0001"}
+
+
+def test_a_report_is_known_by_the_names_of_its_files(sweep: Sweep, another: Reopen) -> None:
+    assert another().report_files() == {}
+    with sweep.writing_report() as folder:
+        (folder / "figures").mkdir(parents=True)
+        for name in ("index.html", "figures/a.svg", ".index.1-2.html"):
+            (folder / name).write_text(name)
+    files = another().report_files()
+    assert {name: path.read_text() for name, path in files.items()} == {
+        "index.html": "index.html", "figures/a.svg": "figures/a.svg",
+    }  # fmt: skip

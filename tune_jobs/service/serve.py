@@ -17,6 +17,8 @@ from tune_jobs.service.service import Service, opened
 
 _log = logging.getLogger(__name__)
 
+_UNREAD_MS = 60_000
+
 
 def serve(config: ServiceConfig, on_start: Callable[[str], None] = lambda _: None) -> None:
     """Serve until SIGTERM or SIGINT; then running sweeps save, and go on at the next start.
@@ -28,18 +30,27 @@ def serve(config: ServiceConfig, on_start: Callable[[str], None] = lambda _: Non
     Raises:
         CannotRunError: It can't listen there, another service has the storage, or the database can't be used.
     """
-    listening = _listening(config)
+    listening = listening_socket(config)
     with listening, opened(config) as service:
         app = make_app(service)
         port = listening.getsockname()[1]
         host = f"[{config.host}]" if ":" in config.host else config.host
-        server = _Server(service, config, app, lambda: on_start(f"http://{host}:{port}"))
+        server = Server(service, config, app, lambda: on_start(f"http://{host}:{port}"))
         # The server raises the signal that ended it once more; it has done what the signal asked for.
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
 
 
-class _Server(uvicorn.Server):
+class Server(uvicorn.Server):
+    """Serves until a signal comes, or `should_exit` is set; then streams end, and running sweeps save.
+
+    Args:
+        service: The service.
+        config: Its settings.
+        app: What answers.
+        on_start: Called once requests are taken.
+    """
+
     def __init__(self, service: Service, config: ServiceConfig, app: Any, on_start: Callable[[], None]) -> None:
         super().__init__(
             uvicorn.Config(
@@ -56,23 +67,35 @@ class _Server(uvicorn.Server):
         self._service, self._drain_s, self._on_start = service, config.drain_s, on_start
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to take requests."""
         await super().startup(sockets)
         self._on_start()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Take no more requests, end what goes on, and let running sweeps save."""
         import anyio
 
+        # Streams would go on for ever; what they are about is not over, so clients come back.
+        await anyio.to_thread.run_sync(self._service.watching.close)
         await super().shutdown(sockets)
         _log.info("Running sweeps save, for at most %g s.", self._drain_s)
         if not await anyio.to_thread.run_sync(self._service.supervisor.drain, self._drain_s):
             _log.warning("Some sweeps did not save in time; they run on, and the next start finds them.")
 
 
-def _listening(config: ServiceConfig) -> socket.socket:
+def listening_socket(config: ServiceConfig) -> socket.socket:
+    """Return a socket that listens where a service is to be reached.
+
+    Raises:
+        CannotRunError: It can't listen there.
+    """
     try:
         family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
         made = socket.socket(family, socket.SOCK_STREAM)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            # Connections have it too: one whose client reads nothing for so long is closed, whatever is left to send.
+            made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNREAD_MS)
         made.bind((config.host, config.port))
         made.listen(1_024)
     except OSError as error:

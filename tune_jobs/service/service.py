@@ -22,6 +22,7 @@ from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.submitting import Submitter
 from tune_jobs.service.supervisor import Supervisor, Surroundings
 from tune_jobs.service.telling import Teller
+from tune_jobs.service.watching import Watching
 from tune_jobs.store.contract import Storage
 from tune_jobs.store.local_storage import open_storage
 
@@ -38,6 +39,7 @@ class Service:
     statuses: Statuses
     submitter: Submitter
     supervisor: Supervisor
+    watching: Watching
 
 
 @contextlib.contextmanager
@@ -50,11 +52,12 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
     with _alone(config.folder):
         engine = open_database(config.database or sqlite_url(config.folder / "service.db"))
         try:
-            storage, queue = open_storage(config.storage), Queue(engine)
+            storage, queue, labels = open_storage(config.storage), Queue(engine), Labels(engine)
+            statuses = Statuses(storage)
             # A cluster shares its CPUs among the trials of all sweeps by itself.
             num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
             where = Surroundings(config.storage, config.folder, config.address, num_cpus, config.modules)
-            statuses = Statuses(storage)
+            watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
             teller = Teller(engine, config.targets, secret=config.webhook_secret)
             watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s)
             supervisor = Supervisor(queue, storage, where, spare_idle_s=config.spare_idle_s, on_end=watch.ended)
@@ -62,15 +65,17 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                 for part in (teller, watch, supervisor):
                     part.start()
                     stack.callback(part.close)
+                stack.callback(watching.close)
                 yield Service(
                     config=config,
                     engine=engine,
                     storage=storage,
                     queue=queue,
-                    labels=Labels(engine),
+                    labels=labels,
                     statuses=statuses,
                     submitter=Submitter(config, queue, storage),
                     supervisor=supervisor,
+                    watching=watching,
                 )
         finally:
             engine.dispose()

@@ -1,31 +1,70 @@
-"""What sweeps look like just now, without reading thousands of files for each request."""
+"""What sweeps look like just now, without reading thousands of files for each request.
+
+A trial's record is read again only when it was written; and what takes long, such as to sum up ten thousand trials, is
+done less often.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 from analysis.records import TrialRecord
+from analysis.selection import score_trial
 from policies.errors import NotFoundError, TuneJobsError
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.sweeps.status import SweepStatus, status_of
 
-FRESH_S = 0.5
-"""How old what is told of a running sweep may be."""
+FRESH_S = 0.4
+"""How old what is told of a running sweep may be; of one with thousands of trials it may be older."""
+_OLDEST_LOOK_S, _OLDEST_STATUS_S = 2.0, 5.0
+_SHARE = 0.02
+"""The share of a core that following one sweep takes, unless it would be too old then."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """When something was done, and how long it took; monotonic seconds."""
+
+    at: float
+    took_s: float
+
+    def is_due(self, now: float, oldest_s: float) -> bool:
+        """Whether it is time to do it again."""
+        return now - self.at >= min(oldest_s, max(FRESH_S, self.took_s / _SHARE))
+
+
+@dataclass(frozen=True)
+class Trials:
+    """The trials of a sweep as they were at some time."""
+
+    records: tuple[TrialRecord, ...]
+    """By index; a record that was not written meanwhile is the object that it was."""
+    scores: Mapping[str, float | None]
+    """The score of each by its id, None if it can't win."""
+    stamps: Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A sweep as it was at some time."""
+    """A sweep as it was at some time; status and trials are the objects that they were if nothing has changed."""
 
     status: SweepStatus
-    trials: tuple[TrialRecord, ...]
-    at: float
-    """A monotonic time, in seconds."""
+    trials: Trials
     stamp: tuple[int, ...]
     """Of the sweep's record; another one means another record."""
+    looked: Done
+    summed_up: Done
+    of: Trials
+    """What the status was made of, which may be older than `trials`."""
+
+    @property
+    def name(self) -> str:
+        """The sweep's name."""
+        return self.status.sweep.name
 
     @property
     def is_over(self) -> bool:
@@ -38,10 +77,11 @@ class Statuses:
 
     Args:
         storage: The sweeps.
+        clock: A monotonic clock, in seconds.
     """
 
-    def __init__(self, storage: Storage) -> None:
-        self._storage = storage
+    def __init__(self, storage: Storage, clock: Callable[[], float] = time.monotonic) -> None:
+        self._storage, self._clock = storage, clock
         self._seen: dict[str, Seen] = {}
         self._locks: dict[str, threading.Lock] = {}
         self._lock = threading.Lock()
@@ -57,23 +97,33 @@ class Statuses:
             lock = self._locks.setdefault(name, threading.Lock())
         # Of many that ask at once, one reads.
         with lock:
-            stamp = sweep.record_stamp()
-            known = self._seen.get(name)
-            if known is not None and known.stamp == stamp and self._holds(known, sweep):
-                return known
+            stamp, known = sweep.record_stamp(), self._seen.get(name)
+            if known is not None and known.stamp == stamp and known.status.alive == sweep.is_driven():
+                if known.is_over or not known.looked.is_due(self._clock(), _OLDEST_LOOK_S):
+                    return known
+                is_same = True
+            else:
+                # It began or ended, or nobody has asked for it yet: the status has to be of now.
+                is_same = False
             if not sweep.exists():
                 self.forget(name)
                 raise NotFoundError(f"There is no sweep {name[:80]!r}.", "List the sweeps with `tune-jobs list`.")
-            trials = sweep.read_trials()
-            seen = Seen(status_of(sweep, trials), tuple(trials), time.monotonic(), stamp)
-            self._seen[name] = seen
+            seen = self._seen[name] = self._look(sweep, stamp, known, is_same=is_same)
             return seen
 
-    def _holds(self, known: Seen, sweep: Sweep) -> bool:
-        if known.is_over:
-            # A driver that begins takes the lock before it writes anything.
-            return not sweep.is_driven()
-        return time.monotonic() - known.at < FRESH_S
+    def _look(self, sweep: Sweep, stamp: tuple[int, ...], known: Seen | None, *, is_same: bool) -> Seen:
+        began = self._clock()
+        stamps = sweep.trial_stamps()
+        trials = None if known is None else known.trials
+        if trials is None or trials.stamps != stamps:
+            trials = _read(sweep, stamps, trials)
+        now = self._clock()
+        # To read all of them is not what it takes to follow them.
+        looked = Done(now, 0.0 if known is None else now - began)
+        if known is not None and is_same and (known.of is trials or not known.summed_up.is_due(now, _OLDEST_STATUS_S)):
+            return replace(known, trials=trials, looked=looked)
+        status = status_of(sweep, trials.records)
+        return Seen(status, trials, stamp, looked, Done(self._clock(), self._clock() - now), of=trials)
 
     def all(self) -> list[Seen]:
         """Return all sweeps, by name; those that can't be read give a warning."""
@@ -90,3 +140,18 @@ class Statuses:
         self._seen.pop(name, None)
         with self._lock:
             self._locks.pop(name, None)
+
+
+def _read(sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Trials | None) -> Trials:
+    """Read the records that were written since, and take the others as they were."""
+    before = {} if known is None else {record.trial_id: record for record in known.records}
+    records, scores = [], {}
+    for trial_id, stamp in stamps.items():
+        if known is not None and known.stamps.get(trial_id) == stamp:
+            record, scores[trial_id] = before[trial_id], known.scores[trial_id]
+        else:
+            record = sweep.trial(trial_id).read_record()
+            scored = score_trial(record)
+            scores[trial_id] = None if scored is None else scored.score
+        records.append(record)
+    return Trials(tuple(sorted(records, key=lambda record: record.index)), scores, stamps)

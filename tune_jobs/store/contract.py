@@ -131,6 +131,14 @@ class Sweep(Protocol):
         """
         ...
 
+    def trial_stamps(self) -> Mapping[str, tuple[int, ...]]:
+        """Return what changes whenever a trial's record is written, by id, of all that have one, without reading them.
+
+        Raises:
+            CheckpointError: The trials cannot be listed.
+        """
+        ...
+
     def pack(self, pack_id: str) -> Pack:
         """Return a pack, which need not exist yet.
 
@@ -277,6 +285,14 @@ class Sweep(Protocol):
 
     def current_report(self) -> Path | None:
         """Return the report's page if it was written after the sweep's record, the winner and the films; else None."""
+        ...
+
+    def report_files(self) -> Mapping[str, Path]:
+        """Return the files of the report that was written last, to read only, by their names, such as `figures/a.svg`.
+
+        Raises:
+            CheckpointError: There is a symbolic link in it.
+        """
         ...
 
     def writing_report(self) -> AbstractContextManager[Path]:

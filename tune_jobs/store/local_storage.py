@@ -26,6 +26,9 @@ def sweep_of_trial(folder: Path) -> Sweep | None:
     return sweep if folder.parent.name == TRIALS_FOLDER and sweep.exists() else None
 
 
+_MAX_NAME_BYTES = 255
+
+
 class LocalStorage:
     """A folder with one folder per sweep; implements `Storage`.
 
@@ -38,7 +41,9 @@ class LocalStorage:
 
     def sweep(self, name: str) -> SweepStore:
         """Return the sweep of a name, which need not exist yet."""
-        if "\0" in name or name in ("", ".", "..") or PurePath(name).name != name:
+        is_part = "\0" not in name and name not in ("", ".", "..") and PurePath(name).name == name
+        # What a file system takes; a longer one would be an error of the system.
+        if not is_part or len(name.encode(errors="surrogatepass")) > _MAX_NAME_BYTES:
             raise NotFoundError(f"{name[:80]!r} cannot be a sweep's name.", "List the sweeps with `tune-jobs list`.")
         return SweepStore(self._folder / name)
 

@@ -7,6 +7,7 @@ sweep folder itself, and the folders above it, may be links, because the user wh
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from pathlib import Path
@@ -105,8 +106,17 @@ def parts_of(folder: Path) -> list[Path]:
     Raises:
         CheckpointError: It cannot be read.
     """
+    return [folder / name for name in names_in(folder)]
+
+
+def names_in(folder: Path) -> list[str]:
+    """Return the names in a folder; none if it is not a folder.
+
+    Raises:
+        CheckpointError: It cannot be read.
+    """
     try:
-        return list(folder.iterdir()) if folder.is_dir() else []
+        return os.listdir(folder) if folder.is_dir() else []  # noqa: PTH208 (thousands of paths take long to make)
     except OSError as error:
         raise _unseen(folder, error) from error
 
@@ -115,6 +125,15 @@ def _unseen(path: Path, error: OSError) -> CheckpointError:
     return CheckpointError(
         f"{path} cannot be read: {error.strerror or error}.", "Check the permissions of the folders above it."
     )
+
+
+def stamp_of(path: str | Path) -> tuple[int, ...]:
+    """Return what changes whenever a file is replaced or written; empty: it does not exist, or can't be seen."""
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return ()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def remove_folder(folder: Path) -> None:

@@ -17,6 +17,7 @@ from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 from pydantic import ValidationError
 
@@ -27,7 +28,7 @@ from policies.files import read_regular
 _BEGINNING = re.compile(rb'\{"iteration":\s*(\d{1,18}),')
 """Matches the iteration in a line as it is written; other lines are parsed to find their iteration."""
 _SHOWN_BYTES = 60
-_MAX_BYTES = 2**30
+MAX_BYTES = 2**30
 """The most bytes that are read, enough for a million iterations."""
 
 Scored = tuple[object, object]
@@ -65,7 +66,7 @@ def read_results(path: Path) -> ResultsFile:
         CheckpointError: The file exists but cannot be read at all.
     """
     try:
-        *lines, tail = read_regular(path, _MAX_BYTES).split(b"\n")
+        *lines, tail = read_regular(path, MAX_BYTES).split(b"\n")
     except FileNotFoundError:
         return ResultsFile()
     except OSError as error:
@@ -80,10 +81,31 @@ def read_results(path: Path) -> ResultsFile:
             read.append((number, line, IterationRecord.model_validate_json(line)))
         except ValidationError:
             bad.append(BadLine(number, line, "is no result"))
-    kept = [read[index] for index in _rising([record.iteration for _, _, record in read], strictly=True)]
-    kept = [kept[index] for index in _rising([record.num_env_steps for _, _, record in kept], strictly=False)]
-    bad += _contradictions(read, {number for number, _, _ in kept})
-    return ResultsFile([record for _, _, record in kept], sorted(bad, key=lambda line: line.number), tail)
+    records = [record for _, _, record in read]
+    kept = _agreeing(records)
+    bad += _contradictions(read, {read[index][0] for index in kept})
+    return ResultsFile([records[index] for index in kept], sorted(bad, key=lambda line: line.number), tail)
+
+
+class _Result(Protocol):
+    @property
+    def iteration(self) -> int: ...
+
+    @property
+    def num_env_steps(self) -> int: ...
+
+
+_ResultT = TypeVar("_ResultT", bound=_Result)
+
+
+def agreeing(records: Sequence[_ResultT]) -> list[_ResultT]:
+    """Return as many as possible of which iterations rise and env steps don't fall."""
+    return [records[index] for index in _agreeing(records)]
+
+
+def _agreeing(records: Sequence[_Result]) -> list[int]:
+    kept = _rising([record.iteration for record in records], strictly=True)
+    return [kept[index] for index in _rising([records[index].num_env_steps for index in kept], strictly=False)]
 
 
 def read_scores(path: Path, wanted: Collection[int]) -> dict[int, list[Scored]]:
@@ -94,7 +116,7 @@ def read_scores(path: Path, wanted: Collection[int]) -> dict[int, list[Scored]]:
     """
     found: defaultdict[int, list[Scored]] = defaultdict(list)
     try:
-        lines = read_regular(path, _MAX_BYTES).split(b"\n")[:-1]
+        lines = read_regular(path, MAX_BYTES).split(b"\n")[:-1]
     except FileNotFoundError:
         return found
     except OSError as error:

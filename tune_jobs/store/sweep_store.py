@@ -24,11 +24,13 @@ from tune_jobs.store.ownership import Owner
 from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.places import (
     is_trial_id,
+    names_in,
     parts_of,
     refuse_link,
     refuse_links_in,
     remove_file,
     remove_folder,
+    stamp_of,
     within,
 )
 from tune_jobs.store.probe import Probe, probing
@@ -155,11 +157,7 @@ class SweepStore:
 
     def record_stamp(self) -> tuple[int, ...]:
         """Return the inode, the size and the time of sweep.json."""
-        try:
-            found = self.record_path.lstat()
-        except OSError:
-            return ()
-        return found.st_ino, found.st_size, found.st_mtime_ns
+        return stamp_of(self.record_path)
 
     def write_record(self, record: SweepRecord) -> None:
         """Replace sweep.json."""
@@ -195,6 +193,14 @@ class SweepStore:
         stores = [self.trial(path.name) for path in folders if is_trial_id(path.name)]
         records = [store.read_record() for store in stores if store.record_path.is_file()]
         return sorted(records, key=lambda record: record.index)
+
+    def trial_stamps(self) -> dict[str, tuple[int, ...]]:
+        """Return inode, time and size of each trial.json; see `Sweep.trial_stamps`."""
+        # Of ten thousand trials, several times a second: texts are joined much faster than paths.
+        folder = within(self.folder, names.TRIALS_FOLDER)
+        trial_ids = filter(is_trial_id, names_in(folder))
+        found = ((trial_id, stamp_of(f"{folder}/{trial_id}/{names.TRIAL_RECORD}")) for trial_id in trial_ids)
+        return {trial_id: stamp for trial_id, stamp in found if stamp}
 
     def read_best(self) -> BestRecord:
         """Read best/evaluation.json.
@@ -266,6 +272,13 @@ class SweepStore:
         page = within(self.report_folder, names.REPORT_PAGE)
         shown = [self.record_path, self.best_folder / names.BEST_RECORD, *self.films().values()]
         return page if _not_older([page], shown) else None
+
+    def report_files(self) -> dict[str, Path]:
+        """Return the report's files by their paths in its folder; see `Sweep.report_files`."""
+        folder = refuse_links_in(self.report_folder)
+        # Hidden ones are being written.
+        files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith("."))
+        return {path.relative_to(folder).as_posix(): path for path in files}
 
     @contextlib.contextmanager
     def writing_report(self) -> Iterator[Path]:

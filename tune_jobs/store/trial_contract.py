@@ -10,6 +10,7 @@ from typing import Protocol
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
 from tune_jobs.store.results_file import ResultsFile, Scored
+from tune_jobs.store.results_tail import NewPoints, ResultsMark
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,16 @@ class Trial(Protocol):
 
     def read_iterations(self) -> list[IterationRecord]:
         """Read the results that can be read, with rising iterations; a warning names what is left out.
+
+        Raises:
+            CheckpointError: In the same cases as `read_results`.
+        """
+        ...
+
+    def read_new_points(self, since: ResultsMark) -> NewPoints:
+        """Read the results that were appended since a mark, as points of learning curves, and return the next mark.
+
+        A line that is being appended is no part of them until it is whole.
 
         Raises:
             CheckpointError: In the same cases as `read_results`.

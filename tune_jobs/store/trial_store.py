@@ -25,6 +25,7 @@ from tune_jobs.store.ownership import OwnedFolder
 from tune_jobs.store.places import check_trial_id, checkpoint_iteration, make_folder, parts_of, remove_folder, within
 from tune_jobs.store.record_files import dump, read_record
 from tune_jobs.store.results_file import ResultsFile, Scored, read_results, read_scores
+from tune_jobs.store.results_tail import NewPoints, ResultsMark, read_new_points
 
 _LOG = logging.getLogger(__name__)
 
@@ -109,6 +110,10 @@ class TrialStore(OwnedFolder):
         for bad in found.bad:
             _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
         return found.records
+
+    def read_new_points(self, since: ResultsMark) -> NewPoints:
+        """Read the lines of results.jsonl behind a mark; see `Trial.read_new_points`."""
+        return read_new_points(self.results_path, since)
 
     def scores_of(self, iterations: Collection[int]) -> dict[int, list[Scored]]:
         """Return the scores of some iterations in results.jsonl; see `Trial.scores_of`."""

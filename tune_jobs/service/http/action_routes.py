@@ -57,7 +57,7 @@ def extend(name: str, more: Extend, service: TheService, caller: AChanger) -> Jo
     # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
     waiting = [job for job in service.queue.jobs("waiting", "running", sweep=name) if job.verb == "extend"]
     known = max([spec.num_samples, *(job.arguments["to_num_samples"] for job in waiting)])
-    trials = len(service.statuses.see(name).trials) // max(1, spec.num_samples) * (known + more.num_samples)
+    trials = len(service.statuses.see(name).trials.records) // max(1, spec.num_samples) * (known + more.num_samples)
     limit = service.config.limits.trials
     if trials > limit:
         raise SpecError(f"The sweep would have about {trials:,} trials; here a sweep may have at most {limit:,}.")

@@ -6,7 +6,7 @@ from importlib.metadata import version
 
 from fastapi import FastAPI
 
-from tune_jobs.service.http import action_routes, meta_routes, play_routes, sweep_routes
+from tune_jobs.service.http import action_routes, event_routes, meta_routes, play_routes, sweep_routes
 from tune_jobs.service.http.problems import add_handlers
 from tune_jobs.service.service import Service
 
@@ -24,6 +24,6 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     add_handlers(app)
-    for module in (meta_routes, sweep_routes, action_routes, play_routes):
+    for module in (meta_routes, sweep_routes, action_routes, event_routes, play_routes):
         app.include_router(module.router)
     return app

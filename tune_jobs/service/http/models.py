@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from analysis.records import TrialStatus
 from tune_jobs.service.jobs import MAX_PRIORITY, Job
 from tune_jobs.service.submitting import Submission
+from tune_jobs.service.summaries import SweepSummary
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Priority = Annotated[int, Field(ge=-MAX_PRIORITY, le=MAX_PRIORITY, description="Higher ones go first.")]
@@ -64,30 +64,6 @@ class Counts(BaseModel):
     model_config = ConfigDict(extra="allow")
 
 
-class SweepSummary(BaseModel):
-    """A sweep in a list."""
-
-    name: str
-    state: str = Field(description="created, running, interrupted, completed.")
-    owner: str | None = Field(description="Who submitted it; null: nobody did, here.")
-    note: str
-    tags: list[str]
-    job: Job | None = Field(description="Its job that waits or runs, else its last one.")
-    algorithm: str
-    env: str
-    created_at: float
-    started_at: float | None
-    ended_at: float | None
-    num_trials: int
-    counts: dict[TrialStatus, int]
-    num_env_steps: int
-    max_env_steps: int | None
-    env_steps_per_s: float | None
-    time_left_s: float | None
-    run_time_s: float
-    best: dict[str, Any] | None
-
-
 class SweepPage(BaseModel):
     """A page of sweeps."""
 
@@ -100,6 +76,22 @@ class TrialPage(BaseModel):
 
     trials: list[dict[str, Any]]
     next_cursor: str | None
+
+
+class Curve(BaseModel):
+    """Points of one trial's learning curve, oldest first."""
+
+    iteration: list[int]
+    num_env_steps: list[int]
+    training_return: list[float | None] = Field(description="Mean of the last 100 exploring episodes; null: none yet.")
+    evaluation_return: list[float | None] = Field(description="Mean of greedy episodes; null: not evaluated there.")
+
+
+class CurvesOfSweep(BaseModel):
+    """The learning curves of a sweep."""
+
+    last_event_id: str = Field(description="The event that they are as of.")
+    trials: dict[str, Curve] = Field(description="By the trial's id; trials without results are left out.")
 
 
 class Submitted(BaseModel):

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Response
 
 from analysis.records import TrialRecord
-from analysis.selection import score_trial
 from policies.errors import NotFoundError
 from tune_jobs.service.http.caller import AChanger, ASubmitter, TheService
 from tune_jobs.service.http.models import (
@@ -17,15 +16,13 @@ from tune_jobs.service.http.models import (
     Planned,
     Submitted,
     SweepPage,
-    SweepSummary,
     TrialPage,
 )
 from tune_jobs.service.http.pages import page_of
 from tune_jobs.service.http.problems import NotNowError, TooManyError
-from tune_jobs.service.jobs import Job
-from tune_jobs.service.labels import NOTHING, Label
+from tune_jobs.service.labels import NOTHING
 from tune_jobs.service.service import Service
-from tune_jobs.service.statuses import Seen
+from tune_jobs.service.summaries import SweepSummary, jobs_by_sweep, summary, trial_row
 from tune_jobs.sweeps.plain import to_json
 
 router = APIRouter(prefix="/api/v1", tags=["sweeps"])
@@ -98,11 +95,8 @@ def sweeps(
 ) -> SweepPage:
     """List sweeps."""
     labels = service.labels.all()
-    jobs = _jobs_by_sweep(service)
-    found = [
-        _summary(seen, labels.get(seen.status.sweep.name, NOTHING), jobs.get(seen.status.sweep.name))
-        for seen in service.statuses.all()
-    ]
+    jobs = jobs_by_sweep(service.queue.jobs())
+    found = [summary(seen, labels.get(seen.name, NOTHING), jobs.get(seen.name)) for seen in service.statuses.all()]
     wanted = [
         item
         for item in found
@@ -179,43 +173,36 @@ def trials(
     cursor: Cursor = None,
 ) -> TrialPage:
     """List the trials of a sweep."""
-    found = [
-        _trial_row(trial) for trial in service.statuses.see(name).trials if status is None or trial.status == status
-    ]
+    known = service.statuses.see(name).trials
 
-    def key(row: dict[str, Any]) -> Any:
-        value = row["point"].get(sort) if sort in row["point"] else row.get(sort)
+    def key(record: TrialRecord) -> Any:
+        if sort == "score":
+            return known.scores[record.trial_id]
+        value = record.point[sort] if sort in record.point else getattr(record, sort, None)
         return value if value is None or isinstance(value, str | int | float) else str(value)
 
     page, following = page_of(
-        found,
+        (record for record in known.records if status is None or record.status == status),
         key=key,
-        identity=lambda row: str(row["trial_id"]),
+        identity=lambda record: record.trial_id,
         descending=order == "desc",
         cursor=cursor,
         limit=limit,
     )
-    return TrialPage(trials=page, next_cursor=following)
+    return TrialPage(
+        trials=[trial_row(record, known.scores[record.trial_id]) for record in page], next_cursor=following
+    )
 
 
 @router.get("/sweeps/{name}/trials/{trial_id}")
 def trial(name: str, trial_id: str, service: TheService) -> dict[str, Any]:
     """Return one trial."""
-    for item in service.statuses.see(name).trials:
-        if item.trial_id == trial_id:
-            return _trial_row(item)
-    raise NotFoundError(f"Sweep {name} has no trial {trial_id[:80]!r}.", f"It has {_span(service, name)}.")
-
-
-def _trial_row(trial: TrialRecord) -> dict[str, Any]:
-    scored = score_trial(trial)
-    row: dict[str, Any] = to_json(trial)
-    return row | {"score": None if scored is None else scored.score}
-
-
-def _span(service: Service, name: str) -> str:
-    known = [item.trial_id for item in service.statuses.see(name).trials]
-    return f"{known[0]} to {known[-1]}" if known else "none"
+    known = service.statuses.see(name).trials
+    for record in known.records:
+        if record.trial_id == trial_id:
+            return trial_row(record, known.scores[trial_id])
+    span = f"{known.records[0].trial_id} to {known.records[-1].trial_id}" if known.records else "none"
+    raise NotFoundError(f"Sweep {name} has no trial {trial_id[:80]!r}.", f"It has {span}.")
 
 
 @router.get("/sweeps/{name}/trials/{trial_id}/iterations")
@@ -253,41 +240,5 @@ def log(
 
 def summary_of(service: Service, name: str) -> SweepSummary:
     """Return one sweep as a list shows it."""
-    seen = service.statuses.see(name)
-    return _summary(seen, service.labels.of(name), _jobs_by_sweep(service, name).get(name))
-
-
-def _jobs_by_sweep(service: Service, name: str | None = None) -> dict[str, Job]:
-    """Return the job of each sweep that matters: the first that waits or runs, else the last that ended."""
-    chosen: dict[str, Job] = {}
-    for job in service.queue.jobs(sweep=name):
-        known = chosen.get(job.sweep)
-        if known is None or known.state == "ended":
-            chosen[job.sweep] = job
-    return chosen
-
-
-def _summary(seen: Seen, label: Label, job: Job | None) -> SweepSummary:
-    status, record = seen.status, seen.status.sweep
-    env = record.spec.get("env", {})
-    return SweepSummary(
-        name=record.name,
-        state=status.state,
-        owner=label.owner,
-        note=label.note,
-        tags=list(label.tags),
-        job=job,
-        algorithm=str(record.spec.get("algorithm", "")),
-        env=str(env.get("id", "") if isinstance(env, dict) else env),
-        created_at=record.created_at,
-        started_at=record.started_at,
-        ended_at=record.ended_at,
-        num_trials=record.num_trials,
-        counts=status.counts,
-        num_env_steps=status.num_env_steps,
-        max_env_steps=status.max_env_steps,
-        env_steps_per_s=status.env_steps_per_s,
-        time_left_s=status.time_left_s,
-        run_time_s=record.run_time_s,
-        best=None if status.best is None else to_json(status.best),
-    )
+    job = jobs_by_sweep(service.queue.jobs(sweep=name)).get(name)
+    return summary(service.statuses.see(name), service.labels.of(name), job)

@@ -1,0 +1,84 @@
+"""Sweeps and trials as the service answers them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from analysis.records import TrialRecord, TrialStatus
+from tune_jobs.service.jobs import Job
+from tune_jobs.service.labels import Label
+from tune_jobs.service.statuses import Seen
+from tune_jobs.sweeps.plain import to_json
+
+
+class SweepSummary(BaseModel):
+    """A sweep in a list."""
+
+    name: str
+    state: str = Field(description="created, running, interrupted, completed.")
+    owner: str | None = Field(description="Who submitted it; null: nobody did, here.")
+    note: str
+    tags: list[str]
+    job: Job | None = Field(description="Its job that waits or runs, else its last one.")
+    algorithm: str
+    env: str
+    created_at: float
+    started_at: float | None
+    ended_at: float | None
+    num_trials: int
+    counts: dict[TrialStatus, int]
+    num_env_steps: int
+    max_env_steps: int | None
+    env_steps_per_s: float | None
+    time_left_s: float | None
+    run_time_s: float
+    best: dict[str, Any] | None
+
+
+def summary(seen: Seen, label: Label, job: Job | None) -> SweepSummary:
+    """Return a sweep as a list shows it."""
+    status, record = seen.status, seen.status.sweep
+    env = record.spec.get("env", {})
+    return SweepSummary(
+        name=record.name,
+        state=status.state,
+        owner=label.owner,
+        note=label.note,
+        tags=list(label.tags),
+        job=job,
+        algorithm=str(record.spec.get("algorithm", "")),
+        env=str(env.get("id", "") if isinstance(env, dict) else env),
+        created_at=record.created_at,
+        started_at=record.started_at,
+        ended_at=record.ended_at,
+        num_trials=record.num_trials,
+        counts=status.counts,
+        num_env_steps=status.num_env_steps,
+        max_env_steps=status.max_env_steps,
+        env_steps_per_s=status.env_steps_per_s,
+        time_left_s=status.time_left_s,
+        run_time_s=record.run_time_s,
+        best=None if status.best is None else to_json(status.best),
+    )
+
+
+def jobs_by_sweep(jobs: Iterable[Job]) -> dict[str, Job]:
+    """Return the job of each sweep that matters, of jobs in the order in which they came.
+
+    It is the first that waits or runs, else the last that ended.
+    """
+    chosen: dict[str, Job] = {}
+    for job in jobs:
+        known = chosen.get(job.sweep)
+        if known is None or known.state == "ended":
+            chosen[job.sweep] = job
+    return chosen
+
+
+def trial_row(record: TrialRecord, score: float | None) -> dict[str, Any]:
+    """Return a trial's record and its score."""
+    row: dict[str, Any] = to_json(record)
+    return row | {"score": score}

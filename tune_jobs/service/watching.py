@@ -1,0 +1,202 @@
+"""Follow sweeps for clients: one thread for each sweep that somebody watches, however many do."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator
+
+from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.service.curves import Columns
+from tune_jobs.service.event_log import EventLog
+from tune_jobs.service.labels import Labels
+from tune_jobs.service.queue import Queue
+from tune_jobs.service.statuses import Statuses
+from tune_jobs.service.views import ListView, SweepView, View
+from tune_jobs.store.contract import Storage
+
+_log = logging.getLogger(__name__)
+
+LINGER_S = 30.0
+"""How long something is followed when nobody watches it any more: whoever comes back finds what came meanwhile."""
+MOST_UNWATCHED = 32
+"""How many are followed that nobody watches."""
+_MOST_WAIT_S = 5.0
+_SHARE = 0.05
+"""The share of a core that following one thing takes, unless it would be too old then."""
+
+
+class Follower:
+    """Asks a view again and again, in a thread of its own, and logs what has changed.
+
+    Args:
+        what: What is followed, for messages.
+        view: It.
+        log: The events.
+    """
+
+    def __init__(self, what: str, view: View, log: EventLog) -> None:
+        self._what, self._view, self.log = what, view, log
+        self.used_at = time.monotonic()
+        self._looking = threading.Lock()
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def begin(self) -> None:
+        """Look once, and go on in the thread; who comes meanwhile waits, and later calls do nothing.
+
+        Raises:
+            NotFoundError: There is nothing to be followed.
+        """
+        self.used_at = time.monotonic()
+        with self._looking:
+            if self._thread is None:
+                self.log.add(self._view.changes())
+                self._thread = threading.Thread(target=self._run, name=f"watch {self._what}", daemon=True)
+                self._thread.start()
+
+    def end(self) -> None:
+        """Let the thread and the log end; may be called more than once."""
+        self._over.set()
+        self.log.end()
+
+    def join(self) -> None:
+        """Wait for the end of the thread."""
+        if self._thread is not None:
+            self._thread.join()
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody watches."""
+        return self.log.num_listeners > 0
+
+    def curves(self, most: int) -> tuple[str, dict[str, Columns]]:
+        """Return the id of the last event and, of a sweep, the curves as of then: at most so many points a trial."""
+        with self._looking:
+            curves = self._view.curves.columns(most) if isinstance(self._view, SweepView) else {}
+            return self.log.last_id, curves
+
+    def _run(self) -> None:
+        wait_s = self._view.interval_s
+        while not self._over.wait(wait_s):
+            began = time.monotonic()
+            if self.is_watched:
+                self.used_at = began
+            elif began - self.used_at > LINGER_S:
+                break
+            try:
+                with self._looking:
+                    self.log.add(self._view.changes())
+            except NotFoundError as error:
+                if not isinstance(error, CheckpointError):
+                    self.log.add([("deleted", {})])
+                    break
+                _log.warning("%s can't be followed just now: %s", self._what, error)
+                wait_s = _MOST_WAIT_S
+            except Exception:  # noqa: BLE001 (such as a database that is away for a while)
+                _log.exception("%s could not be looked at; it is tried again.", self._what)
+                wait_s = _MOST_WAIT_S
+            else:
+                wait_s = min(_MOST_WAIT_S, max(self._view.interval_s, (time.monotonic() - began) / _SHARE))
+        self.end()
+
+
+class Watching:
+    """What is watched; threads may share it.
+
+    Args:
+        storage: The sweeps.
+        statuses: What they look like.
+        queue: The jobs.
+        labels: What people say of sweeps.
+        max_watchers: How many clients may watch at once.
+    """
+
+    def __init__(self, storage: Storage, statuses: Statuses, queue: Queue, labels: Labels, max_watchers: int) -> None:
+        self._storage, self._statuses, self._queue, self._labels = storage, statuses, queue, labels
+        # Numbers of events begin anew with the service: this tells whose they are.
+        self._start, self._numbers = f"{time.time_ns():x}{os.getpid():x}", itertools.count(1)
+        self.max_watchers = max_watchers
+        self._num_watchers = 0
+        self._watches: dict[str | None, Follower] = {}
+        self._lock = threading.Lock()
+        self._is_closed = False
+
+    def sweep(self, name: str) -> Follower:
+        """Return what follows a sweep.
+
+        Raises:
+            NotFoundError: There is none, or it is damaged.
+        """
+        return self._watch(name)
+
+    def sweeps(self) -> Follower:
+        """Return what follows the list of sweeps."""
+        return self._watch(None)
+
+    @contextlib.contextmanager
+    def place(self) -> Iterator[bool]:
+        """Take the place of a client for the block; gives whether there was one."""
+        with self._lock:
+            is_free = self._num_watchers < self.max_watchers
+            self._num_watchers += is_free
+        try:
+            yield is_free
+        finally:
+            with self._lock:
+                self._num_watchers -= is_free
+
+    @property
+    def num_watchers(self) -> int:
+        """How many clients watch."""
+        return self._num_watchers
+
+    def close(self) -> None:
+        """End all streams, and those that come later at once."""
+        with self._lock:
+            self._is_closed = True
+            watches = list(self._watches.values())
+        for watch in watches:
+            watch.end()
+        for watch in watches:
+            watch.join()
+
+    def _watch(self, name: str | None) -> Follower:
+        with self._lock:
+            watch = self._watches.get(name)
+            if watch is None or watch.log.has_ended:
+                self._make_room()
+                watch = self._watches[name] = self._made(name)
+                if self._is_closed:
+                    watch.end()
+        try:
+            watch.begin()
+        except BaseException:
+            with self._lock:
+                if self._watches.get(name) is watch:
+                    del self._watches[name]
+            raise
+        return watch
+
+    def _made(self, name: str | None) -> Follower:
+        if name is None:
+            whole = ListView(self._statuses, self._queue, self._labels)
+            return Follower("the list of sweeps", whole, EventLog(self._start, self._numbers))
+        view = SweepView(name, self._storage, self._statuses, self._queue, self._labels)
+        return Follower(f"sweep {name}", view, EventLog(self._start, self._numbers, greeting=view.greeting))
+
+    def _make_room(self) -> None:
+        """End those that nobody has watched for the longest, and forget those that have ended."""
+        self._watches = {name: watch for name, watch in self._watches.items() if not watch.log.has_ended}
+        unwatched = sorted((item for item in self._watches.items() if not item[1].is_watched), key=_last_used)
+        for name, watch in unwatched[: max(0, len(unwatched) - MOST_UNWATCHED + 1)]:
+            watch.end()
+            del self._watches[name]
+
+
+def _last_used(item: tuple[str | None, Follower]) -> float:
+    return item[1].used_at
