@@ -71,12 +71,15 @@ def domains() -> str:
 
 def commands() -> str:
     """What `--help` prints of each command."""
-    parts = []
-    for name, command in cli.commands.items():
-        # The terminal's width is no business of a page.
-        with click.Context(command, info_name=f"tune-jobs {name}", terminal_width=100) as context:
-            parts.append(f"### {name}\n\n```text\n{command.get_help(context)}\n```")
-    return "\n\n".join(parts)
+    return "\n\n".join(_help(name, command) for name, command in cli.commands.items())
+
+
+def _help(name: str, command: click.Command) -> str:
+    # The terminal's width is no business of a page.
+    with click.Context(command, info_name=f"tune-jobs {name}", terminal_width=100) as context:
+        parts = [f"### {name}\n\n```text\n{command.get_help(context)}\n```"]
+    inner = command.commands.items() if isinstance(command, click.Group) else ()
+    return "\n\n".join([*parts, *(_help(f"{name} {each}", one) for each, one in inner)])
 
 
 def presets() -> str:

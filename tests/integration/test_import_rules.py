@@ -21,7 +21,7 @@ def modules_after(code: str) -> set[str]:
     ("code", "absent"),
     [
         # Help, validation and dry runs are instant.
-        ("import tune_jobs.cli.commands", HEAVY | {"numpy", "pydantic"}),
+        ("import tune_jobs.cli.commands", HEAVY | {"numpy", "pydantic", "sqlalchemy", "fastapi", "starlette"}),
         # What the guard's child begins with, beside its parent, which imports the rest.
         ("import policies.packed.envs.make", HEAVY | {"pydantic", "PIL"}),
         ("from tune_jobs.spec.file import load_spec; load_spec('cartpole-ppo')", HEAVY),

@@ -266,8 +266,9 @@ def test_a_hundred_idle_streams_are_one_thread(live: Live, store: SweepStore) ->
 
 
 def open_stream(live: Live) -> socket.socket:
-    made = socket.create_connection(("127.0.0.1", int(live.url.rpartition(":")[2])), timeout=30)
-    made.sendall(b"GET /api/v1/sweeps/mine/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+    host = live.url.removeprefix("http://")
+    made = socket.create_connection(("127.0.0.1", int(host.rpartition(":")[2])), timeout=30)
+    made.sendall(f"GET /api/v1/sweeps/mine/events HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
     return made
 
 

@@ -227,6 +227,15 @@ def test_no_id_leads_elsewhere(sweep: Sweep, name: str) -> None:
         sweep.pack(name.replace("t0", "px"))
 
 
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../mine", "mine/", "/mine", "mine\0", "m" * 256, "\N{PILE OF POO}" * 64]
+)
+def test_no_name_leads_elsewhere(harness: Harness, sweep: Sweep, name: str) -> None:
+    for ask in (harness.storage().sweep, harness.storage().new_sweep, harness.storage().is_taken):
+        with pytest.raises(NotFoundError):
+            ask(name)
+
+
 @pytest.mark.parametrize("trial_id", ["../t0000", "t0000/../../../../x", "/x"])
 def test_no_record_names_a_place(sweep: Sweep, trial: Trial, trial_id: str) -> None:
     trial.write_checkpoint(make_checkpoint(1), fill)

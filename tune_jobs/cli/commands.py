@@ -33,6 +33,7 @@ from tune_jobs.cli.base import (
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
 from tune_jobs.cli.result_commands import compare, export, importance, reproduce
 from tune_jobs.cli.serve_command import serve
+from tune_jobs.cli.token_commands import token
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -327,7 +328,7 @@ def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
     cli_output.show_paths({"report": path}, as_json=as_json)
 
 
-for _command in (compare, export, importance, reproduce, serve):
+for _command in (compare, export, importance, reproduce, serve, token):
     cli.add_command(_command)
 
 

@@ -105,11 +105,12 @@ def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
         return
     table = make_table("sweep", "state", "trials", "created")
     for status in statuses:
-        table.add_row(status.sweep.name, status.state, status.told_counts, _local_time(status.sweep.created_at))
+        table.add_row(status.sweep.name, status.state, status.told_counts, local_time(status.sweep.created_at))
     console.print(table)
 
 
-def _local_time(unix_time: float) -> str:
+def local_time(unix_time: float) -> str:
+    """Return a time, given in seconds since 1970, for people of this machine's time zone."""
     try:
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(unix_time))
     except (ValueError, OverflowError, OSError):

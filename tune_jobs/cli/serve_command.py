@@ -5,20 +5,23 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
+from pathlib import Path
 
 import click
 
 from tune_jobs.cli.base import storage_option
+
+database_option = click.option(
+    "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
+    help="postgresql://USER@HOST/NAME.  [default: an SQLite file in the storage folder]",
+)  # fmt: skip
 
 
 @click.command()
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any free port.")
 @click.option("--address", metavar="ADDRESS", help="Ray cluster that sweeps run on; without it, this machine.")
-@click.option(
-    "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
-    help="postgresql://USER@HOST/NAME.  [default: an SQLite file in the storage folder]",
-)  # fmt: skip
+@database_option
 @click.option("--env", "envs", multiple=True, metavar="PATTERN", help="Env ids that sweeps may name; may be repeated.")
 @click.option(
     "--allow-module", "modules", multiple=True, metavar="NAME",
@@ -38,6 +41,13 @@ from tune_jobs.cli.base import storage_option
 @click.option("--run-command", metavar="COMMAND", help="Run when something happens, with the message as its input.")
 @click.option("--stuck", "stuck_s", type=click.FloatRange(1), default=900.0, show_default=True, metavar="SECONDS",
               help="A running sweep that takes no env step for so long is told to be stuck.")  # fmt: skip
+@click.option("--public-name", "public_names", multiple=True, metavar="NAME[:PORT]",
+              help="A name that the service is asked for by, besides this machine's own. May be repeated.")  # fmt: skip
+@click.option("--require-token", is_flag=True, help="Let nobody in without a token, on this machine neither.")
+@click.option("--behind-proxy", is_flag=False, flag_value="loopback", metavar="[ADDRESS]",
+              help="Believe X-Forwarded-For and -Proto of a proxy on this machine, or at ADDRESS.")  # fmt: skip
+@click.option("--tls-certificate", type=click.Path(path_type=Path), metavar="FILE", help="Certificate chain, PEM.")
+@click.option("--tls-key", type=click.Path(path_type=Path), metavar="FILE", help="The certificate's key, PEM.")
 @storage_option
 def serve(
     *,
@@ -53,9 +63,17 @@ def serve(
     webhook_secret: str | None,
     run_command: str | None,
     stuck_s: float,
+    public_names: tuple[str, ...],
+    require_token: bool,
+    behind_proxy: str | None,
+    tls_certificate: Path | None,
+    tls_key: Path | None,
     storage: str | None,
 ) -> None:
-    """Run the service: a queue of sweeps, a page that shows them live, and REST over the same sweep folder."""
+    """Run the service: a queue of sweeps, a page that shows them live, and REST over the same sweep folder.
+
+    On 127.0.0.1 it needs no token; anywhere else it does: `tune-jobs token make`.
+    """
     from tune_jobs.service.config import ServiceConfig
     from tune_jobs.service.serve import serve as run
     from tune_jobs.sweeps.storage import storage_folder
@@ -66,5 +84,7 @@ def serve(
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,
         webhooks=webhooks, webhook_secret=webhook_secret, stuck_s=stuck_s,
         command=tuple(shlex.split(run_command or "")),
+        public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
+        tls_certificate=tls_certificate, tls_key=tls_key,
     )  # fmt: skip
     run(config, lambda url: click.echo(f"tune-jobs serves {config.storage} at {url}"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import re
 from dataclasses import dataclass, field
@@ -12,7 +13,18 @@ from tune_jobs.service.events import STUCK_S
 from tune_jobs.service.job_files import SERVICE_FOLDER
 from tune_jobs.service.telling import COMMAND, check_target
 
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
+LOOPBACK = "loopback"
+"""As the address of a proxy: one on this machine."""
+
+
+def is_loopback(address: str) -> bool:
+    """Whether an address can be reached from its own machine alone."""
+    if address == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True)
@@ -20,6 +32,8 @@ class Limits:
     """What one request or one person may take; None: no limit."""
 
     body_bytes: int = 1_000_000
+    body_s: float = 30.0
+    """How long a body may take to arrive."""
     trials: int = 10_000
     """Of one sweep."""
     env_steps: int | None = None
@@ -51,6 +65,11 @@ class ServiceConfig:
         command: A command that is run when something happens, with its arguments; none: nothing is run.
         stuck_s: How long a running sweep may take no env step before it counts as stuck.
         drain_s: How long sweeps may take to save when the service ends.
+        public_names: Names, or names and ports, that it is asked for by, besides this machine's own.
+        require_token: Whether a token is needed on this machine, too.
+        behind_proxy: The address of the proxy whose headers are believed; `loopback`: one on this machine.
+        tls_certificate: A file with the certificate and those above it, PEM.
+        tls_key: A file with its key, PEM.
     """
 
     storage: Path
@@ -67,6 +86,11 @@ class ServiceConfig:
     command: tuple[str, ...] = ()
     stuck_s: float = STUCK_S
     drain_s: float = 60.0
+    public_names: tuple[str, ...] = ()
+    require_token: bool = False
+    behind_proxy: str | None = None
+    tls_certificate: Path | None = None
+    tls_key: Path | None = None
 
     def __post_init__(self) -> None:
         for url in self.webhooks:
@@ -76,6 +100,19 @@ class ServiceConfig:
                 re.compile(pattern)
             except re.error as error:
                 raise SpecError(f"{pattern!r} is no pattern of env ids: {error}.") from error
+        if self.behind_proxy not in (None, LOOPBACK):
+            try:
+                ipaddress.ip_address(str(self.behind_proxy))
+            except ValueError as error:
+                raise SpecError(
+                    f"{self.behind_proxy!r} is no address of a proxy.",
+                    "Give --behind-proxy alone for one on this machine, else its IP address.",
+                ) from error
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise SpecError(
+                "TLS needs a certificate and its key; one of them is missing.",
+                "Give both --tls-certificate and --tls-key.",
+            )
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -90,7 +127,17 @@ class ServiceConfig:
     @property
     def is_local(self) -> bool:
         """Whether only this machine can reach it."""
-        return self.host in LOOPBACK
+        return is_loopback(self.host)
+
+    @property
+    def needs_token(self) -> bool:
+        """Whether nobody comes in without a token: others than the users of this machine can reach it."""
+        return not self.is_local or self.require_token or self.behind_proxy is not None or self.has_public_name
+
+    @property
+    def has_public_name(self) -> bool:
+        """Whether it is asked for under names that this machine has elsewhere."""
+        return not all(is_loopback(re.sub(r":\d+$", "", name).strip("[]").lower()) for name in self.public_names)
 
     def allows_env(self, env_id: str) -> bool:
         """Whether a spec may name an environment; that its module is allowed is checked elsewhere."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import logging
 import socket
+import ssl
 from collections.abc import Callable
 from typing import Any
 
 import uvicorn
 
 from policies.errors import CannotRunError
+from tune_jobs.service.access.hosts import public_host
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.http.app import make_app
 from tune_jobs.service.service import Service, opened
@@ -28,14 +30,22 @@ def serve(config: ServiceConfig, on_start: Callable[[str], None] = lambda _: Non
         on_start: Called with the URL, once requests are taken.
 
     Raises:
-        CannotRunError: It can't listen there, another service has the storage, or the database can't be used.
+        SpecError: A public name is none.
+        CannotRunError: It can't listen there, another service has the storage, the database or the certificate can't
+            be used, or a token is needed and there is none.
     """
+    for name in config.public_names:
+        public_host(name)
+    _check_tls(config)
     listening = listening_socket(config)
     with listening, opened(config) as service:
-        app = make_app(service)
         port = listening.getsockname()[1]
+        app = make_app(service)
         host = f"[{config.host}]" if ":" in config.host else config.host
-        server = Server(service, config, app, lambda: on_start(f"http://{host}:{port}"))
+        scheme = "http" if config.tls_certificate is None else "https"
+        if not config.is_local and scheme == "http" and config.behind_proxy is None:
+            _log.warning("Without TLS, who listens on the network reads tokens. Give --tls-certificate and --tls-key.")
+        server = Server(service, config, app, lambda: on_start(f"{scheme}://{host}:{port}"))
         # The server raises the signal that ended it once more; it has done what the signal asked for.
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
@@ -59,6 +69,10 @@ class Server(uvicorn.Server):
                 access_log=False,
                 lifespan="off",
                 server_header=False,
+                # The access layer reads these headers, from the one proxy that the operator has named.
+                proxy_headers=False,
+                ssl_certfile=config.tls_certificate,
+                ssl_keyfile=None if config.tls_key is None else str(config.tls_key),
                 timeout_graceful_shutdown=5,
                 timeout_keep_alive=30,
                 h11_max_incomplete_event_size=64 * 1024,
@@ -81,6 +95,25 @@ class Server(uvicorn.Server):
         _log.info("Running sweeps save, for at most %g s.", self._drain_s)
         if not await anyio.to_thread.run_sync(self._service.supervisor.drain, self._drain_s):
             _log.warning("Some sweeps did not save in time; they run on, and the next start finds them.")
+
+
+def _check_tls(config: ServiceConfig) -> None:
+    if config.tls_certificate is None or config.tls_key is None:
+        return
+    told = f"{config.tls_certificate} and {config.tls_key}"
+    try:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        # A key with a password would ask for it, at a terminal that a service has not.
+        context.load_cert_chain(config.tls_certificate, config.tls_key, password=lambda: "")
+    except ssl.SSLError as error:
+        raise CannotRunError(
+            f"{told} can't be used as certificate and key: {error.reason or error}.",
+            "Give PEM files that belong together, the key without a password.",
+        ) from error
+    except OSError as error:
+        raise CannotRunError(
+            f"{told} can't be read: {error.strerror}.", "Check that both are there and may be read by the service."
+        ) from error
 
 
 def listening_socket(config: ServiceConfig) -> socket.socket:

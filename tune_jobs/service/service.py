@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ from sqlalchemy import Engine
 
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import local_machine
+from tune_jobs.service.access.audit import Audit
+from tune_jobs.service.access.gate import Gate
+from tune_jobs.service.access.tokens import Tokens
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database, sqlite_url
 from tune_jobs.service.events import Watch
@@ -33,6 +37,7 @@ class Service:
 
     config: ServiceConfig
     engine: Engine
+    gate: Gate
     storage: Storage
     queue: Queue
     labels: Labels
@@ -47,11 +52,13 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
     """Open the database and run the queue for the block; sweeps that run at its end live on.
 
     Raises:
-        CannotRunError: Another service has this storage folder, it can't be written, or the database can't be used.
+        CannotRunError: Another service has this storage folder, it can't be written, the database can't be used, or
+            nobody could come in.
     """
     with _alone(config.folder):
         engine = open_database(config.database or sqlite_url(config.folder / "service.db"))
         try:
+            gate = _gate(config, engine)
             storage, queue, labels = open_storage(config.storage), Queue(engine), Labels(engine)
             statuses = Statuses(storage)
             # A cluster shares its CPUs among the trials of all sweeps by itself.
@@ -69,6 +76,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                 yield Service(
                     config=config,
                     engine=engine,
+                    gate=gate,
                     storage=storage,
                     queue=queue,
                     labels=labels,
@@ -79,6 +87,25 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                 )
         finally:
             engine.dispose()
+
+
+def _gate(config: ServiceConfig, engine: Engine) -> Gate:
+    tokens = Tokens(engine)
+    if config.needs_token and not tokens.any_valid():
+        raise CannotRunError(
+            f"Others than this machine's users can reach {config.host}, so a token is needed, and there is none."
+            if not config.is_local
+            else "A token is needed, and there is none.",
+            f"Make one: tune-jobs token make NAME --role admin{_where(config)}",
+        )
+    return Gate(config, tokens, Audit(engine))
+
+
+def _where(config: ServiceConfig) -> str:
+    if config.database is None:
+        return f" --storage {shlex.quote(str(config.storage))}"
+    # Its password stays out of the terminal.
+    return " --database URL"
 
 
 @contextlib.contextmanager

@@ -8,7 +8,8 @@ from typing import Any
 from fastapi import APIRouter
 
 from policies.errors import SpecError
-from tune_jobs.service.http.caller import AChanger, Caller, TheService
+from tune_jobs.service.access.callers import Caller
+from tune_jobs.service.http.caller import AChanger, TheService
 from tune_jobs.service.http.models import Extend, Replicate
 from tune_jobs.service.http.problems import NotNowError
 from tune_jobs.service.jobs import Job, Verb

@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 from importlib.metadata import version
+from typing import Any
 
 from fastapi import FastAPI
+from starlette.types import ASGIApp
+from typing_extensions import override
 
-from tune_jobs.service.http import action_routes, event_routes, meta_routes, play_routes, sweep_routes
+from tune_jobs.service.access.middleware import AccessMiddleware
+from tune_jobs.service.http import access_routes, action_routes, event_routes, meta_routes, play_routes, sweep_routes
 from tune_jobs.service.http.problems import add_handlers
 from tune_jobs.service.service import Service
 
 
+class _App(FastAPI):
+    """An application with the access layer outside of everything else, answers to unexpected errors among it."""
+
+    def __init__(self, service: Service, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._gate = service.gate
+
+    @override
+    def build_middleware_stack(self) -> ASGIApp:
+        return AccessMiddleware(super().build_middleware_stack(), self._gate)
+
+
 def make_app(service: Service) -> FastAPI:
     """Return the application, with all routes."""
-    app = FastAPI(
+    app = _App(
+        service,
         title="tune-jobs",
         version=version("tune-jobs"),
         summary="Hyperparameter search for reinforcement learning.",
@@ -24,6 +41,6 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     add_handlers(app)
-    for module in (meta_routes, sweep_routes, action_routes, event_routes, play_routes):
+    for module in (access_routes, meta_routes, sweep_routes, action_routes, event_routes, play_routes):
         app.include_router(module.router)
     return app

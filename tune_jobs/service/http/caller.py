@@ -1,37 +1,14 @@
-"""Who asks, and what they may do."""
+"""What routes depend on: the service, and who asks for what they may do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal, cast
+from typing import Annotated, cast
 
 from fastapi import Depends, HTTPException, Request
 
-from tune_jobs.service.labels import Label
+from tune_jobs.service.access.callers import RANK, Caller
+from tune_jobs.service.access.credentials import CHALLENGE
 from tune_jobs.service.service import Service
-
-Role = Literal["viewer", "submitter", "admin"]
-_RANK: dict[Role, int] = {"viewer": 0, "submitter": 1, "admin": 2}
-
-
-@dataclass(frozen=True)
-class Caller:
-    """Who asks.
-
-    Args:
-        name: The token's name; on this machine, without a token, `local`.
-        role: A viewer looks, a submitter submits and changes their own sweeps, an admin changes all.
-    """
-
-    name: str
-    role: Role
-
-    def may_change(self, label: Label) -> bool:
-        """Whether they may change a sweep."""
-        return self.role == "admin" or (self.role == "submitter" and label.owner == self.name)
-
-
-LOCAL = Caller("local", "admin")
 
 
 def service_of(request: Request) -> Service:
@@ -40,15 +17,17 @@ def service_of(request: Request) -> Service:
 
 
 def caller_of(request: Request) -> Caller:
-    """Return who asks, as the access layer found."""
-    caller: Caller = getattr(request.state, "caller", LOCAL)
+    """Return who asks, as the layer around the application found; it finds nobody where no token is needed."""
+    caller: Caller | None = getattr(request.state, "caller", None)
+    if caller is None:
+        raise HTTPException(401, "A token is needed here.", {"WWW-Authenticate": CHALLENGE})
     return caller
 
 
 def submitter_of(request: Request) -> Caller:
     """Return who asks, who may submit."""
     caller = caller_of(request)
-    if _RANK[caller.role] < _RANK["submitter"]:
+    if RANK[caller.role] < RANK["submitter"]:
         raise HTTPException(403, f"The token {caller.name!r} is a viewer's: it may look, and change nothing.")
     return caller
 
@@ -62,7 +41,21 @@ def changer_of(request: Request, name: str) -> Caller:
     return caller
 
 
+def admin_of(request: Request) -> Caller:
+    """Return who asks, who is an admin."""
+    caller = caller_of(request)
+    if caller.role != "admin":
+        raise HTTPException(403, f"The token {caller.name!r} is a {caller.role}'s; only admins may do this.")
+    return caller
+
+
+def set_audit_target(request: Request, sweep: str) -> None:
+    """Say which sweep a request is about, for the audit log, where the path does not."""
+    request.state.audit_target = sweep
+
+
 TheService = Annotated[Service, Depends(service_of)]
 TheCaller = Annotated[Caller, Depends(caller_of)]
 ASubmitter = Annotated[Caller, Depends(submitter_of)]
+AnAdmin = Annotated[Caller, Depends(admin_of)]
 AChanger = Annotated[Caller, Depends(changer_of)]

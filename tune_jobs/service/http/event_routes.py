@@ -41,7 +41,7 @@ def curves(
     return Response(body, media_type="application/json")
 
 
-@router.get("/sweeps/{name}/events", responses=_STREAM, response_class=EventStream)
+@router.get("/sweeps/{name}/events", status_code=200, responses=_STREAM, response_class=EventStream)
 def sweep_events(
     name: str, service: TheService, last_event_id: LastId = None, last_id: LastIdAgain = None
 ) -> EventStream:
@@ -54,7 +54,7 @@ def sweep_events(
     return EventStream(service.watching, service.watching.sweep(name).log, last_event_id or last_id or None)
 
 
-@router.get("/events", responses=_STREAM, response_class=EventStream)
+@router.get("/events", status_code=200, responses=_STREAM, response_class=EventStream)
 def list_events(service: TheService, last_event_id: LastId = None, last_id: LastIdAgain = None) -> EventStream:
     """Tell what changes in the list of sweeps, as server-sent events.
 

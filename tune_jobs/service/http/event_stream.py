@@ -10,7 +10,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from tune_jobs.service.event_log import EventLog
-from tune_jobs.service.http.problems import problem
+from tune_jobs.service.problem_documents import problem
 from tune_jobs.service.watching import Watching
 
 HEARTBEAT_S = 15.0

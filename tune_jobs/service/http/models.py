@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from tune_jobs.service.access.audit import Entry
+from tune_jobs.service.access.callers import Role
 from tune_jobs.service.jobs import MAX_PRIORITY, Job
 from tune_jobs.service.submitting import Submission
 from tune_jobs.service.summaries import SweepSummary
@@ -119,3 +121,23 @@ class Ready(BaseModel):
 
     status: Literal["ready", "draining", "not ready"]
     problems: list[str]
+
+
+class Login(_Request):
+    """A token, in exchange for a cookie."""
+
+    token: str = Field(min_length=1, max_length=500, description="The token, as it was shown when it was made.")
+
+
+class LoggedIn(BaseModel):
+    """Who has logged in."""
+
+    name: str
+    role: Role
+
+
+class AuditPage(BaseModel):
+    """A page of the audit log."""
+
+    entries: list[Entry]
+    next_cursor: str | None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from http import HTTPStatus
-from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -13,10 +12,11 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from policies.errors import CannotRunError, CheckpointError, EnvFailedError, NotFoundError, SpecError, TuneJobsError
+from tune_jobs.service.access.refusal import RefusedError
+from tune_jobs.service.problem_documents import problem
 from tune_jobs.service.queue import KeyUsedError
 from tune_jobs.spec.problems import WrongSpecError
 
-MEDIA_TYPE = "application/problem+json"
 _log = logging.getLogger(__name__)
 
 
@@ -41,19 +41,6 @@ _STATUS: tuple[tuple[type[TuneJobsError], HTTPStatus], ...] = (
 )
 
 
-def problem(status: int, detail: str, **more: Any) -> JSONResponse:
-    """Return a problem document.
-
-    Args:
-        status: The HTTP status.
-        detail: What is wrong, as a sentence.
-        more: Further members, such as `hint` and `problems`; those that are empty are left out.
-    """
-    content = {"type": "about:blank", "title": HTTPStatus(status).phrase, "status": status, "detail": detail}
-    content |= {name: value for name, value in more.items() if value}
-    return JSONResponse(content, status_code=status, media_type=MEDIA_TYPE)
-
-
 def add_handlers(app: FastAPI) -> None:
     """Let all errors of an app be problem documents."""
 
@@ -62,6 +49,10 @@ def add_handlers(app: FastAPI) -> None:
         status = next((code for kind, code in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
         problems = [item._asdict() for item in error.problems] if isinstance(error, WrongSpecError) else []
         return problem(status, error.message, hint=error.hint, problems=problems)
+
+    @app.exception_handler(RefusedError)
+    async def _refused(_: Request, error: RefusedError) -> JSONResponse:
+        return error.answer()
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:

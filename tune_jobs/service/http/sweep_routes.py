@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 
 from analysis.records import TrialRecord
 from policies.errors import NotFoundError
-from tune_jobs.service.http.caller import AChanger, ASubmitter, TheService
+from tune_jobs.service.http.caller import AChanger, ASubmitter, TheService, set_audit_target
 from tune_jobs.service.http.models import (
     Change,
     NewSweep,
@@ -44,12 +44,15 @@ def submit(
     new: NewSweep,
     service: TheService,
     caller: ASubmitter,
+    *,
+    request: Request,
     response: Response,
     idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
 ) -> Submitted:
     """Write a sweep, and let it wait for its turn."""
     _check_room(service, caller.name)
     job, is_new = service.submitter.submit(new.submission(), owner=caller.name, key=idempotency_key)
+    set_audit_target(request, job.sweep)
     if is_new:
         service.labels.change(job.sweep, owner=caller.name, note=new.note, tags=new.tags)
         service.supervisor.wake()
