@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 from fake_sweeps import RunCommand
 from sweep_folders import make_sweep_folder
@@ -261,7 +262,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_command_takes_json_and_has_a_one_line_help() -> None:
-    for name, command in cli.commands.items():
+    groups = [command for command in cli.commands.values() if isinstance(command, click.Group)]
+    inner = {f"{group.name} {name}": command for group in groups for name, command in group.commands.items()}
+    outer = {name: command for name, command in cli.commands.items() if not isinstance(command, click.Group)}
+    for name, command in (outer | inner).items():
         assert any("--json" in parameter.opts for parameter in command.params), name
         assert command.help, name
 

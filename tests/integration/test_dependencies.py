@@ -16,6 +16,7 @@ from tests.narrowing import present
 OWN = {"policies", "analysis", "tune_jobs"}
 # Why something is required that nothing here imports; by distribution.
 NOT_IMPORTED = {
+    "psycopg": "SQLAlchemy loads it for PostgreSQL",
     "build": "the tests build the wheel by `python -m build`",
     "mkdocs-material": "the theme of the site",
     "mkdocstrings-python": "a plugin of MkDocs",

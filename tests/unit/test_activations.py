@@ -44,7 +44,8 @@ def test_all_compute_the_same_function(name: str) -> None:
     portable = forward._ACTIVATION_FUNCTIONS[name]
     assert portable is None or np.allclose(portable(x.copy()), expected, rtol=1e-6, atol=1e-6)
     packed = networks._ACTIVATIONS[name]
-    assert packed.forward is None or np.array_equal(packed.forward(torch.from_numpy(x.copy())).numpy(), expected)
+    if packed.forward is not None:
+        assert_as_close(name, packed.forward(torch.from_numpy(x.copy())), torch.from_numpy(expected))
     assert packed.of_few is None or np.allclose(packed.of_few(x.copy()), expected, rtol=1e-6, atol=1e-6)
     assert expected[0, VALUES.index(0.0)] == 0.0  # padding stays zero
 
@@ -57,4 +58,15 @@ def test_the_gradients_of_packs_are_those_of_torch(name: str) -> None:
     out.sum().backward()
     kept = (x if packed.keeps_input else out).detach()
     found = torch.ones_like(kept) if packed.backward is None else packed.backward(torch.ones_like(kept), kept)
-    assert torch.equal(found, present(x.grad))
+    assert_as_close(name, found, present(x.grad))
+
+
+def assert_as_close(name: str, found: torch.Tensor, expected: torch.Tensor) -> None:
+    """Check that numbers are torch's own; of silu and elu, which packs write out, but for their last bits.
+
+    A few roundings of float32, each of at most 6e-8 of a number, in a formula of five operations.
+    """
+    if name in ("silu", "elu"):
+        torch.testing.assert_close(found, expected, rtol=5e-7, atol=5e-8)
+    else:
+        assert torch.equal(found, expected)

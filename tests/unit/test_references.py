@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import click
 import pytest
 from click.testing import CliRunner
 from pydantic import BaseModel
@@ -193,6 +194,12 @@ def test_every_command_with_its_options_exists() -> None:
                 if before not in ('"', "'", " ") or rest.startswith(" --"):
                     wrong.add(f"{place}: tune-jobs {name}")
                 continue
+            if isinstance(command, click.Group):
+                inner = command.commands.get(rest.split()[0] if rest.split() else "")
+                if inner is None:
+                    wrong.add(f"{place}: tune-jobs {name}{rest}")
+                    continue
+                command = inner
             options = {option for parameter in command.params for option in parameter.opts} | {"--help"}
             used = set(re.findall(r"(?<!\S)--[a-z-]+", rest))
             wrong |= {f"{place}: {name} {option}" for option in used - options}

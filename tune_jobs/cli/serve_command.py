@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shlex
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from tune_jobs.cli.base import storage_option
+from tune_jobs.cli.base import json_option, storage_option
 
 database_option = click.option(
     "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
@@ -49,6 +50,7 @@ database_option = click.option(
 @click.option("--tls-certificate", type=click.Path(path_type=Path), metavar="FILE", help="Certificate chain, PEM.")
 @click.option("--tls-key", type=click.Path(path_type=Path), metavar="FILE", help="The certificate's key, PEM.")
 @storage_option
+@json_option
 def serve(
     *,
     host: str,
@@ -69,6 +71,7 @@ def serve(
     tls_certificate: Path | None,
     tls_key: Path | None,
     storage: str | None,
+    as_json: bool,
 ) -> None:
     """Run the service: a queue of sweeps, a page that shows them live, and REST over the same sweep folder.
 
@@ -87,4 +90,10 @@ def serve(
         public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
         tls_certificate=tls_certificate, tls_key=tls_key,
     )  # fmt: skip
-    run(config, lambda url: click.echo(f"tune-jobs serves {config.storage} at {url}"))
+
+    def say(url: str) -> None:
+        # One line, as whoever reads it waits for its end.
+        told = json.dumps({"url": url, "storage": str(config.storage)})
+        click.echo(told if as_json else f"serving {config.storage} at {url}")
+
+    run(config, say)

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from policies.errors import SpecError
+from tune_jobs.service.database.opening import sqlite_url
 from tune_jobs.service.events import STUCK_S
-from tune_jobs.service.job_files import SERVICE_FOLDER
+from tune_jobs.service.job_files import own_database, own_folder
 from tune_jobs.service.telling import COMMAND, check_target
 
 LOOPBACK = "loopback"
@@ -122,7 +123,12 @@ class ServiceConfig:
     @property
     def folder(self) -> Path:
         """The folder for what the service itself writes."""
-        return self.storage / SERVICE_FOLDER
+        return own_folder(self.storage)
+
+    @property
+    def database_url(self) -> str:
+        """The URL of the database, also where none was given."""
+        return self.database or sqlite_url(own_database(self.storage))
 
     @property
     def is_local(self) -> bool:

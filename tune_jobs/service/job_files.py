@@ -22,6 +22,16 @@ SERVICE_FOLDER = ".service"
 """In the storage folder; hidden, so that it is no sweep."""
 
 
+def own_folder(root: Path) -> Path:
+    """Return the folder for what the service writes of its own, in the folder that sweeps are in."""
+    return root / SERVICE_FOLDER
+
+
+def own_database(root: Path) -> Path:
+    """Return the file of the service's database, where no other is given."""
+    return own_folder(root) / "service.db"
+
+
 class Ended(BaseModel):
     """How an attempt at a job ended."""
 
@@ -44,7 +54,7 @@ class Holder(BaseModel):
 
 def held_jobs(folder: Path) -> list[Holder]:
     """Return the drivers that run now, as the files of all jobs say."""
-    holders = (JobFiles(folder, path.stem).holder() for path in sorted((folder / "jobs").glob("*.lock")))
+    holders = (JobFiles(folder, path.stem).holder() for path in sorted((folder / "jobs").glob("*.held")))
     return [holder for holder in holders if holder is not None]
 
 
@@ -58,7 +68,7 @@ class JobFiles:
 
     def __init__(self, folder: Path, uid: str) -> None:
         self._folder = folder / "jobs"
-        self._lock = self._folder / f"{uid}.lock"
+        self._lock = self._folder / f"{uid}.held"
         self._ended = self._folder / f"{uid}.json"
         self.log = self._folder / f"{uid}.log"
         """What the driver process prints besides the sweep's own log."""

@@ -18,7 +18,7 @@ from tune_jobs.service.access.audit import Audit
 from tune_jobs.service.access.gate import Gate
 from tune_jobs.service.access.tokens import Tokens
 from tune_jobs.service.config import ServiceConfig
-from tune_jobs.service.database.opening import open_database, sqlite_url
+from tune_jobs.service.database.opening import open_database
 from tune_jobs.service.events import Watch
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.queue import Queue
@@ -56,7 +56,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             nobody could come in.
     """
     with _alone(config.folder):
-        engine = open_database(config.database or sqlite_url(config.folder / "service.db"))
+        engine = open_database(config.database_url)
         try:
             gate = _gate(config, engine)
             storage, queue, labels = open_storage(config.storage), Queue(engine), Labels(engine)

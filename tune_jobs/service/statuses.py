@@ -113,7 +113,7 @@ class Statuses:
 
     def _look(self, sweep: Sweep, stamp: tuple[int, ...], known: Seen | None, *, is_same: bool) -> Seen:
         began = self._clock()
-        stamps = sweep.trial_stamps()
+        record, stamps = sweep.read_record(), sweep.trial_stamps()
         trials = None if known is None else known.trials
         if trials is None or trials.stamps != stamps:
             trials = _read(sweep, stamps, trials)
@@ -122,7 +122,7 @@ class Statuses:
         looked = Done(now, 0.0 if known is None else now - began)
         if known is not None and is_same and (known.of is trials or not known.summed_up.is_due(now, _OLDEST_STATUS_S)):
             return replace(known, trials=trials, looked=looked)
-        status = status_of(sweep, trials.records)
+        status = status_of(sweep, record, trials.records)
         return Seen(status, trials, stamp, looked, Done(self._clock(), self._clock() - now), of=trials)
 
     def all(self) -> list[Seen]:

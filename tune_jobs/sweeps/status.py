@@ -167,12 +167,13 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
 
 
 def _status(store: Sweep) -> SweepStatus:
-    return status_of(store, store.read_trials())
+    record = store.read_record()
+    return status_of(store, record, store.read_trials())
 
 
-def status_of(store: Sweep, trials: Sequence[TrialRecord]) -> SweepStatus:
-    """Return the status of a sweep whose trials' records have been read."""
-    record, alive = store.read_record(), store.is_driven()
+def status_of(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> SweepStatus:
+    """Return the status of a sweep whose records have been read."""
+    alive = store.is_driven()
     counts = Counter(trial.status for trial in trials)
     if record.state == "running" and not alive:
         # Its process was killed before it could write that it ended.

@@ -15,7 +15,7 @@ from tune_jobs.service.access.audit import Audit, Done
 from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.access.tokens import Token, Tokens
 from tune_jobs.service.config import ServiceConfig
-from tune_jobs.service.database.opening import open_database, sqlite_url
+from tune_jobs.service.database.opening import open_database
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def opened_gate(config: ServiceConfig) -> Iterator[Gate]:
             raise CannotRunError(
                 f"The service's folder {config.folder} can't be made: {error.strerror}.", "Check the storage folder."
             ) from error
-    engine = open_database(config.database or sqlite_url(config.folder / "service.db"))
+    engine = open_database(config.database_url)
     try:
         yield Gate(config, Tokens(engine), Audit(engine))
     except SQLAlchemyError as error:
