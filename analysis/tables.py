@@ -272,17 +272,24 @@ def steps_to_solve_frame(
 
 
 def write_csv(path: Path, frame: pd.DataFrame) -> None:
-    """Write a frame atomically as CSV (UTF-8, no index).
-
-    Text that a spreadsheet would run as a formula gets a leading apostrophe, because error texts are not trusted.
+    """Write a frame atomically as CSV, as `csv_text` has it.
 
     Raises:
         CannotRunError: The file cannot be written.
     """
+    write_atomic(path, csv_text(frame))
+
+
+def csv_text(frame: pd.DataFrame) -> str:
+    """Return a frame as CSV, without its index.
+
+    Text that a spreadsheet would run as a formula gets a leading apostrophe, because error texts are not trusted.
+    """
     safe = frame.copy()
     for name in safe.columns:
         safe[name] = safe[name].map(_defuse) if safe[name].dtype.kind in "OTU" else safe[name]
-    write_atomic(path, safe.to_csv(index=False, lineterminator="\n"))
+    text: str = safe.to_csv(index=False, lineterminator="\n")
+    return text
 
 
 def _defuse(value: Any) -> Any:

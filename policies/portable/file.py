@@ -39,8 +39,8 @@ from policies.portable.network import (
 
 __all__ = [
     "BASELINE_KINDS", "FORMAT_VERSION", "ActionTransform", "ConvLayer", "Layer", "ModuleWeights", "NetworkKind",
-    "Normalization", "PolicyNetwork", "PortablePolicy", "action_problem", "describe_space", "read_policy",
-    "save_policy", "space_from_description",
+    "Normalization", "PolicyNetwork", "PortablePolicy", "action_problem", "describe_space", "policy_files",
+    "read_policy", "save_policy", "space_from_description",
 ]  # fmt: skip
 
 FORMAT_VERSION = 2
@@ -113,6 +113,12 @@ def save_policy(
     write(folder / f"{stem}.safetensors", weights)
     write(folder / f"{stem}.json", json.dumps(_jsonable(description), indent=2, allow_nan=False) + "\n")
     return folder / f"{stem}.json"
+
+
+def policy_files(folder: Path) -> dict[str, Path]:
+    """Return the files of the policy in a folder by their names; none if it lacks one of them."""
+    files = {name: folder / name for name in ("policy.json", "policy.safetensors")}
+    return files if all(path.is_file() for path in files.values()) else {}
 
 
 def is_policy_folder(folder: Path) -> bool:

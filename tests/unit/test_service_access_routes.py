@@ -20,7 +20,7 @@ EVERYBODYS = {"/api/v1/login", "/api/v1/logout"}
 """What changes something, and is a viewer's, too."""
 ADMINS = {"/api/v1/audit"}
 """What only admins see."""
-VALUES = {"name": SWEEP, "trial_id": "t0000"}
+VALUES = {"film": "after_mp4", "file": "policy.json", "name": SWEEP, "trial_id": "t0000"}
 
 
 def routes_of(app: FastAPI) -> list[tuple[str, str]]:

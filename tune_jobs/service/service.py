@@ -19,6 +19,7 @@ from tune_jobs.service.access.gate import Gate
 from tune_jobs.service.access.tokens import Tokens
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database
+from tune_jobs.service.derived import Derived
 from tune_jobs.service.events import Watch
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.queue import Queue
@@ -45,6 +46,7 @@ class Service:
     submitter: Submitter
     supervisor: Supervisor
     watching: Watching
+    derived: Derived
 
 
 @contextlib.contextmanager
@@ -84,6 +86,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     submitter=Submitter(config, queue, storage),
                     supervisor=supervisor,
                     watching=watching,
+                    derived=Derived(storage, statuses),
                 )
         finally:
             engine.dispose()

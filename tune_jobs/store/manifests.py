@@ -15,7 +15,7 @@ from analysis.records import CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import refuse_others, sha256_file, sync, write_plain
 from tune_jobs.store.names import MANIFEST
-from tune_jobs.store.places import refuse_link
+from tune_jobs.store.places import refuse_link, within
 from tune_jobs.store.record_files import dump_sealed, parse_record, read_json
 
 _POLICY_FILES = ("policy.json", "policy.safetensors")
@@ -92,6 +92,15 @@ def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
                 _HINT,
             )
     return record
+
+
+def files_of(checkpoint: Path) -> dict[str, Path]:
+    """Return the files of a checkpoint by their names, its manifest first.
+
+    Raises:
+        CheckpointError: Something in it is a symbolic link, or neither a file nor a folder.
+    """
+    return {MANIFEST: within(checkpoint, MANIFEST), **_files_in(checkpoint)}
 
 
 def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:

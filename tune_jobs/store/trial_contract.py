@@ -212,6 +212,14 @@ class Trial(Protocol):
         """
         ...
 
+    def checkpoint_files(self, iteration: int) -> Mapping[str, Path]:
+        """Check every file of a checkpoint, and return them by their names, the manifest too, to read only.
+
+        Raises:
+            NotFoundError: As `verify_checkpoint`; a CheckpointError likewise.
+        """
+        ...
+
     def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
         """Write a checkpoint, which appears when it is whole and on disk; one of the same iteration is replaced.
 

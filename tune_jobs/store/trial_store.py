@@ -20,7 +20,7 @@ from policies.errors import CheckpointError
 from policies.files import open_to_append, write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
-from tune_jobs.store.manifests import read_manifest, verify_checkpoint, write_manifest
+from tune_jobs.store.manifests import files_of, read_manifest, verify_checkpoint, write_manifest
 from tune_jobs.store.ownership import OwnedFolder
 from tune_jobs.store.places import check_trial_id, checkpoint_iteration, make_folder, parts_of, remove_folder, within
 from tune_jobs.store.record_files import dump, read_record
@@ -170,6 +170,11 @@ class TrialStore(OwnedFolder):
     def verify_checkpoint(self, iteration: int) -> CheckpointRecord:
         """Check every file of a checkpoint; see `Trial.verify_checkpoint`."""
         return verify_checkpoint(self.checkpoint_folder(iteration))
+
+    def checkpoint_files(self, iteration: int) -> dict[str, Path]:
+        """Check a checkpoint and return its files; see `Trial.checkpoint_files`."""
+        self.verify_checkpoint(iteration)
+        return files_of(self.checkpoint_folder(iteration))
 
     def write_checkpoint(self, record: CheckpointRecord, write: Callable[[Path], None], engine: str = "") -> None:
         """Write a checkpoint folder atomically: under a hidden name, hashed, synced, then renamed.

@@ -187,6 +187,18 @@ def sweep_data(store: Sweep) -> SweepData:
     )
 
 
+def trials_csv(store: Sweep) -> str:
+    """Return the table of a sweep's trials as CSV, as `export` writes it.
+
+    Raises:
+        CheckpointError: The record of the sweep or of a trial is damaged.
+    """
+    from analysis.exports.frames import make_frame
+    from analysis.tables import csv_text
+
+    return csv_text(make_frame(sweep_data(store), "trials"))
+
+
 def _spec_of(store: Sweep) -> SweepSpec:
     from tune_jobs.spec.file import stored_spec
 

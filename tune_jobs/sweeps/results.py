@@ -14,6 +14,7 @@ from policies.envs.modules import allowed_again
 
 if TYPE_CHECKING:
     from analysis.importance import WhatMattered
+    from tune_jobs.store.contract import Sweep
 
 
 class Trials(BriefList[TrialRecord]):
@@ -75,11 +76,16 @@ def importance(sweep: str | Path, *, storage: str | Path | None = None) -> WhatM
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from analysis.importance import what_mattered
     from tune_jobs.sweeps.conclude import find_sweep
+
+    return importance_of(find_sweep(sweep, storage))
+
+
+def importance_of(store: Sweep) -> WhatMattered:
+    """Say which hyperparameters a sweep's scores depend on; see `importance`."""
+    from analysis.importance import what_mattered
     from tune_jobs.sweeps.exports import sweep_data
 
-    store = find_sweep(sweep, storage)
     data = sweep_data(store)
     return what_mattered(store.read_record(), data.trials, data.results, threshold=data.threshold)
 

@@ -10,7 +10,15 @@ from starlette.types import ASGIApp
 from typing_extensions import override
 
 from tune_jobs.service.access.middleware import AccessMiddleware
-from tune_jobs.service.http import access_routes, action_routes, event_routes, meta_routes, play_routes, sweep_routes
+from tune_jobs.service.http import (
+    access_routes,
+    action_routes,
+    download_routes,
+    event_routes,
+    meta_routes,
+    play_routes,
+    sweep_routes,
+)
 from tune_jobs.service.http.problems import add_handlers
 from tune_jobs.service.service import Service
 
@@ -41,6 +49,6 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     add_handlers(app)
-    for module in (access_routes, meta_routes, sweep_routes, action_routes, event_routes, play_routes):
+    for module in (access_routes, meta_routes, sweep_routes, action_routes, event_routes, download_routes, play_routes):
         app.include_router(module.router)
     return app

@@ -96,6 +96,15 @@ class CurvesOfSweep(BaseModel):
     trials: dict[str, Curve] = Field(description="By the trial's id; trials without results are left out.")
 
 
+class FileOfSweep(BaseModel):
+    """A file that can be downloaded."""
+
+    path: str = Field(description="Behind `/api/v1/sweeps/{name}/`.")
+    num_bytes: int
+    modified_at: float = Field(description="Unix time, seconds.")
+    media_type: str
+
+
 class Submitted(BaseModel):
     """A sweep that was submitted."""
 

@@ -1,0 +1,86 @@
+"""What is made of all results of a sweep, which takes seconds: once for all who ask, and anew when they changed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from tune_jobs.service.statuses import Statuses, Trials
+from tune_jobs.store.contract import Storage, Sweep
+from tune_jobs.sweeps.status import SweepStatus
+
+if TYPE_CHECKING:
+    from analysis.importance import WhatMattered
+
+_SHARE = 0.1
+"""The share of a core that making one thing anew of a running sweep takes."""
+_MOST_KEPT = 64
+
+
+@dataclass(frozen=True)
+class _Made:
+    of: tuple[Trials, SweepStatus]
+    value: Any
+    at: float
+    took_s: float
+
+
+class Derived:
+    """Makes and keeps such things; threads may share it.
+
+    Args:
+        storage: The sweeps.
+        statuses: What they look like.
+        clock: A monotonic clock, in seconds.
+    """
+
+    def __init__(self, storage: Storage, statuses: Statuses, clock: Callable[[], float] = time.monotonic) -> None:
+        self._storage, self._statuses, self._clock = storage, statuses, clock
+        self._made: dict[tuple[str, float, str], _Made] = {}
+        # One at a time: two at once would take as long, and twice the memory.
+        self._lock = threading.Lock()
+
+    def importance(self, name: str) -> WhatMattered:
+        """Say which hyperparameters a sweep's scores depend on, as of a while ago if it runs.
+
+        Raises:
+            NotFoundError: There is no such sweep, or it is damaged.
+        """
+        from tune_jobs.sweeps.results import importance_of
+
+        found: WhatMattered = self._get(name, "importance", importance_of)
+        return found
+
+    def trials_csv(self, name: str) -> str:
+        """Return the table of a sweep's trials as CSV, as of a while ago if it runs.
+
+        Raises:
+            NotFoundError: There is no such sweep, or it is damaged.
+        """
+        from tune_jobs.sweeps.exports import trials_csv
+
+        text: str = self._get(name, "trials.csv", trials_csv)
+        return text
+
+    def _get(self, name: str, what: str, make: Callable[[Sweep], Any]) -> Any:
+        self._statuses.see(name)
+        with self._lock:
+            # Looked at again, as one may have waited here for long.
+            seen, now = self._statuses.see(name), self._clock()
+            # A sweep of that name that was deleted is another one.
+            key = (name, seen.status.sweep.created_at, what)
+            known = self._made.pop(key, None)
+            if known is not None:
+                is_of_now = known.of[0] is seen.trials and known.of[1] is seen.status
+                if is_of_now or (not seen.is_over and now - known.at < known.took_s / _SHARE):
+                    self._made[key] = known
+                    return known.value
+            value = make(self._storage.sweep(name))
+            self._made[key] = _Made((seen.trials, seen.status), value, now, self._clock() - now)
+            while len(self._made) > _MOST_KEPT:
+                # The first is the one that nobody has asked for the longest.
+                del self._made[next(iter(self._made))]
+            return value
