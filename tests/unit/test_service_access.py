@@ -34,6 +34,11 @@ def test_a_host_that_is_not_the_services_is_refused(shared: Service, host: str, 
     assert "Host" in found["detail"] or "--public-name" in found["hint"]
 
 
+def test_of_two_hosts_none_counts(shared: Service) -> None:
+    for hosts in (("127.0.0.1:8265", "evil.example"), ("evil.example", "127.0.0.1:8265")):
+        problem(place(shared).client().get(ME, headers=[("Host", host) for host in hosts]), 400)
+
+
 def test_a_public_name_is_the_services_too(shared: Service) -> None:
     at = place(shared, public_names=("Tune.Example.org", "other.example:9000"))
     headers = bearer(at.token("viewer"))

@@ -106,6 +106,16 @@ def test_a_submitter_changes_an_own_sweep(shared: Service) -> None:
         shared.labels.forget(SWEEP)
 
 
+def test_the_openapi_document_says_what_needs_a_token(shared: Service) -> None:
+    document = place(shared).client().get("/api/v1/openapi.json").json()
+    schemes = document["components"]["securitySchemes"]
+    assert {name for item in document["security"] for name in item} == set(schemes) == {"token", "cookie"}
+    unguarded = {
+        path for path, methods in document["paths"].items() for said in methods.values() if said.get("security") == []
+    }
+    assert unguarded == PUBLIC & document["paths"].keys()
+
+
 def test_who_asks_is_said(shared: Service) -> None:
     at = place(shared, **OPEN)
     assert at.client(**bearer(at.token("viewer", "vera"))).get("/api/v1/me").json()["role"] == "viewer"
