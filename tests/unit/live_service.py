@@ -41,9 +41,11 @@ class Live:
 
 
 @contextlib.contextmanager
-def serving(storage: Path, **limits: Any) -> Iterator[Live]:
+def serving(storage: Path, *, require_token: bool = False, **limits: Any) -> Iterator[Live]:
     """Serve a storage folder; its queue stands still."""
-    config = ServiceConfig(storage=storage, port=0, spare_idle_s=0, limits=Limits(**limits), drain_s=1.0)
+    config = ServiceConfig(
+        storage=storage, port=0, spare_idle_s=0, limits=Limits(**limits), drain_s=1.0, require_token=require_token
+    )
     started = threading.Event()
     with listening_socket(config) as listening, _idle(config) as service:
         server = Server(service, config, make_app(service), started.set)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from pydantic import BaseModel, Field
 
 from analysis.records import TrialRecord, TrialStatus
+from policies.errors import SpecError
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import Label
 from tune_jobs.service.statuses import Seen
@@ -78,7 +79,23 @@ def jobs_by_sweep(jobs: Iterable[Job]) -> dict[str, Job]:
     return chosen
 
 
-def trial_row(record: TrialRecord, score: float | None) -> dict[str, Any]:
-    """Return a trial's record and its score."""
-    row: dict[str, Any] = to_json(record)
-    return row | {"score": score}
+def trial_row(record: TrialRecord, score: float | None, fields: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return a trial's record and its score, or these fields of them alone."""
+    if fields is None:
+        row: dict[str, Any] = to_json(record)
+        return row | {"score": score}
+    return {name: score if name == "score" else to_json(getattr(record, name)) for name in fields}
+
+
+def wanted_fields(text: str) -> list[str]:
+    """Return the names of a trial's fields that a text lists, separated by commas.
+
+    Raises:
+        SpecError: It has no such field.
+    """
+    known = {*TrialRecord.model_fields, "score"}
+    names = text.split(",")
+    for name in names:
+        if name not in known:
+            raise SpecError(f"fields: a trial has no field {name[:80]!r}.", f"It has {', '.join(sorted(known))}.")
+    return names

@@ -20,6 +20,7 @@ from tune_jobs.service.http import (
     sweep_routes,
 )
 from tune_jobs.service.http.problems import add_handlers
+from tune_jobs.service.page import routes as page_routes
 from tune_jobs.service.service import Service
 
 _SECURITY_SCHEMES = {
@@ -77,6 +78,16 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     add_handlers(app)
-    for module in (access_routes, meta_routes, sweep_routes, action_routes, event_routes, download_routes, play_routes):
+    modules = (
+        access_routes,
+        meta_routes,
+        sweep_routes,
+        action_routes,
+        event_routes,
+        download_routes,
+        play_routes,
+        page_routes,
+    )
+    for module in modules:
         app.include_router(module.router)
     return app

@@ -22,7 +22,7 @@ from tune_jobs.service.http.pages import page_of
 from tune_jobs.service.http.problems import NotNowError, TooManyError
 from tune_jobs.service.labels import NOTHING
 from tune_jobs.service.service import Service
-from tune_jobs.service.summaries import SweepSummary, jobs_by_sweep, summary, trial_row
+from tune_jobs.service.summaries import SweepSummary, jobs_by_sweep, summary, trial_row, wanted_fields
 from tune_jobs.sweeps.plain import to_json
 
 router = APIRouter(prefix="/api/v1", tags=["sweeps"])
@@ -172,11 +172,15 @@ def trials(
     status: Annotated[str | None, Query(max_length=100)] = None,
     sort: Annotated[str, Query(max_length=200, description="score, a column, or a searched hyperparameter.")] = "score",
     order: Order = "desc",
+    fields: Annotated[
+        str | None, Query(max_length=1_000, description="Only these fields of each, separated by commas.")
+    ] = None,
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> TrialPage:
     """List the trials of a sweep."""
     known = service.statuses.see(name).trials
+    wanted = None if fields is None else wanted_fields(fields)
 
     def key(record: TrialRecord) -> Any:
         if sort == "score":
@@ -192,9 +196,8 @@ def trials(
         cursor=cursor,
         limit=limit,
     )
-    return TrialPage(
-        trials=[trial_row(record, known.scores[record.trial_id]) for record in page], next_cursor=following
-    )
+    rows = [trial_row(record, known.scores[record.trial_id], wanted) for record in page]
+    return TrialPage(trials=rows, next_cursor=following)
 
 
 @router.get("/sweeps/{name}/trials/{trial_id}")

@@ -1,0 +1,411 @@
+"""The service's page in a browser, driven as a reader would: look, sort, filter, brush, submit, stop."""
+
+from collections.abc import Iterator
+
+import pytest
+
+selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
+
+from live_service import Live, serving  # noqa: E402
+from page_browser import CHROMIUM, DRIVER, Page, chromium  # noqa: E402
+from page_sweeps import HOSTILE, write_large, write_storage  # noqa: E402
+from selenium import webdriver  # noqa: E402
+from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
+
+from tune_jobs.service.access.gate import opened_gate  # noqa: E402
+from tune_jobs.service.config import ServiceConfig  # noqa: E402
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
+]
+FAILED = "#/sweeps/cartpole-ppo?trial=t0003"
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    storage = tmp_path_factory.mktemp("page") / "sweeps"
+    write_storage(storage)
+    with serving(storage) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrome]:
+    with chromium(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+@pytest.fixture
+def page(browser: webdriver.Chrome, live: Live) -> Iterator[Page]:
+    """The page; afterwards no script has failed, nothing was blocked, and no text was run as HTML."""
+    found = Page(browser, live.url)
+    found.errors()
+    yield found
+    assert found.errors() == []
+    assert "run" not in browser.title.split()
+    browser.execute_script("sessionStorage.clear()")
+
+
+def column(page: Page, heading: str) -> list[str]:
+    """The texts of a column of the table of trials, of the rows that are there."""
+    script = """
+        const head = document.querySelector(".trials thead tr");
+        const body = document.querySelector(".trials tbody:has(th)");
+        const place = [...head.cells].findIndex((cell) => cell.innerText.trim() === arguments[0]);
+        return place < 0 || !body ? [] : [...body.rows].map((row) => row.cells[place].innerText);
+    """
+    found: list[str] = page.run(script, heading)
+    return found
+
+
+def numbers(page: Page, heading: str) -> list[float]:
+    return [float(text.replace(",", "")) for text in column(page, heading) if text[0].isdigit()]
+
+
+def num_trials(page: Page) -> str:
+    return page.text(".trials-card [role=status]")
+
+
+def test_sweeps_are_listed_sorted_searched_and_filtered(page: Page) -> None:
+    page.open()
+    page.says("main", "cartpole-seeds")
+    names = "return [...document.querySelectorAll('.sweeps tbody th a')].map((link) => link.innerText)"
+    assert page.run(names) == ["cartpole-seeds", "cartpole-ppo", "pendulum-no-space"]
+    assert "interrupted" in page.text(".sweeps tbody tr")
+    page.button("Sweep", "thead").click()
+    assert page.run(names) == ["cartpole-ppo", "cartpole-seeds", "pendulum-no-space"]
+    page.one("input[type=search]").send_keys("Pendulum")
+    assert page.run(names) == ["pendulum-no-space"]
+    assert "search=Pendulum" in page.address()
+    page.browser.refresh()
+    assert page.wait(f"return ({names.removeprefix('return ')}).length === 1")
+    page.open("#/?state=running")
+    page.says(".empty", "No sweep matches.")
+
+
+def test_a_link_reproduces_what_is_looked_at(page: Page) -> None:
+    page.open("#/sweeps/cartpole-ppo")
+    page.says(".trials-card", "60 trials")
+    scores = numbers(page, "score")
+    assert scores == sorted(scores, reverse=True)
+    page.button("lr", ".trials").click()
+    assert numbers(page, "lr") == sorted(numbers(page, "lr"), reverse=True)
+    page.button("lr", ".trials").click()
+    assert numbers(page, "lr") == sorted(numbers(page, "lr"))
+    page.one(".trials-card input[type=search]").send_keys("relu score>100")
+    assert set(column(page, "activation")) == {"relu"}
+    page.browser.find_elements(By.CSS_SELECTOR, ".trials tbody input")[1].click()
+    chosen = page.wait("return document.querySelector('.trials tr.chosen th')?.innerText")
+    before = (column(page, "trial"), num_trials(page), page.text(".curves .keys"))
+    assert f"chosen={chosen}" in page.address()
+    assert before[2].startswith(chosen)
+    page.browser.refresh()
+    page.says(".trials-card", before[1])
+    assert (column(page, "trial"), num_trials(page), page.text(".curves .keys")) == before
+
+
+def test_a_range_on_an_axis_keeps_the_table_to_its_trials(page: Page) -> None:
+    page.open("#/sweeps/cartpole-ppo", height=1400)
+    page.says(".trials-card", "60 trials")
+    grip = page.one(".grip[data-axis=lr]")
+    page.drag(grip, (20, 20), (0, 30), (0, 40))
+    assert page.address().startswith("#/sweeps/cartpole-ppo?in.lr=")
+    few = int(num_trials(page).split()[0])
+    assert 0 < few < 60
+    page.drag(grip, (20, 40), (0, 0))
+    page.says(".trials-card", "60 trials")
+    # The same by keys: the upper end goes down.
+    handle = page.browser.find_element(By.CSS_SELECTOR, ".handle[data-axis=lr][data-end=high]")
+    page.run("arguments[0].focus()", handle)
+    page.keys(*[Keys.ARROW_DOWN] * 12)
+    assert int(num_trials(page).split()[0]) < 60
+    assert handle.get_attribute("aria-valuetext")
+    page.keys(Keys.ESCAPE)
+    page.says(".trials-card", "60 trials")
+
+
+def test_a_trial_opens_with_why_it_failed_and_its_log(page: Page) -> None:
+    page.open("#/sweeps/cartpole-ppo?filter=status%3Dfailed")
+    page.says(".trials-card", "2 of 60 trials")
+    page.one(".trials tbody th").click()
+    trial = page.text("#trial-title")
+    assert f"trial={trial}" in page.address()
+    page.says(".panel .why", HOSTILE)
+    page.says(".panel [role=log]", "iteration 5: 5120 env steps")
+    page.says(".panel", "hidden_sizes")
+    assert page.focused() == trial
+    page.one(".panel button[aria-label^=Next]").click()
+    page.until(lambda: page.text("#trial-title") != trial)
+    assert page.text("#trial-title") in page.address()
+    page.keys(Keys.ESCAPE)
+    page.until(lambda: "trial=" not in page.address())
+    assert page.run("return document.activeElement.tagName") == "TR"
+
+
+def test_the_panel_keeps_the_focus_inside_on_a_phone(page: Page) -> None:
+    page.open(FAILED, width=400)
+    page.says(".panel", "Why it failed")
+    outside = "return document.activeElement !== document.body && !document.activeElement.closest('.panel')"
+    for _ in range(20):
+        page.keys(Keys.TAB)
+        assert not page.run(outside)
+
+
+def test_a_sweep_file_is_planned_and_what_is_wrong_is_shown_at_its_line(page: Page) -> None:
+    page.open("#/new?preset=cartpole-ppo")
+    page.says(".plan", "valid")
+    page.says(".plan", "20 points")
+    area = page.one("#sweep-file")
+    area.click()
+    area.send_keys(Keys.CONTROL, "a")
+    area.send_keys(Keys.DELETE)
+    area.send_keys("env: CartPole-v1", Keys.ENTER, "algorithm: ppo", Keys.ENTER, "num_sample: 3", Keys.ENTER)
+    page.says(".plan", "Did you mean 'num_samples'?")
+    page.button("line 3").click()
+    assert page.run("return getSelection().toString() || document.activeElement.id") in ("num_sample: 3", "sweep-file")
+    assert page.text(".numbers .bad") == "3"
+    area.send_keys(Keys.BACKSPACE, "num_samples: 3")
+    page.says(".plan", "valid")
+    page.says(".plan", "3 points")
+    # A draft is there again after a reload.
+    page.browser.refresh()
+    page.says(".plan", "3 points")
+
+
+def test_keys_and_values_are_completed_from_the_schema(page: Page) -> None:
+    page.open("#/new")
+    page.says(".plan", "valid")
+    area = page.one("#sweep-file")
+    area.click()
+    area.send_keys(Keys.CONTROL, "a")
+    area.send_keys(Keys.DELETE)
+    area.send_keys("env: CartPole-v1", Keys.ENTER, "algo")
+    page.says("#offers", "algorithm")
+    area.send_keys(Keys.ENTER)
+    area.send_keys("p")
+    page.says("#offers", "ppo")
+    area.send_keys(Keys.ARROW_DOWN, Keys.ARROW_UP, Keys.ENTER, Keys.ENTER, "spa")
+    page.says("#offers", "space")
+    area.send_keys(Keys.ENTER, "gae")
+    page.says("#offers", "gae_lambda")
+    area.send_keys(Keys.ENTER, "uni")
+    page.says("#offers", "uniform")
+    area.send_keys(Keys.ENTER, "0.9, 0.99")
+    wanted = "env: CartPole-v1\nalgorithm: ppo\nspace:\n  gae_lambda: {uniform: [0.9, 0.99]}"
+    assert page.run("return arguments[0].value", area) == wanted
+    page.says(".plan", "valid")
+
+
+def test_a_sweep_is_submitted_stopped_and_refused_with_a_sentence(page: Page) -> None:
+    page.open("#/new")
+    page.says(".plan", "valid")
+    page.one("#name").send_keys("from-the-page")
+    page.one("#tags").send_keys("one, two")
+    page.button("Submit sweep").click()
+    page.says("main h1", "from-the-page")
+    page.says(".sweep-title", "waiting")
+    assert "two" in page.text(".tag-line")
+    # The name is taken now.
+    page.open("#/new")
+    page.says(".plan", "valid")
+    page.one("#name").send_keys("from-the-page")
+    page.button("Submit sweep").click()
+    page.says(".submit .problem", "from-the-page")
+    page.open("#/sweeps/from-the-page")
+    page.button("Stop").click()
+    page.says(".sweep-title", "stopped")
+    # Somebody else was faster.
+    page.run("document.querySelector('[data-action=stop]').click()")
+    page.says("[role=alert]", "Sweep from-the-page neither waits nor runs")
+    page.button("Close", "[role=alert]").click()
+    assert page.text("[role=alert]") == ""
+
+
+def test_dialogs_show_what_is_refused_and_change_what_is_not(page: Page) -> None:
+    page.open("#/sweeps/cartpole-ppo")
+    page.button("More").click()
+    page.button("Extend…").click()
+    assert page.focused() == "More samples"
+    page.one("dialog input").send_keys("9999")
+    for _ in range(12):
+        page.keys(Keys.TAB)
+        inside = "return document.activeElement === document.body || document.activeElement.closest('dialog') !== null"
+        assert page.run(inside)
+    page.button("Extend", "dialog").click()
+    page.says("dialog [role=alert]", "here a sweep may have at most 10,000")
+    page.keys(Keys.ESCAPE)
+    page.wait("return document.querySelector('.dialog') === null")
+    page.open("#/sweeps/pendulum-no-space")
+    page.button("More").click()
+    page.button("Note, tags, priority…").click()
+    page.one("dialog textarea").send_keys(f"A note {HOSTILE}")
+    page.one("dialog #field-tags").send_keys("baseline, baseline")
+    page.button("Save", "dialog").click()
+    page.says(".note", HOSTILE)
+    page.says(".tag-line", "baseline")
+
+
+def test_a_sweep_is_deleted_only_when_it_was_meant(page: Page, live: Live) -> None:
+    from page_sweeps import write_sweep
+    from synthetic_sweep import make_sweep
+
+    made = make_sweep(name="to-delete", points=[{}], with_best=False)
+    write_sweep(live.storage, made, state="interrupted", spec={"space": {}})
+    page.open("#/sweeps/to-delete")
+    page.button("More").click()
+    page.button("Delete…").click()
+    page.button("Delete", "dialog").click()
+    page.says("dialog [role=alert]", "has not finished")
+    page.one("dialog input[type=checkbox]").click()
+    page.button("Delete", "dialog").click()
+    page.says("main h1", "Sweeps")
+    page.wait("return ![...document.querySelectorAll('.sweeps a')].some((link) => link.innerText === 'to-delete')")
+    assert not (live.storage / "to-delete").exists()
+
+
+def test_what_trials_report_shows_up_by_itself(page: Page, live: Live) -> None:
+    from page_sweeps import write_sweep
+    from synthetic_sweep import make_sweep
+
+    made = make_sweep(name="live", points=[{"lr": 1e-3}, {"lr": 1e-2}], with_best=False, max_steps=20_000)
+    store = write_sweep(
+        live.storage, made, state="running", ended_at=None, spec={"space": {"lr": {"grid": [1e-3, 1e-2]}}}
+    )
+    trial = store.trial("t0001")
+    record = trial.read_record()
+    rows = trial.read_iterations()
+    trial.write_record(record.model_copy(update={"status": "running", "ended_at": None}))
+    with store.lock():
+        page.open("#/sweeps/live")
+        page.says(".sweep-title", "running")
+        page.says(".trials", "running")
+        last = rows[-1].model_copy(
+            update={"iteration": len(rows) + 1, "num_env_steps": 30_000, "training_return": 654.3}
+        )
+        trial.append_iterations([last])
+        progress = {"status": "running", "ended_at": None, "num_env_steps": 30_000, "training_return": 654.3}
+        trial.write_record(record.model_copy(update=progress))
+        page.says(".trials", "654.3")
+        page.wait("""return document.querySelector(".curves .keys")?.innerText.includes("654.3")""")
+    store.write_record(store.read_record().model_copy(update={"state": "interrupted"}))
+    page.says(".sweep-title", "interrupted")
+
+
+def test_a_table_of_ten_thousand_trials_scrolls_and_sorts(page: Page, live: Live) -> None:
+    write_large(live.storage)
+    page.open("#/sweeps/large")
+    page.says(".trials-card", "10,000 trials")
+    rows = "return document.querySelectorAll('.trials tbody tr:has(th)').length"
+    assert page.run(rows) < 80
+    assert page.one(".trials").get_attribute("aria-rowcount") == "10001"
+    page.run("document.querySelector('.scroller').scrollTop = 1e7")
+    page.wait("return document.querySelector('.trials tr[aria-rowindex=\"10001\"]') !== null")
+    assert page.run(rows) < 80
+    page.button("trial", ".trials").click()
+    page.run("document.querySelector('.scroller').scrollTop = 0")
+    page.until(lambda: column(page, "trial")[:2] == ["t0000", "t0001"])
+    page.run("document.querySelector('.trials tr[tabindex=\"0\"]').focus()")
+    page.keys(Keys.END)
+    page.until(lambda: page.run("return document.activeElement.dataset.key") == "t9999")
+    page.keys(Keys.ARROW_UP, Keys.ENTER)
+    page.says(".panel", "t9998")
+    page.one(".trials-card input[type=search]").send_keys("score>199.9")
+    page.until(lambda: 0 < int(num_trials(page).split()[0].replace(",", "")) < 100)
+    page.open("#/")
+    page.says("main", "large")
+
+
+def test_all_is_reached_with_the_tab_key_and_the_focus_is_seen(page: Page) -> None:
+    page.open("#/sweeps/cartpole-ppo")
+    page.says(".trials-card", "60 trials")
+    can_be_reached = """
+        const wanted = "a[href], button, input, select, textarea, summary, [tabindex]";
+        const isThere = (node) => node.checkVisibility({ visibilityProperty: true }) && !node.closest("[popover]");
+        const isReached = (node) => isThere(node) && node.tabIndex >= 0 && !node.disabled;
+        return [...document.querySelectorAll(wanted)].filter(isReached).length;
+    """
+    expected = page.run(can_be_reached)
+    seen: list[str] = []
+    page.run("document.body.tabIndex = -1; document.body.focus(); document.body.removeAttribute('tabindex')")
+    for _ in range(expected + 1):
+        page.keys(Keys.TAB)
+        key, outline = page.run("""
+            const node = document.activeElement;
+            node.dataset.seen ??= String(Math.random());
+            const style = getComputedStyle(node);
+            const isShown = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) > 0;
+            return [node === document.body ? "" : node.dataset.seen, isShown || node.outerHTML.slice(0, 150)];
+        """)
+        if not key:
+            break
+        seen.append(key)
+        assert outline is True
+    assert len(set(seen)) >= expected - 1
+    # A list that is typed at first shows where the focus is, too.
+    page.open("#/")
+    page.says("main", "cartpole-ppo")
+    page.keys(Keys.TAB)
+    assert page.focused() == "Skip to content"
+    page.keys(Keys.ENTER)
+    assert page.run("return document.activeElement.id") == "main"
+    assert page.address() in ("", "#/")
+
+
+@pytest.mark.parametrize("view", ["#/", "#/sweeps/cartpole-ppo", FAILED, "#/sweeps/cartpole-seeds", "#/new"])
+def test_views_have_no_barriers_and_fit_each_width(page: Page, view: str) -> None:
+    for width, theme in ((400, "light"), (1280, "dark"), (1920, "light")):
+        page.open(view, width=width, theme=theme)
+        wait_for = {"#/": "cartpole-ppo", "#/new": "At once"}.get(view, "How the leading settings learn")
+        page.says("main", wait_for)
+        if view == FAILED:
+            page.says(".panel", "Why it failed")
+        assert page.violations() == [], width
+        assert page.run("return document.documentElement.scrollWidth <= innerWidth"), width
+
+
+@pytest.mark.parametrize("label", ["Delete…", "Extend…", "Note, tags, priority…"])
+def test_dialogs_have_no_barriers(page: Page, label: str) -> None:
+    page.open("#/sweeps/cartpole-ppo")
+    page.button("More").click()
+    assert page.violations() == []
+    page.button(label).click()
+    page.one("dialog")
+    assert page.violations() == []
+
+
+def test_a_name_that_is_not_there_is_said(page: Page) -> None:
+    page.open("#/")
+    page.run("location.hash = '#/sweeps/nothing%3Cb%3E'")
+    page.says("main", "There is no sweep 'nothing<b>'.")
+
+
+def test_who_has_no_token_logs_in_and_a_viewer_changes_nothing(
+    browser: webdriver.Chrome, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    storage = tmp_path_factory.mktemp("closed") / "sweeps"
+    write_storage(storage)
+    with opened_gate(ServiceConfig(storage=storage)) as gate:
+        _, secret = gate.tokens.make("vera", "viewer")
+    with serving(storage, require_token=True) as closed:
+        page = Page(browser, closed.url)
+        page.errors()
+        page.open("#/sweeps/cartpole-ppo")
+        page.says("main h1", "Log in")
+        assert page.violations() == []
+        assert "Token" in page.focused()
+        page.keys("wrong", Keys.ENTER)
+        page.says("[role=alert]", "This token is wrong")
+        page.keys(secret, Keys.ENTER)
+        # What the link named is there.
+        page.says("main h1", "cartpole-ppo")
+        page.says(".where", "vera, viewer")
+        assert not page.one(".sweep-title").find_elements(By.CSS_SELECTOR, ".actions:not([hidden])")
+        page.open("#/new")
+        page.says("main", "it may look, and submit nothing")
+        assert not page.one("button[type=submit]").is_enabled()
+        page.button("Log out").click()
+        page.says("main h1", "Log in")
+        assert page.errors() == []

@@ -1,0 +1,112 @@
+// Dialogs with a few fields: the browser keeps the focus inside and gives it back.
+import { el, setText } from "./dom.js";
+
+// A field: { name, label, type: "number" | "text" | "textarea" | "checkbox", value, min, max, hint }.
+function fieldOf(spec) {
+  const id = `field-${spec.name}`;
+  const hint = spec.hint ? el("small", { id: `${id}-hint` }, spec.hint) : null;
+  const common = { id, name: spec.name, "aria-describedby": hint ? `${id}-hint` : null };
+  if (spec.type === "checkbox") {
+    return el(
+      "div",
+      { class: "field" },
+      el("label", { class: "check" }, el("input", { ...common, type: "checkbox", checked: spec.value }), spec.label),
+      hint,
+    );
+  }
+  const input =
+    spec.type === "textarea"
+      ? el("textarea", { ...common, rows: 4, maxlength: spec.max })
+      : el("input", {
+          ...common,
+          type: spec.type,
+          min: spec.min,
+          max: spec.type === "number" ? spec.max : null,
+          step: spec.type === "number" ? 1 : null,
+          required: spec.type === "number",
+          maxlength: spec.type === "text" ? spec.max : null,
+          autocomplete: "off",
+        });
+  input.value = spec.value ?? "";
+  return el("div", { class: "field" }, el("label", { for: id }, spec.label), input, hint);
+}
+
+function valuesOf(form, fields) {
+  return Object.fromEntries(
+    fields.map((spec) => {
+      const input = form.elements[spec.name];
+      if (spec.type === "checkbox") return [spec.name, input.checked];
+      return [spec.name, spec.type === "number" ? Number(input.value) : input.value];
+    }),
+  );
+}
+
+// Show a dialog; `act(values)` does what it asks for, and what it throws is shown in the dialog, which stays open.
+export function askInDialog({ title, text, fields = [], label, isDangerous = false, act }) {
+  const problem = el("div", { class: "problem", role: "alert" });
+  const submit = el("button", { type: "submit", class: isDangerous ? "danger" : "primary" }, label);
+  const cancel = el("button", { type: "button" }, "Cancel");
+  const heading = el("h2", { id: "dialog-title" }, title);
+  const form = el(
+    "form",
+    { method: "dialog" },
+    heading,
+    text ? el("p", { class: "quiet" }, text) : null,
+    ...fields.map(fieldOf),
+    problem,
+    el("div", { class: "buttons" }, cancel, submit),
+  );
+  const dialog = el("dialog", { class: "dialog", "aria-labelledby": "dialog-title" }, form);
+  cancel.addEventListener("click", () => dialog.close());
+  dialog.addEventListener("close", () => dialog.remove());
+  dialog.addEventListener("click", (event) => {
+    if (event.target === dialog) dialog.close();
+  });
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    submit.disabled = true;
+    problem.replaceChildren();
+    try {
+      await act(valuesOf(form, fields));
+      dialog.close();
+    } catch (error) {
+      problem.replaceChildren(...refusal(error));
+    } finally {
+      submit.disabled = false;
+    }
+  });
+  document.body.append(dialog);
+  dialog.showModal();
+  // A dangerous one begins where nothing happens.
+  (form.querySelector("input, textarea") ?? (isDangerous ? cancel : submit)).focus();
+  return dialog;
+}
+
+// What was refused, and what to do, as paragraphs.
+export function refusal(error) {
+  const lines = [el("p", {}, error.message)];
+  if (error.hint) lines.push(el("p", { class: "quiet" }, error.hint));
+  return lines;
+}
+
+// A place for what was refused outside of a dialog; it stays until it is closed.
+export function makeAlert() {
+  const text = el("div", {});
+  const close = el("button", { type: "button", class: "plain", "aria-label": "Close the message" }, "Close");
+  const box = el("div", { class: "notice bad closable", hidden: true }, text, close);
+  const place = el("div", { role: "alert" }, box);
+  close.addEventListener("click", () => {
+    box.hidden = true;
+  });
+  return {
+    node: place,
+    show(error) {
+      text.replaceChildren(...refusal(error));
+      box.hidden = false;
+    },
+    hide() {
+      box.hidden = true;
+      setText(text, "");
+    },
+  };
+}

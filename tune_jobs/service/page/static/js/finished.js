@@ -1,0 +1,106 @@
+// What a finished sweep has come to: the policy to deploy, the setting to train with, its report and films.
+import { address, ask, ofSweep } from "./api.js";
+import { el } from "./dom.js";
+import { counted, pointText, returnText } from "./format.js";
+import { stateOf } from "./states.js";
+
+const CAPTIONS = { before_mp4: "Before: a random policy", after_mp4: "After: the best policy" };
+const SCORES = {
+  final: "return in the later half of training",
+  area: "return over all of training",
+  best: "best evaluation return",
+  steps_to_threshold: "env steps to the threshold",
+};
+
+export class Finished {
+  // `onOpen(trialId)` is called when the reader wants to see the policy's trial.
+  constructor(card, name, { onOpen }) {
+    Object.assign(this, { card, name, onOpen });
+    this.card.hidden = true;
+    this.stamp = "";
+  }
+
+  // Asked for once each time the sweep has come to an end.
+  async follow(sweep) {
+    const stamp = `${stateOf(sweep).group} ${sweep.state} ${sweep.ended_at} ${sweep.job?.ended_at}`;
+    if (stamp === this.stamp) return;
+    this.stamp = stamp;
+    if (sweep.state !== "completed") {
+      this.card.hidden = true;
+      return;
+    }
+    try {
+      const files = new Set((await ask(ofSweep(this.name, "/files"))).map((file) => file.path));
+      // There is no answer before there is a policy.
+      const hasBest = [...files].some((path) => path.startsWith("policy/"));
+      const best = hasBest ? await ask(ofSweep(this.name, "/best")) : null;
+      if (stamp === this.stamp) this.show(files, best);
+    } catch {
+      // The next look asks again.
+      this.stamp = "";
+    }
+  }
+
+  show(files, best) {
+    const hasReport = files.has("report/index.html");
+    const link = { class: "button", href: address(ofSweep(this.name, "/report/")), target: "_blank", rel: "noopener" };
+    this.card.hidden = best === null && !hasReport;
+    this.card.replaceChildren(
+      el(
+        "div",
+        { class: "card-head" },
+        el("h2", {}, "Result"),
+        hasReport ? el("a", link, "Open the report", el("span", { class: "for-readers" }, " in a new tab")) : null,
+      ),
+      el(
+        "div",
+        { class: "answers" },
+        best ? this.policyAnswer(best) : null,
+        best?.settings ? settingAnswer(best.settings) : null,
+        Object.keys(CAPTIONS)
+          .filter((name) => files.has(`films/${name}`))
+          .map((name) => this.film(name)),
+      ),
+    );
+  }
+
+  policyAnswer({ checkpoint, confirmation, random }) {
+    const { solved } = confirmation;
+    const badge = el("span", { class: `badge ${solved ? "good" : ""}` }, solved ? "solved" : "not solved");
+    const trial = el("button", { type: "button", class: "link", onclick: () => this.onOpen(checkpoint.trial_id) });
+    trial.append(checkpoint.trial_id);
+    const episodes = counted(confirmation.num_episodes, "fresh episode");
+    return el(
+      "div",
+      {},
+      el("h3", {}, "The policy to deploy"),
+      el("p", { class: "score" }, returnText(confirmation.mean_return), " ", solved === null ? null : badge),
+      el("p", { class: "quiet small" }, `mean over ${episodes}; a random policy has ${returnText(random.mean_return)}`),
+      el("p", { class: "small" }, trial, ` at ${counted(checkpoint.num_env_steps, "env step")}`),
+    );
+  }
+
+  film(name) {
+    const source = address(ofSweep(this.name, `/films/${name}`));
+    const options = { src: source, controls: true, loop: true, playsinline: true, preload: "metadata" };
+    const video = el("video", { ...options, "aria-label": CAPTIONS[name] });
+    // As an attribute it says how a film begins alone.
+    video.muted = true;
+    return el("figure", {}, video, el("figcaption", {}, CAPTIONS[name]));
+  }
+}
+
+function settingAnswer({ objective, num_may_be_best: numAsGood, ranking: [setting] }) {
+  const hasRange = setting.lower !== null && setting.upper !== null;
+  const range = hasRange ? ` (95 % interval ${returnText(setting.lower)} to ${returnText(setting.upper)})` : "";
+  const score = `${returnText(setting.expected)} expected ${SCORES[objective] ?? "score"}${range}`;
+  const others = numAsGood - 1;
+  return el(
+    "div",
+    {},
+    el("h3", {}, "The setting to train with"),
+    el("p", { class: "point" }, pointText(setting.point, 4) || "no searched values"),
+    el("p", { class: "quiet small" }, `${score}, from ${counted(setting.scores.length, "seed")}`),
+    others > 0 ? el("p", { class: "quiet small" }, `${counted(others, "other setting")} may be as good`) : null,
+  );
+}

@@ -1,0 +1,77 @@
+// Numbers, times and values as texts, as the report and the command line write them.
+export const NONE = "–";
+const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
+const tenths = new Intl.NumberFormat("en", { minimumFractionDigits: 1, maximumFractionDigits: 1 });
+const short = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 3 });
+const day = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit" });
+const date = new Intl.DateTimeFormat("en-GB", { dateStyle: "long", timeStyle: "medium" });
+
+const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
+export const count = (value) => (isNumber(value) ? whole.format(value) : NONE);
+export const compact = (value) => (isNumber(value) ? short.format(value) : NONE);
+export const returnText = (value) => (isNumber(value) ? tenths.format(Object.is(value, -0) ? 0 : value) : NONE);
+export const counted = (number, noun, plural = `${noun}s`) => `${count(number)} ${number === 1 ? noun : plural}`;
+
+export function significant(value, digits = 4) {
+  if (!isNumber(value)) return NONE;
+  if (Number.isInteger(value) && Math.abs(value) < 1e6) return String(value);
+  const text = value.toPrecision(digits);
+  if (/e/.test(text) || Math.abs(value) < 1e-3) {
+    const [mantissa, exponent] = value.toExponential(digits - 1).split("e");
+    return `${Number(mantissa)}e${Number(exponent)}`;
+  }
+  return String(Number(text));
+}
+
+// A hyperparameter's value: 64x64 for lists.
+export function settingText(value, digits = 4) {
+  if (value === null || value === undefined) return NONE;
+  if (Array.isArray(value)) return value.map((item) => settingText(item, digits)).join("x");
+  if (typeof value === "number") return significant(value, digits);
+  return typeof value === "object" ? JSON.stringify(value) : String(value);
+}
+
+export const pointText = (point, digits = 3) =>
+  Object.entries(point ?? {})
+    .map(([name, value]) => `${name} ${settingText(value, digits)}`)
+    .join(", ");
+
+export function duration(seconds) {
+  if (!isNumber(seconds)) return NONE;
+  const all = Math.round(seconds);
+  if (all < 60) return seconds < 10 ? `${tenths.format(seconds)} s` : `${all} s`;
+  const minutes = Math.floor(all / 60);
+  if (minutes < 60) return `${minutes} min ${all % 60} s`;
+  const hours = Math.floor(minutes / 60);
+  return hours < 48 ? `${hours} h ${minutes % 60} min` : `${Math.floor(hours / 24)} d ${hours % 24} h`;
+}
+
+// An estimate: what is finer than it is known is left out.
+export function timeLeft(seconds) {
+  if (!isNumber(seconds)) return NONE;
+  if (seconds < 60) return `${Math.max(1, Math.round(seconds))} s`;
+  const minutes = Math.round(seconds / 60);
+  return minutes < 60 ? `${minutes} min` : duration(minutes * 60);
+}
+
+export function ago(unixTime, now = Date.now() / 1000) {
+  if (!isNumber(unixTime)) return NONE;
+  const seconds = Math.max(0, now - unixTime);
+  if (seconds < 45) return "just now";
+  if (seconds < 3600) return `${Math.max(1, Math.round(seconds / 60))} min ago`;
+  if (seconds < 86400) return `${Math.round(seconds / 3600)} h ago`;
+  return day.format(new Date(unixTime * 1000));
+}
+
+export const moment = (unixTime) => (isNumber(unixTime) ? date.format(new Date(unixTime * 1000)) : NONE);
+
+export function bytes(number) {
+  if (!isNumber(number)) return NONE;
+  const units = ["bytes", "kB", "MB", "GB", "TB"];
+  let unit = 0;
+  for (; number >= 1000 && unit < units.length - 1; unit += 1) number /= 1000;
+  return `${unit ? tenths.format(number) : number} ${units[unit]}`;
+}
+
+// Rounded down, so that 100 % means done.
+export const percent = (part, all) => (all > 0 ? Math.min(100, Math.floor((100 * part) / all)) : 0);

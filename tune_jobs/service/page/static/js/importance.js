@@ -1,0 +1,84 @@
+// Which hyperparameters the scores depend on, as it firms up.
+import { ask, ofSweep } from "./api.js";
+import { el, reconcile, setAttribute, setText } from "./dom.js";
+
+const width = (share) => `${100 * share}%`;
+const percentText = (share) => `${Math.round(100 * share)} %`;
+
+export class ImportanceCard {
+  constructor(card, name) {
+    Object.assign(this, { card, name });
+    this.numEnded = -1;
+    this.isAsking = false;
+    this.caption = el("p", { class: "quiet small" });
+    this.rows = el("ul", { class: "shares" });
+    this.notes = el("div", { class: "quiet small" });
+    card.append(el("div", { class: "card-head" }, el("h2", {}, "What mattered")), this.caption, this.rows, this.notes);
+  }
+
+  // It is asked for again when a tenth more trials have ended: reading all of them takes the service a while.
+  async follow(sweep) {
+    const ended = ["completed", "failed", "stopped"].reduce((sum, status) => sum + (sweep.counts[status] ?? 0), 0);
+    const isLast = ended === sweep.num_trials && ended !== this.numEnded;
+    setText(this.caption, this.caption.textContent || "Said once some trials have ended.");
+    if (this.isAsking || ended === 0 || !(isLast || this.numEnded < 0 || ended >= 1.1 * this.numEnded + 1)) return;
+    this.isAsking = true;
+    this.numEnded = ended;
+    try {
+      this.show(await ask(ofSweep(this.name, "/importance")));
+    } catch (error) {
+      setText(this.caption, error.message);
+    } finally {
+      this.isAsking = false;
+    }
+  }
+
+  show({ hyperparams, too_few: tooFew, interactions, edges, notes }) {
+    const known = hyperparams.filter((item) => item.share !== null);
+    setText(
+      this.caption,
+      known.length
+        ? "The share of the points' ranks that each accounts for by itself, with its 95 % interval; grey: may be chance."
+        : "",
+    );
+    const together = interactions.map(({ names }) => `${names.join(" and ")} matter together.`);
+    const sentences = tooFew ? [tooFew, ...notes] : [...together, ...edges.map((edge) => edge.text), ...notes];
+    this.rows.hidden = known.length === 0;
+    reconcile(this.rows, known, (item) => item.name, makeRow, updateRow);
+    reconcile(
+      this.notes,
+      sentences,
+      (sentence) => sentence,
+      (sentence) => el("p", {}, sentence),
+      () => {},
+    );
+  }
+}
+
+function makeRow(item) {
+  return el(
+    "li",
+    {},
+    el("span", { class: "name" }, item.name),
+    el("span", { class: "share", "aria-hidden": "true" }, el("i"), el("b")),
+    el("span", { class: "value" }),
+  );
+}
+
+function updateRow(row, item) {
+  const [, bar, value] = row.children;
+  setAttribute(row, "class", item.is_clear ? null : "unclear");
+  bar.firstElementChild.style.width = width(item.share);
+  const hasRange = item.low !== null && item.high !== null;
+  bar.lastElementChild.hidden = !hasRange;
+  if (hasRange) {
+    bar.lastElementChild.style.left = width(Math.max(0, item.low));
+    bar.lastElementChild.style.width = width(Math.max(0, Math.min(1, item.high) - Math.max(0, item.low)));
+  }
+  setText(value, percentText(item.share));
+  setAttribute(
+    row,
+    "title",
+    `${item.name}: ${percentText(item.share)}${hasRange ? `, ${percentText(item.low)} to ${percentText(item.high)}` : ""}${item.is_clear ? "" : "; may be chance"}`,
+  );
+}

@@ -1,0 +1,97 @@
+// The page: its bar, and the view that the address names.
+import { ask } from "./api.js";
+import { el, setText, speak } from "./dom.js";
+import { counted } from "./format.js";
+import { read } from "./route.js";
+import { openLogin } from "./login.js";
+import { openNew } from "./new_view.js";
+import { openSweep } from "./sweep_view.js";
+import { openSweeps } from "./sweeps_view.js";
+import { me } from "./who.js";
+
+const VIEWS = { sweeps: openSweeps, sweep: openSweep, new: openNew };
+const main = document.getElementById("main");
+let open = null;
+let isSigningIn = false;
+
+function heading(route) {
+  return { sweeps: "Sweeps", new: "New sweep", sweep: route.name }[route.view];
+}
+
+function show() {
+  const route = read();
+  if (isSigningIn) return;
+  const isSame = open && open.route.view === route.view && open.route.name === route.name;
+  if (isSame && open.view.follow) {
+    open.view.follow(route.params);
+    return;
+  }
+  const isFirst = open === null;
+  open?.view.close();
+  main.replaceChildren();
+  document.title = `${heading(route)} · tune-jobs`;
+  for (const link of document.querySelectorAll(".bar nav a")) {
+    const isHere = link.dataset.view === (route.view === "new" ? "new" : "sweeps");
+    if (isHere) link.setAttribute("aria-current", route.view === link.dataset.view ? "page" : "true");
+    else link.removeAttribute("aria-current");
+  }
+  open = { route, view: VIEWS[route.view](main, route) };
+  scrollTo(0, 0);
+  if (!isFirst) {
+    // A reader of the screen hears where they are now.
+    main.focus({ preventScroll: true });
+    speak(heading(route));
+  }
+}
+
+function tellWho(found) {
+  const cpus = found.num_cpus ? counted(found.num_cpus, "CPU") : found.address ? `cluster ${found.address}` : "";
+  const who = found.name === "local" ? "" : `${found.name}, ${found.role}`;
+  setText(document.getElementById("where"), [who, cpus].filter(Boolean).join(" · "));
+  document.getElementById("log-out").hidden = found.name === "local";
+}
+
+async function begin() {
+  try {
+    Object.assign(me, await ask("me"));
+    tellWho(me);
+  } catch (error) {
+    if (error.status === 401) return;
+    main.replaceChildren(
+      el(
+        "div",
+        { class: "notice bad", role: "alert" },
+        el("p", {}, error.message),
+        el("p", { class: "quiet" }, error.hint ?? ""),
+      ),
+    );
+    setTimeout(begin, 3000);
+    return;
+  }
+  show();
+}
+
+addEventListener("sign-in-needed", () => {
+  if (isSigningIn) return;
+  isSigningIn = true;
+  open?.view.close();
+  open = null;
+  document.body.classList.add("signing-in");
+  openLogin(main, () => {
+    isSigningIn = false;
+    document.body.classList.remove("signing-in");
+    main.replaceChildren();
+    begin();
+  });
+});
+addEventListener("hashchange", show);
+document.getElementById("log-out").addEventListener("click", async () => {
+  await ask("logout", { method: "POST" }).catch(() => {});
+  location.reload();
+});
+document.getElementById("skip").addEventListener("click", (event) => {
+  // The fragment is the view's address, not a place on the page.
+  event.preventDefault();
+  main.focus();
+});
+begin();

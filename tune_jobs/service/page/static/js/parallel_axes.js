@@ -1,0 +1,121 @@
+// The axes of parallel coordinates: where a value lies on its axis (0 below, 1 at the top), and which values a range has.
+import { returnText, settingText } from "./format.js";
+
+const NUM_TICKS = 4;
+
+export function axesOf(data, trials) {
+  const axes = data.searched.map((searched) =>
+    axisOf(
+      searched,
+      trials.map((trial) => trial.point[searched.name]).filter((value) => value !== undefined && value !== null),
+    ),
+  );
+  const scores = trials.map((trial) => trial.score).filter((score) => score !== null);
+  if (scores.length)
+    axes.push({
+      ...rangeAxis("score", "linear", scores),
+      isScore: true,
+      valueOf: (trial) => trial.score,
+      text: returnText,
+    });
+  return axes.map((axis) => ({ valueOf: (trial) => trial.point[axis.name] ?? null, ...axis }));
+}
+
+function axisOf({ name, kind, values }, found) {
+  const isNumeric = found.length > 0 && found.every((value) => typeof value === "number");
+  if (kind === "listed" || !isNumeric) return listedAxis(name, [...values, ...found]);
+  return rangeAxis(name, kind === "log" && found.every((value) => value > 0) ? "log" : "linear", found);
+}
+
+function listedAxis(name, values) {
+  const texts = [...new Set(values.map((value) => settingText(value)))];
+  const isNumeric = values.every((value) => typeof value === "number");
+  if (isNumeric) texts.sort((a, b) => Number(a) - Number(b));
+  const place = (value) => {
+    const index = texts.indexOf(settingText(value));
+    return texts.length === 1 ? 0.5 : index / (texts.length - 1);
+  };
+  return {
+    name,
+    kind: "listed",
+    texts,
+    place,
+    text: (value) => settingText(value),
+    ticks: texts.map((text) => ({ text, at: place(text) })),
+    // A range of the axis as its values, and the other way round.
+    rangeText: (low, high) => texts.filter((text) => place(text) >= low - 1e-9 && place(text) <= high + 1e-9).join("|"),
+    test: (range) => {
+      const wanted = new Set(range.split("|"));
+      return (value) => wanted.has(settingText(value));
+    },
+    ends: (range) => {
+      const at = range
+        .split("|")
+        .filter((text) => texts.includes(text))
+        .map(place);
+      return at.length ? [Math.min(...at), Math.max(...at)] : null;
+    },
+  };
+}
+
+function rangeAxis(name, kind, values) {
+  let [low, high] = values.reduce(([a, b], value) => [Math.min(a, value), Math.max(b, value)], [Infinity, -Infinity]);
+  if (low === high) [low, high] = kind === "log" ? [low / 2, high * 2] : [low - 1, high + 1];
+  const by = kind === "log" ? Math.log10 : (value) => value;
+  const back = kind === "log" ? (value) => 10 ** value : (value) => value;
+  const place = (value) => (by(value) - by(low)) / (by(high) - by(low));
+  const valueAt = (at) => back(by(low) + at * (by(high) - by(low)));
+  return {
+    name,
+    kind,
+    place,
+    valueAt,
+    text: (value) => settingText(value, 3),
+    ticks: (kind === "log" ? logTicks(low, high) : linearTicks(low, high)).map((value) => ({
+      text: settingText(value, 3),
+      at: place(value),
+    })),
+    rangeText: (from, to) => `${rounded(valueAt(from))}..${rounded(valueAt(to))}`,
+    test: (range) => {
+      const [from, to] = range.split("..").map(Number);
+      return (value) => value >= from && value <= to;
+    },
+    ends: (range) => {
+      const ends = range.split("..").map(Number).map(place);
+      return ends.every(Number.isFinite) ? ends.map((at) => Math.max(0, Math.min(1, at))) : null;
+    },
+  };
+}
+
+const rounded = (value) => Number(value.toPrecision(4));
+
+function logTicks(low, high) {
+  const decades = [];
+  for (let power = Math.ceil(Math.log10(low) - 1e-9); power <= Math.floor(Math.log10(high) + 1e-9); power += 1)
+    decades.push(10 ** power);
+  if (decades.length < 2) return finerLogTicks(low, high);
+  const step = Math.ceil(decades.length / (NUM_TICKS + 1));
+  return decades.filter((_, index) => index % step === 0);
+}
+
+// 1, 2 and 5 of each decade; where not even two of them lie within, the ends.
+function finerLogTicks(low, high) {
+  const ticks = [];
+  for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power += 1) {
+    for (const factor of [1, 2, 5]) {
+      const value = Number(`${factor}e${power}`);
+      if (value >= low * 0.999 && value <= high * 1.001) ticks.push(value);
+    }
+  }
+  return ticks.length > 1 ? ticks : [low, high];
+}
+
+function linearTicks(low, high) {
+  const rough = (high - low) / NUM_TICKS;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough * 0.999);
+  const ticks = [];
+  for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-6; value += step)
+    ticks.push(Number(value.toPrecision(12)));
+  return ticks;
+}

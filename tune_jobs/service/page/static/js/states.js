@@ -1,0 +1,42 @@
+// What state a sweep is in for people: its own, and that of the job which the service has for it.
+const TONES = { running: "live", stopping: "live", waiting: "wait", completed: "good", failed: "bad" };
+
+export const isLive = (sweep) => sweep.state === "running" || sweep.job?.state === "running";
+export const isWaiting = (sweep) => !isLive(sweep) && ["waiting", "creating"].includes(sweep.job?.state);
+
+export function stateOf(sweep) {
+  const word = stateWord(sweep);
+  return { word, tone: TONES[word] ?? "quiet", group: groupOf(word) };
+}
+
+function stateWord(sweep) {
+  const job = sweep.job;
+  if (isLive(sweep)) return job?.stop_requested ? "stopping" : "running";
+  if (isWaiting(sweep)) return "waiting";
+  if (job?.outcome === "failed") return "failed";
+  if (sweep.state === "completed") return "completed";
+  if (job?.outcome === "stopped" || job?.outcome === "cancelled") return "stopped";
+  return sweep.state;
+}
+
+function groupOf(word) {
+  if (word === "running" || word === "stopping") return "running";
+  return word === "waiting" || word === "created" ? "waiting" : "ended";
+}
+
+// What there is to say of a state, as a sentence; empty: the word says it.
+export function stateReason(sweep) {
+  const { word } = stateOf(sweep);
+  if (word === "failed") return sweep.job?.message || "Its driver failed; the service's log has more.";
+  if (word === "stopping") return "Its trials save first.";
+  if (word === "waiting")
+    return sweep.job?.verb === "drive" ? "It starts when its turn has come." : `${sweep.job.verb} waits for its turn.`;
+  if (word === "interrupted") return "Its process is gone: resume it, and it goes on from what was saved.";
+  if (word === "created") return "It is written, but was never started: resume it.";
+  return "";
+}
+
+export const TRIAL_STATUSES = ["running", "pending", "paused", "completed", "stopped", "failed"];
+
+export const trialTone = (status) =>
+  ({ running: "live", completed: "good", failed: "bad", pending: "wait" })[status] ?? "quiet";

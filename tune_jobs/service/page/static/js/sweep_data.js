@@ -1,0 +1,131 @@
+// What is known of one sweep: its summary, its sweep file, its trials and their curves.
+import { ask, askAll, ofSweep } from "./api.js";
+
+const FIELDS = [
+  "trial_id",
+  "index",
+  "point_index",
+  "seed_index",
+  "seed",
+  "point",
+  "status",
+  "score",
+  "training_return",
+  "evaluation_return",
+  "num_iterations",
+  "num_env_steps",
+  "time_s",
+  "stop_reason",
+  "started_at",
+  "ended_at",
+  "node",
+  "num_failures",
+].join(",");
+const LOG_DOMAINS = ["loguniform", "qloguniform", "lograndint", "qlograndint"];
+const LISTED = ["grid", "choice"];
+
+export class SweepData {
+  constructor(name) {
+    this.name = name;
+    this.summary = null;
+    this.spec = null;
+    this.trials = [];
+    // By trial, in columns: env steps, training returns, evaluation returns, and the iterations that they are of.
+    this.curves = new Map();
+    this.places = new Map();
+  }
+
+  // Fetch all; the curves come first, as the events continue from them. Returns the path of the events.
+  async load() {
+    const curves = await ask(ofSweep(this.name, "/curves"));
+    const [summary, spec, trials] = await Promise.all([
+      ask(ofSweep(this.name)),
+      this.spec ?? ask(ofSweep(this.name, "/spec")),
+      askAll(ofSweep(this.name, "/trials"), "trials", { fields: FIELDS, sort: "index", order: "asc" }),
+    ]);
+    Object.assign(this, { summary, spec, trials });
+    this.curves = new Map(Object.entries(curves.trials));
+    this.places = new Map(trials.map((trial, place) => [trial.trial_id, place]));
+    return ofSweep(this.name, `/events?last_event_id=${encodeURIComponent(curves.last_event_id)}`);
+  }
+
+  apply(kind, data) {
+    if (kind === "status") this.summary = data;
+    else if (kind === "trials") this.setTrials(data.trials);
+    else if (kind === "iterations") for (const [id, rows] of Object.entries(data.trials)) this.addRows(id, rows);
+  }
+
+  setTrials(changed) {
+    // Another list, so that who has drawn the old one sees that there is a new one.
+    this.trials = this.trials.slice();
+    for (const trial of changed) {
+      if (!this.places.has(trial.trial_id)) this.places.set(trial.trial_id, this.trials.length);
+      this.trials[this.places.get(trial.trial_id)] = trial;
+    }
+  }
+
+  // New points of a curve: those that are known of later iterations than `after` are no more.
+  addRows(id, rows) {
+    const known = this.curves.get(id) ?? {
+      iteration: [],
+      num_env_steps: [],
+      training_return: [],
+      evaluation_return: [],
+    };
+    const length = known.iteration.findLastIndex((iteration) => iteration <= rows.after) + 1;
+    this.curves.set(
+      id,
+      Object.fromEntries(
+        Object.keys(known).map((column) => [column, [...known[column].slice(0, length), ...rows[column]]]),
+      ),
+    );
+  }
+
+  // The searched hyperparameters in the order of the sweep file, each with how it is drawn.
+  get searched() {
+    const space = this.spec?.space ?? {};
+    const inPoints = new Set(this.trials.flatMap((trial) => Object.keys(trial.point)));
+    const names = [
+      ...Object.keys(space).filter((name) => inPoints.has(name)),
+      ...[...inPoints].filter((name) => !(name in space)),
+    ];
+    const isNumber = (name) => this.trials.every((trial) => ["number", "undefined"].includes(typeof trial.point[name]));
+    return names.map((name) => ({ name, isNumber: isNumber(name), ...kindOf(space[name]) }));
+  }
+
+  get hasSeveralSeeds() {
+    return this.trials.some((trial) => trial.seed_index > 0);
+  }
+
+  // The return at which the sweep file calls a trial done; null: it names none.
+  get goal() {
+    return (
+      this.spec?.objective?.threshold ?? this.spec?.stop?.evaluation_return ?? this.spec?.stop?.training_return ?? null
+    );
+  }
+
+  // Points by their mean scores over seeds, best first; those with a failed seed come after, as in the report.
+  rankedPoints(trials) {
+    const points = new Map();
+    for (const trial of trials) {
+      const point = points.get(trial.point_index) ?? { index: trial.point_index, point: trial.point, trials: [] };
+      point.trials.push(trial);
+      points.set(trial.point_index, point);
+    }
+    for (const point of points.values()) {
+      const scores = point.trials.map((trial) => trial.score).filter((score) => score !== null);
+      point.score = scores.length ? scores.reduce((sum, score) => sum + score, 0) / scores.length : null;
+      point.hasFailed = point.trials.some((trial) => trial.status === "failed");
+    }
+    return [...points.values()].sort(
+      (a, b) =>
+        a.hasFailed - b.hasFailed || (a.score === null) - (b.score === null) || b.score - a.score || a.index - b.index,
+    );
+  }
+}
+
+function kindOf(domain) {
+  const type = domain && typeof domain === "object" ? Object.keys(domain)[0] : null;
+  if (type === null || LISTED.includes(type)) return { kind: "listed", values: type === null ? [] : domain[type] };
+  return { kind: LOG_DOMAINS.includes(type) ? "log" : "linear", values: [] };
+}

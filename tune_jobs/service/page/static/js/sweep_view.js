@@ -1,0 +1,250 @@
+// One sweep, live. What is looked at is in the address: sort, filter, ranges, the chosen trials and the opened one.
+import { makeActions } from "./actions.js";
+import { ask, ofSweep } from "./api.js";
+import { BestChart } from "./best_chart.js";
+import { COLOURS, CurvesChart } from "./curves_chart.js";
+import { makeAlert, refusal } from "./dialogs.js";
+import { colour, el, isTyping } from "./dom.js";
+import { filterOf } from "./filter.js";
+import { Finished } from "./finished.js";
+import { follow } from "./follow.js";
+import { ImportanceCard } from "./importance.js";
+import { axesOf } from "./parallel_axes.js";
+import { Parallel } from "./parallel.js";
+import { keep } from "./route.js";
+import { SweepData } from "./sweep_data.js";
+import { SweepHead } from "./sweep_head.js";
+import { columnsOf, sortRows } from "./trial_columns.js";
+import { TrialPanel } from "./trial_panel.js";
+import { TrialTable } from "./trial_table.js";
+
+const RANGE = "in.";
+
+function seenOf(params) {
+  const ranges = Object.entries(params)
+    .filter(([key]) => key.startsWith(RANGE))
+    .map(([key, text]) => [key.slice(RANGE.length), text]);
+  return {
+    sort: params.sort ?? "score",
+    isRising: params.order === "asc",
+    filter: params.filter ?? "",
+    metric: params.metric === "evaluation" ? "evaluation" : "training",
+    chosen: (params.chosen ?? "").split(",").filter(Boolean),
+    trial: params.trial ?? null,
+    ranges: Object.fromEntries(ranges),
+  };
+}
+
+export function openSweep(main, route) {
+  const data = new SweepData(route.name);
+  let seen = seenOf(route.params);
+  let columns = [];
+  let columnKey = "";
+  let shown = [];
+  let isClosed = false;
+
+  const alert = makeAlert();
+  const actions = makeActions({
+    state: () => data.summary,
+    alert,
+    onDone: refreshHead,
+    onGone: () => {
+      location.hash = "#/";
+    },
+  });
+  const page = el("div", { class: "sweep-page", hidden: true });
+  const loading = el("p", { class: "empty quiet", role: "status" }, "Loading…");
+  const content = el("div", { class: "sweep-content" });
+  page.append(content);
+  main.append(loading, page);
+  const open = (id) => {
+    if (id) change({ trial: id });
+  };
+  const head = new SweepHead(content, { name: route.name, actions, alert, onOpen: open });
+  const card = (label, kind) => el("section", { class: `card ${kind}`, "aria-label": label });
+  const cards = {
+    finished: card("Result", "finished"),
+    curves: card("Learning curves", "curves"),
+    best: card("Best so far", "best-card"),
+    parallel: card("Values and scores", "values"),
+    importance: card("Importance", "importance"),
+    table: card("Trials", "table-card trials-card"),
+  };
+  content.append(el("div", { class: "grid" }, ...Object.values(cards)));
+  const finished = new Finished(cards.finished, route.name, { onOpen: open });
+  const curves = new CurvesChart(cards.curves, { onOpen: open, onMetric: (metric) => change({ metric }) });
+  const best = new BestChart(cards.best, { onOpen: open });
+  const parallel = new Parallel(cards.parallel, { onRange: setRange, onOpen: open });
+  const importance = new ImportanceCard(cards.importance, route.name);
+  const filter = el("input", {
+    type: "search",
+    "aria-label": "Filter trials",
+    placeholder: "Filter: relu score>150 status=failed",
+    value: seen.filter,
+  });
+  const clear = el("button", { type: "button", hidden: true, onclick: () => change({ chosen: [] }) });
+  const bar = el("div", { class: "card-head" }, el("h2", {}, "Trials"), filter, clear);
+  cards.table.append(bar);
+  const table = new TrialTable(cards.table, {
+    onSort: (key) =>
+      change({
+        sort: key,
+        isRising: seen.sort === key ? !seen.isRising : !columns.find((column) => column.key === key)?.isNumber,
+      }),
+    onOpen: open,
+    onChoose: choose,
+    onHover: (id) => parallel.highlight(id),
+  });
+  bar.append(table.told);
+  const panel = new TrialPanel(page, {
+    sweep: route.name,
+    onClose: () => {
+      const id = seen.trial;
+      change({ trial: null });
+      // The focus goes back to where it came from.
+      table.focus(shown.findIndex((row) => row.trial_id === id));
+    },
+    onStep: (by) => {
+      const place = shown.findIndex((row) => row.trial_id === seen.trial) + by;
+      if (shown[place]) change({ trial: shown[place].trial_id });
+    },
+  });
+  filter.addEventListener("input", () => change({ filter: filter.value }));
+  const shortcut = (event) => {
+    if (event.key !== "/" || isTyping(event.target) || event.ctrlKey || event.metaKey) return;
+    event.preventDefault();
+    filter.focus();
+  };
+  addEventListener("keydown", shortcut);
+
+  function change(changes) {
+    Object.assign(seen, changes);
+    const ranges = Object.fromEntries(
+      Object.keys(route.params)
+        .filter((key) => key.startsWith(RANGE))
+        .map((key) => [key, null]),
+    );
+    for (const [name, text] of Object.entries(seen.ranges)) ranges[RANGE + name] = text;
+    keep({
+      sort: seen.sort === "score" ? null : seen.sort,
+      order: seen.isRising ? "asc" : null,
+      filter: seen.filter,
+      metric: seen.metric === "training" ? null : seen.metric,
+      chosen: seen.chosen.join(","),
+      trial: seen.trial,
+      ...ranges,
+    });
+    Object.assign(route.params, ranges);
+    show();
+  }
+
+  function setRange(name, text) {
+    const { [name]: _, ...others } = seen.ranges;
+    change({ ranges: text === null ? others : { ...others, [name]: text } });
+  }
+
+  function choose(id) {
+    change({ chosen: seen.chosen.includes(id) ? seen.chosen.filter((known) => known !== id) : [...seen.chosen, id] });
+  }
+
+  function matchingTrials() {
+    const axes = axesOf(data, data.trials);
+    const tests = Object.entries(seen.ranges).flatMap(([name, text]) => {
+      const axis = axes.find((known) => known.name === name);
+      if (!axis) return [];
+      const test = axis.test(text);
+      return [(trial) => axis.valueOf(trial) !== null && test(axis.valueOf(trial))];
+    });
+    const wanted = filterOf(seen.filter, columns);
+    return data.trials.filter((trial) => wanted(trial) && tests.every((test) => test(trial)));
+  }
+
+  function show() {
+    if (data.summary === null) return;
+    const searched = data.searched;
+    const key = JSON.stringify([searched, data.hasSeveralSeeds]);
+    if (key !== columnKey) {
+      columnKey = key;
+      columns = columnsOf(searched, data.hasSeveralSeeds);
+    }
+    const matching = matchingTrials();
+    const column = columns.find((known) => known.key === seen.sort) ?? columns.find((known) => known.key === "score");
+    shown = sortRows(matching, column, seen.isRising);
+    const chosen = new Map(seen.chosen.map((id, index) => [id, colour(COLOURS[index % COLOURS.length])]));
+    const named = new Map(seen.chosen.map((id, index) => [id, COLOURS[index % COLOURS.length]]));
+    clear.hidden = seen.chosen.length === 0;
+    clear.textContent = `Clear ${seen.chosen.length} chosen`;
+    curves.show({ data, matching, chosen: named, metric: seen.metric });
+    best.show({ data });
+    parallel.show({ data, matching: new Set(matching.map((trial) => trial.trial_id)), ranges: seen.ranges, chosen });
+    table.show({
+      rows: shown,
+      numAll: data.trials.length,
+      columns,
+      sort: column.key,
+      isRising: seen.isRising,
+      chosen,
+      opened: seen.trial,
+    });
+    if (seen.trial === null) panel.hide();
+    else panel.open(seen.trial);
+    page.classList.toggle("with-panel", seen.trial !== null);
+  }
+
+  // The events tell it too, a moment later.
+  async function refreshHead() {
+    try {
+      data.summary = await ask(ofSweep(route.name));
+      showHead();
+    } catch (error) {
+      alert.show(error);
+    }
+  }
+
+  function showHead() {
+    head.show(data.summary);
+    actions.show();
+  }
+
+  const followed = follow({
+    kinds: ["status", "trials", "iterations", "deleted"],
+    load: () => data.load(),
+    apply(kind, changes) {
+      if (kind === "deleted")
+        alert.show({ message: `Sweep ${route.name} was deleted.`, hint: "What is shown is how it was." });
+      else data.apply(kind, changes);
+    },
+    async show(error) {
+      if (error !== null) {
+        if (page.hidden) loading.replaceChildren(...refusal(error));
+        else if (error.status === 404) alert.show(error);
+        return;
+      }
+      // What a finished sweep came to stands above the rest, which would jump if it came later.
+      if (page.hidden) await finished.follow(data.summary);
+      else finished.follow(data.summary);
+      if (isClosed) return;
+      loading.hidden = true;
+      page.hidden = false;
+      cards.importance.hidden = data.searched.length === 0;
+      showHead();
+      show();
+      importance.follow(data.summary);
+    },
+  });
+
+  return {
+    follow(params) {
+      seen = seenOf(params);
+      route.params = { ...params };
+      filter.value = seen.filter;
+      show();
+    },
+    close() {
+      isClosed = true;
+      followed.close();
+      removeEventListener("keydown", shortcut);
+      for (const part of [actions, curves, best, parallel, table, panel]) part.close();
+    },
+  };
+}
