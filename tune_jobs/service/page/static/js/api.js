@@ -54,14 +54,15 @@ export async function ask(path, { method = "GET", query = {}, body, headers = {}
   return answer.status === 204 ? null : answer.json();
 }
 
-// All items of a list that comes in pages.
-export async function askAll(path, key, query = {}, signal = undefined) {
+// All items of a list that comes in pages; `onPart(items)` is called with what is there so far, if there is more.
+export async function askAll(path, key, query = {}, onPart = () => {}) {
   const items = [];
   let cursor = null;
   do {
-    const page = await ask(path, { query: { limit: 1000, ...query, cursor }, signal });
+    const page = await ask(path, { query: { limit: 1000, ...query, cursor } });
     items.push(...page[key]);
     cursor = page.next_cursor;
+    if (cursor) onPart(items);
   } while (cursor);
   return items;
 }

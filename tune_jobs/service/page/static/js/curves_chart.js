@@ -5,7 +5,8 @@ import { bandOf, drawLine, lineOf, valueAt } from "./lines.js";
 import { Plot, withAir } from "./plot.js";
 
 export const NUM_LEADING = 5;
-export const COLOURS = ["series-0", "series-1", "series-2", "series-3", "series-4", "series-5"];
+// Without the light blue, which on a dark page is too near to the blue.
+export const COLOURS = ["series-0", "series-1", "series-2", "series-3", "series-5"];
 const MOST_PALE = 400;
 const NEAR_PX = 24;
 

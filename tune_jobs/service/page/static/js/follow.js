@@ -95,7 +95,11 @@ export function follow({ load, kinds, apply, show, opened = null }) {
     else if (source === null) begin();
   }
 
+  // A page that the reader has left may be kept for the way back, with its connection.
+  const shown = (event) => event.persisted && begin();
   document.addEventListener("visibilitychange", seen);
+  addEventListener("pagehide", end);
+  addEventListener("pageshow", shown);
   begin();
   return {
     close() {
@@ -103,6 +107,8 @@ export function follow({ load, kinds, apply, show, opened = null }) {
       end();
       clearTimeout(hiding);
       document.removeEventListener("visibilitychange", seen);
+      removeEventListener("pagehide", end);
+      removeEventListener("pageshow", shown);
       tell(true);
     },
   };

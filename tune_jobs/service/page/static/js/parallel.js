@@ -1,7 +1,6 @@
 // Parallel coordinates: a line a trial, on a canvas; the axes and the ranges that a reader sets on them are SVG.
 import { colour, el, onThemeChange, reconcile, setAttribute, setText, svg } from "./dom.js";
 import { returnText, settingText } from "./format.js";
-import { axesOf } from "./parallel_axes.js";
 import { HEIGHT, makeMarks, placeAt, placeMarks, showRange, SIDE, topOf } from "./parallel_marks.js";
 
 const LEAST_AXIS_PX = 110;
@@ -19,9 +18,10 @@ export class Parallel {
     this.hovered = null;
     this.drag = null;
     this.canvas = el("canvas", { "aria-hidden": "true" });
+    this.over = el("canvas", { "aria-hidden": "true" });
     this.svg = svg("svg", { class: "axes", role: "group", "aria-label": "Ranges on the axes" });
     this.tip = el("div", { class: "tip", hidden: true });
-    this.box = el("div", { class: "parallel" }, this.canvas, this.svg, this.tip);
+    this.box = el("div", { class: "parallel" }, this.canvas, this.over, this.svg, this.tip);
     this.scroller = el("div", { class: "sideways" }, this.box);
     this.none = el("p", { class: "missing quiet" });
     this.clear = el(
@@ -56,7 +56,7 @@ export class Parallel {
   // `matching` is the set of ids that filter and ranges let through.
   show({ data, matching, ranges, chosen }) {
     const drawn = data.trials.filter((trial) => Object.keys(trial.point).length);
-    const axes = axesOf(data, drawn);
+    const { axes } = data;
     Object.assign(this, { trials: drawn, axes, matching, ranges, chosen });
     const has = axes.some((axis) => !axis.isScore);
     this.scroller.hidden = this.legend.hidden = !has;
@@ -92,8 +92,10 @@ export class Parallel {
     this.box.style.width = `${width}px`;
     const ratio = devicePixelRatio;
     // To set it clears the canvas, and takes a while.
-    if (this.canvas.width !== Math.round(width * ratio)) this.canvas.width = Math.round(width * ratio);
-    if (this.canvas.height !== Math.round(HEIGHT * ratio)) this.canvas.height = Math.round(HEIGHT * ratio);
+    for (const canvas of [this.canvas, this.over]) {
+      if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
+      if (canvas.height !== Math.round(HEIGHT * ratio)) canvas.height = Math.round(HEIGHT * ratio);
+    }
     setAttribute(this.svg, "viewBox", `0 0 ${width} ${HEIGHT}`);
     const last = this.axes.length - 1;
     const gap = (width - 2 * SIDE) / Math.max(1, last);
@@ -156,11 +158,19 @@ export class Parallel {
       context.strokeStyle = this.chosen.get(trial.trial_id);
       this.stroke(context, [trial], 2.5);
     }
+    this.paintHovered();
+  }
+
+  // On a canvas of its own, as thousands of lines take longer than a pointer's move.
+  paintHovered() {
+    const context = this.over.getContext("2d");
+    context.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
+    context.clearRect(0, 0, this.width, HEIGHT);
     const near = this.trials.find((trial) => trial.trial_id === this.hovered);
-    if (near) {
-      context.strokeStyle = colour("ink");
-      this.stroke(context, [near], 2.5);
-    }
+    if (!near) return;
+    context.lineJoin = "round";
+    context.strokeStyle = colour("ink");
+    this.stroke(context, [near], 2.5);
   }
 
   stroke(context, trials, width) {
@@ -226,6 +236,9 @@ export class Parallel {
 
   setRange(axis, [low, high]) {
     const text = low <= 0 && high >= 1 ? null : axis.rangeText(low, high);
+    const { [axis.name]: _, ...others } = this.ranges;
+    // Known at once, as the next key may come before the next frame.
+    this.ranges = text ? { ...others, [axis.name]: text } : others;
     this.act.onRange(axis.name, text || null);
   }
 
@@ -293,7 +306,7 @@ export class Parallel {
   highlight(id) {
     if (id === this.hovered) return;
     this.hovered = id;
-    this.paint();
+    if (this.axes.length) this.paintHovered();
   }
 
   close() {

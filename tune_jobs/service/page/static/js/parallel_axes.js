@@ -3,8 +3,8 @@ import { returnText, settingText } from "./format.js";
 
 const NUM_TICKS = 4;
 
-export function axesOf(data, trials) {
-  const axes = data.searched.map((searched) =>
+export function axesOf(searchedOnes, trials) {
+  const axes = searchedOnes.map((searched) =>
     axisOf(
       searched,
       trials.map((trial) => trial.point[searched.name]).filter((value) => value !== undefined && value !== null),
@@ -31,10 +31,8 @@ function listedAxis(name, values) {
   const texts = [...new Set(values.map((value) => settingText(value)))];
   const isNumeric = values.every((value) => typeof value === "number");
   if (isNumeric) texts.sort((a, b) => Number(a) - Number(b));
-  const place = (value) => {
-    const index = texts.indexOf(settingText(value));
-    return texts.length === 1 ? 0.5 : index / (texts.length - 1);
-  };
+  const places = new Map(texts.map((text, index) => [text, texts.length === 1 ? 0.5 : index / (texts.length - 1)]));
+  const place = (value) => places.get(settingText(value));
   return {
     name,
     kind: "listed",

@@ -1,5 +1,6 @@
 // What is known of one sweep: its summary, its sweep file, its trials and their curves.
 import { ask, askAll, ofSweep } from "./api.js";
+import { axesOf } from "./parallel_axes.js";
 
 const FIELDS = [
   "trial_id",
@@ -33,20 +34,33 @@ export class SweepData {
     // By trial, in columns: env steps, training returns, evaluation returns, and the iterations that they are of.
     this.curves = new Map();
     this.places = new Map();
+    this.kept = {};
   }
 
-  // Fetch all; the curves come first, as the events continue from them. Returns the path of the events.
-  async load() {
+  // Fetch all; the curves come first, as the events continue from them. `onPart()` is called when there is something to
+  // show, and more to come. Returns the path of the events.
+  async load(onPart = () => {}) {
     const curves = await ask(ofSweep(this.name, "/curves"));
-    const [summary, spec, trials] = await Promise.all([
-      ask(ofSweep(this.name)),
-      this.spec ?? ask(ofSweep(this.name, "/spec")),
-      askAll(ofSweep(this.name, "/trials"), "trials", { fields: FIELDS, sort: "index", order: "asc" }),
-    ]);
-    Object.assign(this, { summary, spec, trials });
-    this.curves = new Map(Object.entries(curves.trials));
+    const [summary, spec] = await Promise.all([ask(ofSweep(this.name)), this.spec ?? ask(ofSweep(this.name, "/spec"))]);
+    const isFirst = this.summary === null;
+    Object.assign(this, { summary, spec, curves: new Map(Object.entries(curves.trials)) });
+    const query = { fields: FIELDS, sort: "index", order: "asc" };
+    const trials = await askAll(ofSweep(this.name, "/trials"), "trials", query, (some) => {
+      // Later on there is more to be seen than a part.
+      if (!isFirst || this.trials.length) return;
+      this.trials = some.slice();
+      onPart();
+    });
+    this.trials = trials;
     this.places = new Map(trials.map((trial, place) => [trial.trial_id, place]));
     return ofSweep(this.name, `/events?last_event_id=${encodeURIComponent(curves.last_event_id)}`);
+  }
+
+  // What is worked out of the trials, kept until there are others.
+  keep(name, make) {
+    if (this.kept.of !== this.trials) this.kept = { of: this.trials };
+    this.kept[name] ??= make();
+    return this.kept[name];
   }
 
   apply(kind, data) {
@@ -83,6 +97,15 @@ export class SweepData {
 
   // The searched hyperparameters in the order of the sweep file, each with how it is drawn.
   get searched() {
+    return this.keep("searched", () => this.findSearched());
+  }
+
+  // The axes of parallel coordinates.
+  get axes() {
+    return this.keep("axes", () => axesOf(this.searched, this.trials));
+  }
+
+  findSearched() {
     const space = this.spec?.space ?? {};
     const inPoints = new Set(this.trials.flatMap((trial) => Object.keys(trial.point)));
     const names = [
@@ -94,7 +117,7 @@ export class SweepData {
   }
 
   get hasSeveralSeeds() {
-    return this.trials.some((trial) => trial.seed_index > 0);
+    return this.keep("hasSeveralSeeds", () => this.trials.some((trial) => trial.seed_index > 0));
   }
 
   // The return at which the sweep file calls a trial done; null: it names none.

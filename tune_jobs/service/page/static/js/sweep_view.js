@@ -9,7 +9,6 @@ import { filterOf } from "./filter.js";
 import { Finished } from "./finished.js";
 import { follow } from "./follow.js";
 import { ImportanceCard } from "./importance.js";
-import { axesOf } from "./parallel_axes.js";
 import { Parallel } from "./parallel.js";
 import { keep } from "./route.js";
 import { SweepData } from "./sweep_data.js";
@@ -42,6 +41,7 @@ export function openSweep(main, route) {
   let columnKey = "";
   let shown = [];
   let isClosed = false;
+  let frame = 0;
 
   const alert = makeAlert();
   const actions = makeActions({
@@ -148,9 +148,8 @@ export function openSweep(main, route) {
   }
 
   function matchingTrials() {
-    const axes = axesOf(data, data.trials);
     const tests = Object.entries(seen.ranges).flatMap(([name, text]) => {
-      const axis = axes.find((known) => known.name === name);
+      const axis = data.axes.find((known) => known.name === name);
       if (!axis) return [];
       const test = axis.test(text);
       return [(trial) => axis.valueOf(trial) !== null && test(axis.valueOf(trial))];
@@ -171,12 +170,8 @@ export function openSweep(main, route) {
     const column = columns.find((known) => known.key === seen.sort) ?? columns.find((known) => known.key === "score");
     shown = sortRows(matching, column, seen.isRising);
     const chosen = new Map(seen.chosen.map((id, index) => [id, colour(COLOURS[index % COLOURS.length])]));
-    const named = new Map(seen.chosen.map((id, index) => [id, COLOURS[index % COLOURS.length]]));
     clear.hidden = seen.chosen.length === 0;
     clear.textContent = `Clear ${seen.chosen.length} chosen`;
-    curves.show({ data, matching, chosen: named, metric: seen.metric });
-    best.show({ data });
-    parallel.show({ data, matching: new Set(matching.map((trial) => trial.trial_id)), ranges: seen.ranges, chosen });
     table.show({
       rows: shown,
       numAll: data.trials.length,
@@ -186,9 +181,20 @@ export function openSweep(main, route) {
       chosen,
       opened: seen.trial,
     });
+    // The table answers at once, the charts with the next frame.
+    cancelAnimationFrame(frame);
+    frame = requestAnimationFrame(() => showCharts(matching, chosen));
     if (seen.trial === null) panel.hide();
     else panel.open(seen.trial);
     page.classList.toggle("with-panel", seen.trial !== null);
+  }
+
+  function showCharts(matching, chosen) {
+    if (isClosed) return;
+    const named = new Map(seen.chosen.map((id, index) => [id, COLOURS[index % COLOURS.length]]));
+    curves.show({ data, matching, chosen: named, metric: seen.metric });
+    best.show({ data });
+    parallel.show({ data, matching: new Set(matching.map((trial) => trial.trial_id)), ranges: seen.ranges, chosen });
   }
 
   // The events tell it too, a moment later.
@@ -208,30 +214,32 @@ export function openSweep(main, route) {
 
   const followed = follow({
     kinds: ["status", "trials", "iterations", "deleted"],
-    load: () => data.load(),
+    load: () => data.load(() => showAll()),
     apply(kind, changes) {
       if (kind === "deleted")
         alert.show({ message: `Sweep ${route.name} was deleted.`, hint: "What is shown is how it was." });
       else data.apply(kind, changes);
     },
-    async show(error) {
-      if (error !== null) {
-        if (page.hidden) loading.replaceChildren(...refusal(error));
-        else if (error.status === 404) alert.show(error);
-        return;
-      }
-      // What a finished sweep came to stands above the rest, which would jump if it came later.
-      if (page.hidden) await finished.follow(data.summary);
-      else finished.follow(data.summary);
-      if (isClosed) return;
-      loading.hidden = true;
-      page.hidden = false;
-      cards.importance.hidden = data.searched.length === 0;
-      showHead();
-      show();
-      importance.follow(data.summary);
+    show(error) {
+      if (error === null) return showAll();
+      if (page.hidden) loading.replaceChildren(...refusal(error));
+      else if (error.status === 404) alert.show(error);
+      return undefined;
     },
   });
+
+  async function showAll() {
+    // What a finished sweep came to stands above the rest, which would jump if it came later.
+    const told = finished.follow(data.summary);
+    if (page.hidden) await told;
+    if (isClosed) return;
+    loading.hidden = true;
+    page.hidden = false;
+    cards.importance.hidden = data.searched.length === 0;
+    showHead();
+    show();
+    importance.follow(data.summary);
+  }
 
   return {
     follow(params) {

@@ -1,6 +1,8 @@
 // The columns of the table of trials, which the filter and the sorting know by the same names.
 import { count, duration, NONE, returnText, settingText } from "./format.js";
 
+const collator = new Intl.Collator("en", { numeric: true });
+
 export function columnsOf(searched, hasSeveralSeeds) {
   const columns = [
     column("trial", "trial", (row) => row.trial_id),
@@ -49,10 +51,8 @@ export function sortRows(rows, column, isRising) {
     .sort(([a, one], [b, two]) => {
       if (a === null || b === null) return (a === null) - (b === null) || one.index - two.index;
       return (
-        sign *
-          (typeof a === "number" && typeof b === "number"
-            ? a - b
-            : String(a).localeCompare(String(b), "en", { numeric: true })) || one.index - two.index
+        sign * (typeof a === "number" && typeof b === "number" ? a - b : collator.compare(a, b)) ||
+        one.index - two.index
       );
     })
     .map(([, row]) => row);
