@@ -3,17 +3,33 @@
 import json
 import re
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
+from databases import PostgreSQL, postgresql  # noqa: F401 (a fixture)
 from fastapi.testclient import TestClient
-from services import FAKE, client, database_url, postgresql, service  # noqa: F401 (fixtures)
+from services import FAKE, client, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
+from tune_jobs.service.database.opening import sqlite_url
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import preset_names
 
 # ruff: noqa: F811 - fixtures are named as arguments
+
+
+@pytest.fixture
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """The URL of a new database; of SQLite, where a test asks for no other."""
+    if getattr(request, "param", "sqlite") == "sqlite":
+        return sqlite_url(tmp_path / "service.db")
+    server: PostgreSQL = request.getfixturevalue("postgresql")
+    return server.new_database()
+
+
+# What is about requests is asked with one database; the queue's own tests have both.
+with_both = pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)
 
 
 @pytest.fixture
@@ -43,6 +59,7 @@ def problem(answer: Any, status: int) -> dict[str, Any]:
 # -- submitting
 
 
+@with_both
 def test_a_sweep_is_written_and_waits(client: TestClient, service: Service) -> None:
     found = submit(client, name="mine", priority=3, note="why", tags=["x", "y"])
     assert found["sweep"] == "mine"
@@ -68,6 +85,7 @@ def test_overrides_act(client: TestClient) -> None:
     assert (seen["num_trials"], seen["max_env_steps"]) == (2, 2 * 5_000)
 
 
+@with_both
 def test_a_request_that_is_repeated_makes_one_sweep(client: TestClient, service: Service) -> None:
     answers = [client.post("/api/v1/sweeps", json={"spec": FAKE}, headers={"Idempotency-Key": "k"}) for _ in range(2)]
     assert [answer.status_code for answer in answers] == [201, 200]
@@ -77,6 +95,7 @@ def test_a_request_that_is_repeated_makes_one_sweep(client: TestClient, service:
     assert "'k'" in problem(other, 422)["detail"]
 
 
+@with_both
 def test_of_equal_requests_at_once_one_makes_a_sweep(client: TestClient, service: Service) -> None:
     answers: list[int] = []
 
@@ -127,11 +146,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-# What has nothing to do with the database is asked with one.
-with_one = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
-
-
-@with_one
 @pytest.mark.parametrize(
     ("path", "case"),
     [("sweeps", case) for case in WRONG] + [("plans", case) for case, (body, _) in WRONG.items() if "name" not in body],
@@ -144,7 +158,6 @@ def test_what_is_wrong_is_said_and_nothing_is_made(client: TestClient, service: 
     assert service.storage.sweeps() == []
 
 
-@with_one
 @pytest.mark.parametrize("body", [b"", b"{", b"null", b"[]", b"\xff\xfe", b'{"spec": NaN}', b"[" * 50_000])
 def test_bodies_that_are_none(client: TestClient, body: bytes) -> None:
     answer = client.post("/api/v1/sweeps", content=body, headers={"content-type": "application/json"})
@@ -193,7 +206,6 @@ def test_lists_have_pages(client: TestClient, service: Service) -> None:
     assert names == [["s0", "s1"], ["s2", "s3"], ["s4"]]
 
 
-@with_one
 @pytest.mark.parametrize("cursor", ["x", "!!!", "bnVsbA", "W10", "e30", "WzEsIDJd", "W3t9LCAiYSJd", "A" * 1_999])
 def test_a_cursor_of_another_list_is_refused(client: TestClient, finished: str, cursor: str) -> None:
     assert "cursor" in problem(client.get("/api/v1/sweeps", params={"cursor": cursor, "sort": "name"}), 422)["detail"]
@@ -236,7 +248,6 @@ def test_one_trial_its_iterations_and_its_log(client: TestClient, finished: str)
     assert "text" in client.get("/api/v1/sweeps/done/trials/t0003/log").json()
 
 
-@with_one
 @pytest.mark.parametrize("path", [
     "sweeps/none", "sweeps/none/trials", "sweeps/none/spec", "sweeps/done/trials/t9999",
     "sweeps/done/trials/t9999/log", "sweeps/done/trials/t9999/iterations", "sweeps/done/trials/..%2f..%2fsweep.json",
@@ -271,6 +282,7 @@ def test_ready_says_what_is_missing(client: TestClient, service: Service) -> Non
 # -- changing
 
 
+@with_both
 def test_priority_note_and_tags_are_changed(client: TestClient) -> None:
     submit(client, name="mine", note="before", tags=["x"])
     found = client.patch("/api/v1/sweeps/mine", json={"priority": 7, "tags": []}).json()
@@ -305,6 +317,7 @@ def test_actions_that_cannot_be(client: TestClient, finished: str) -> None:
     problem(client.post("/api/v1/sweeps/grid/extend", json={"num_samples": 1}), 422)
 
 
+@with_both
 def test_a_finished_sweep_is_deleted(client: TestClient, finished: str, service: Service) -> None:
     assert client.delete("/api/v1/sweeps/done").status_code == 204
     assert not (service.config.storage / "done").exists()
@@ -321,6 +334,7 @@ def test_what_waits_or_has_not_finished_is_not_deleted(client: TestClient, servi
     assert submit(client, name="mine")["sweep"] == "mine"
 
 
+@with_both
 def test_a_database_that_is_gone_is_said(client: TestClient, service: Service, finished: str) -> None:
     with service.engine.begin() as connection:
         connection.exec_driver_sql("DROP TABLE jobs")
