@@ -47,8 +47,8 @@ $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
-# In three processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
-# each with a Ray of its own, and the others; with the types beside them. What the parts print, skipped tests with their
+# In four processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
+# each with a Ray of its own, the unit tests, and the others; with the types beside them. What the parts print, skipped tests with their
 # reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
 # the environment says.
 RAY := tests/ray
@@ -57,10 +57,12 @@ test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
 	$(BIN)/python -m pytest $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
 	$(BIN)/python -m pytest $(RAY)/test_[p-s]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
-	$(BIN)/python -m pytest --ignore=$(RAY); others=$$?; \
+	$(BIN)/python -m pytest tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
+	$(BIN)/python -m pytest --ignore=$(RAY) --ignore=tests/unit; others=$$?; \
+	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \
-	exit $$((first || second || others || types))
+	exit $$((first || second || unit || others || types))
 
 unit: $(VENV)/installed-test
 	$(BIN)/python -m pytest --quiet --numprocesses=2 tests/unit

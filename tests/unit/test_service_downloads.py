@@ -135,7 +135,7 @@ def test_there_is_nothing_of_an_unknown_sweep(site: Live, path: str) -> None:
         ("/report/.hidden.html", 404),
         ("/films/films.json", 422),
         ("/films/..%2fpolicy.json", 404),
-        ("/policy/evaluation.json", 422),
+        ("/policy/evaluation.json", 404),
         ("/policy/..%2f..%2fsweep.json", 404),
         ("/trials/t9999/checkpoints/6", 404),
         ("/trials/..%2ft0000/checkpoints/6", 404),

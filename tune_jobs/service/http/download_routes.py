@@ -21,8 +21,7 @@ from tune_jobs.sweeps.plain import to_json
 router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["downloads"])
 
 Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
-PolicyFile = Literal["policy.json", "policy.safetensors"]
-_REPORT_PAGE = "index.html"
+_PAGE_SUFFIX = ".html"
 _MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8", ".csv": "text/csv; charset=utf-8", ".svg": "image/svg+xml",
     ".pdf": "application/pdf", ".png": "image/png", ".json": "application/json", ".mp4": "video/mp4",
@@ -61,14 +60,14 @@ def _described(path: str, file: Path) -> FileOfSweep | None:
 @router.head("/report/{path:path}", include_in_schema=False)
 @router.get("/report/{path:path}", response_class=Download, status_code=200)
 def report(name: str, path: str, service: TheService) -> Download:
-    """Download a file of the report, `index.html` if none is named; its page runs in a sandbox, without a network."""
-    path = path or _REPORT_PAGE
+    """Download a file of the report, its page if none is named; that runs in a sandbox, without a network."""
     known = _sweep(service, name).report_files()
+    path = path or next((file for file in known if file.endswith(_PAGE_SUFFIX)), "")
     if path not in known:
         has = "It has those that `files` lists." if known else "It is written when the sweep has ended."
         raise NotFoundError(f"The report of sweep {name} has no file {path[:80]!r}.", has)
     suffix = PurePosixPath(path).suffix
-    headers = {"Content-Security-Policy": SANDBOX if suffix == ".html" else NO_SCRIPTS}
+    headers = {"Content-Security-Policy": SANDBOX if suffix == _PAGE_SUFFIX else NO_SCRIPTS}
     filename = None if suffix in _SHOWN else f"{name}-{PurePosixPath(path).name}"
     return Download(known[path], _media_type(known[path]), filename=filename, headers=headers)
 
@@ -92,9 +91,12 @@ def policy(name: str, service: TheService) -> Archive:
 
 @router.head("/policy/{file}", include_in_schema=False)
 @router.get("/policy/{file}", response_class=Download, status_code=200)
-def policy_file(name: str, file: PolicyFile, service: TheService) -> Download:
+def policy_file(name: str, file: str, service: TheService) -> Download:
     """Download one of the two files of the best policy."""
-    path = _policy_files(service, name)[file]
+    known = _policy_files(service, name)
+    if file not in known:
+        raise NotFoundError(f"The policy of sweep {name} has no file {file[:80]!r}.", f"It has {' and '.join(known)}.")
+    path = known[file]
     return Download(path, _media_type(path), filename=f"{name}-{file}")
 
 

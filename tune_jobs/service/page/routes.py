@@ -42,7 +42,7 @@ class _Asset:
 @router.api_route("/", methods=["GET", "HEAD"])
 def page(if_none_match: str | None = Header(None)) -> Response:
     """Return the page itself."""
-    return _answer("index.html", if_none_match)
+    return _answer("page.html", if_none_match)
 
 
 @router.api_route("/static/{path:path}", methods=["GET", "HEAD"])
