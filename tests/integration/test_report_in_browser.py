@@ -1,6 +1,5 @@
 """The report in a browser, driven as a reader would: sort, filter, brush, film; and nothing in its console."""
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,17 +14,12 @@ from tests.narrowing import present
 
 selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
 
+from page_browser import CHROMIUM, DRIVER  # noqa: E402
 from selenium import webdriver  # noqa: E402
 from selenium.webdriver import ActionChains  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-    "--disable-background-networking", "--disable-sync", "--autoplay-policy=no-user-gesture-required",
-)  # fmt: skip
 SECONDS = 120
 
 pytestmark = [
@@ -53,21 +47,6 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder, target=folder / "report", sweep=made.sweep, trials=made.trials, results=made.results,
         best=present(made.best), videos={"after": folder / "after.mp4"},
     )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrome]:
-    options = webdriver.ChromeOptions()
-    options.binary_location = present(CHROMIUM)
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(present(DRIVER)))
-    driver.set_page_load_timeout(SECONDS)
-    try:
-        yield driver
-    finally:
-        driver.quit()
 
 
 @pytest.fixture

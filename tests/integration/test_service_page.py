@@ -1,20 +1,14 @@
 """The service's page in a browser, driven as a reader would: look, sort, filter, brush, submit, stop."""
 
-from collections.abc import Iterator
-
 import pytest
 
 selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
 
-from live_service import Live, serving  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page, chromium  # noqa: E402
-from page_sweeps import HOSTILE, write_large, write_storage  # noqa: E402
-from selenium import webdriver  # noqa: E402
+from live_service import Live  # noqa: E402
+from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
+from page_sweeps import HOSTILE, write_large  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
-
-from tune_jobs.service.access.gate import opened_gate  # noqa: E402
-from tune_jobs.service.config import ServiceConfig  # noqa: E402
 
 pytestmark = [
     pytest.mark.browser,
@@ -22,31 +16,6 @@ pytestmark = [
     pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
 ]
 FAILED = "#/sweeps/cartpole-ppo?trial=t0003"
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
-    storage = tmp_path_factory.mktemp("page") / "sweeps"
-    write_storage(storage)
-    with serving(storage) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrome]:
-    with chromium(tmp_path_factory.mktemp("profile")) as found:
-        yield found
-
-
-@pytest.fixture
-def page(browser: webdriver.Chrome, live: Live) -> Iterator[Page]:
-    """The page; afterwards no script has failed, nothing was blocked, and no text was run as HTML."""
-    found = Page(browser, live.url)
-    found.errors()
-    yield found
-    assert found.errors() == []
-    assert "run" not in browser.title.split()
-    browser.execute_script("sessionStorage.clear()")
 
 
 def column(page: Page, heading: str) -> list[str]:
@@ -316,96 +285,3 @@ def test_a_table_of_ten_thousand_trials_scrolls_and_sorts(page: Page, live: Live
     page.until(lambda: 0 < int(num_trials(page).split()[0].replace(",", "")) < 100)
     page.open("#/")
     page.says("main", "large")
-
-
-def test_all_is_reached_with_the_tab_key_and_the_focus_is_seen(page: Page) -> None:
-    page.open("#/sweeps/cartpole-ppo")
-    page.says(".trials-card", "60 trials")
-    can_be_reached = """
-        const wanted = "a[href], button, input, select, textarea, summary, [tabindex]";
-        const isThere = (node) => node.checkVisibility({ visibilityProperty: true }) && !node.closest("[popover]");
-        const isReached = (node) => isThere(node) && node.tabIndex >= 0 && !node.disabled;
-        return [...document.querySelectorAll(wanted)].filter(isReached).length;
-    """
-    expected = page.run(can_be_reached)
-    seen: list[str] = []
-    page.run("document.body.tabIndex = -1; document.body.focus(); document.body.removeAttribute('tabindex')")
-    for _ in range(expected + 1):
-        page.keys(Keys.TAB)
-        key, outline = page.run("""
-            const node = document.activeElement;
-            node.dataset.seen ??= String(Math.random());
-            const style = getComputedStyle(node);
-            const isShown = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) > 0;
-            return [node === document.body ? "" : node.dataset.seen, isShown || node.outerHTML.slice(0, 150)];
-        """)
-        if not key:
-            break
-        seen.append(key)
-        assert outline is True
-    assert len(set(seen)) >= expected - 1
-    # A list that is typed at first shows where the focus is, too.
-    page.open("#/")
-    page.says("main", "cartpole-ppo")
-    page.keys(Keys.TAB)
-    assert page.focused() == "Skip to content"
-    page.keys(Keys.ENTER)
-    assert page.run("return document.activeElement.id") == "main"
-    assert page.address() in ("", "#/")
-
-
-@pytest.mark.parametrize("view", ["#/", "#/sweeps/cartpole-ppo", FAILED, "#/sweeps/cartpole-seeds", "#/new"])
-def test_views_have_no_barriers_and_fit_each_width(page: Page, view: str) -> None:
-    for width, theme in ((400, "light"), (1280, "dark"), (1920, "light")):
-        page.open(view, width=width, theme=theme)
-        wait_for = {"#/": "cartpole-ppo", "#/new": "At once"}.get(view, "How the leading settings learn")
-        page.says("main", wait_for)
-        if view == FAILED:
-            page.says(".panel", "Why it failed")
-        assert page.violations() == [], width
-        assert page.run("return document.documentElement.scrollWidth <= innerWidth"), width
-
-
-@pytest.mark.parametrize("label", ["Delete…", "Extend…", "Note, tags, priority…"])
-def test_dialogs_have_no_barriers(page: Page, label: str) -> None:
-    page.open("#/sweeps/cartpole-ppo")
-    page.button("More").click()
-    assert page.violations() == []
-    page.button(label).click()
-    page.one("dialog")
-    assert page.violations() == []
-
-
-def test_a_name_that_is_not_there_is_said(page: Page) -> None:
-    page.open("#/")
-    page.run("location.hash = '#/sweeps/nothing%3Cb%3E'")
-    page.says("main", "There is no sweep 'nothing<b>'.")
-
-
-def test_who_has_no_token_logs_in_and_a_viewer_changes_nothing(
-    browser: webdriver.Chrome, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    storage = tmp_path_factory.mktemp("closed") / "sweeps"
-    write_storage(storage)
-    with opened_gate(ServiceConfig(storage=storage)) as gate:
-        _, secret = gate.tokens.make("vera", "viewer")
-    with serving(storage, require_token=True) as closed:
-        page = Page(browser, closed.url)
-        page.errors()
-        page.open("#/sweeps/cartpole-ppo")
-        page.says("main h1", "Log in")
-        assert page.violations() == []
-        assert "Token" in page.focused()
-        page.keys("wrong", Keys.ENTER)
-        page.says("[role=alert]", "This token is wrong")
-        page.keys(secret, Keys.ENTER)
-        # What the link named is there.
-        page.says("main h1", "cartpole-ppo")
-        page.says(".where", "vera, viewer")
-        assert not page.one(".sweep-title").find_elements(By.CSS_SELECTOR, ".actions:not([hidden])")
-        page.open("#/new")
-        page.says("main", "it may look, and submit nothing")
-        assert not page.one("button[type=submit]").is_enabled()
-        page.button("Log out").click()
-        page.says("main h1", "Log in")
-        assert page.errors() == []

@@ -19,7 +19,7 @@ DRIVER = shutil.which("chromedriver")
 AXE = Path(__file__).parents[1] / "vendor" / "axe-core" / "axe.min.js"
 FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-    "--disable-background-networking", "--disable-sync",
+    "--disable-background-networking", "--disable-sync", "--autoplay-policy=no-user-gesture-required",
 )  # fmt: skip
 SECONDS = 60
 _ValueT = TypeVar("_ValueT")
