@@ -11,12 +11,12 @@ from store_parts import make_iteration
 from sweep_folders import make_sweep_folder
 
 from tune_jobs.service import statuses as module
-from tune_jobs.service.curves import Curves
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.store.local_storage import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
+from tune_jobs.sweeps.curves import Curves
 from tune_jobs.sweeps.status import status_of
 
 

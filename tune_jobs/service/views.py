@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
-from tune_jobs.service.curves import Curves
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import NOTHING, Labels
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.statuses import Seen, Statuses, Trials
 from tune_jobs.service.summaries import SweepSummary, jobs_by_sweep, summary, trial_row
 from tune_jobs.store.contract import Storage
+from tune_jobs.sweeps.curves import Curves
 
 Change = tuple[str, Mapping[str, Any]]
 """The kind of an event, and its data."""

@@ -11,13 +11,13 @@ import time
 from collections.abc import Iterator
 
 from policies.errors import CheckpointError, NotFoundError
-from tune_jobs.service.curves import Columns
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.views import ListView, SweepView, View
 from tune_jobs.store.contract import Storage
+from tune_jobs.sweeps.curves import Columns
 
 _log = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ export class BestChart {
   }
 
   show({ data }) {
-    const { steps, spent, hasEvaluations } = bestSoFar(data.trials, data.curves);
+    const { steps, spent, hasEvaluations } = bestSoFar(data.trials, data.curves, data.now());
     this.steps = steps;
     this.body.hidden = steps.length === 0;
     setText(this.none, steps.length ? "" : "No return has been shown yet.");

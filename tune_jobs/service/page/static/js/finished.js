@@ -1,5 +1,4 @@
 // What a finished sweep has come to: the policy to deploy, the setting to train with, its report and films.
-import { address, ask, ofSweep } from "./api.js";
 import { el } from "./dom.js";
 import { counted, pointText, returnText } from "./format.js";
 import { stateOf } from "./states.js";
@@ -14,8 +13,8 @@ const SCORES = {
 
 export class Finished {
   // `onOpen(trialId)` is called when the reader wants to see the policy's trial.
-  constructor(card, name, { onOpen }) {
-    Object.assign(this, { card, name, onOpen });
+  constructor(card, source, { onOpen }) {
+    Object.assign(this, { card, source, onOpen });
     this.card.hidden = true;
     this.stamp = "";
   }
@@ -30,10 +29,7 @@ export class Finished {
       return;
     }
     try {
-      const files = new Set((await ask(ofSweep(this.name, "/files"))).map((file) => file.path));
-      // There is no answer before there is a policy.
-      const hasBest = [...files].some((path) => path.startsWith("policy/"));
-      const best = hasBest ? await ask(ofSweep(this.name, "/best")) : null;
+      const { files, best } = await this.source.outcome();
       if (stamp === this.stamp) this.show(files, best);
     } catch {
       // The next look asks again.
@@ -43,14 +39,13 @@ export class Finished {
 
   show(files, best) {
     const hasReport = files.has("report/index.html");
-    const link = { class: "button", href: address(ofSweep(this.name, "/report/")), target: "_blank", rel: "noopener" };
     this.card.hidden = best === null && !hasReport;
     this.card.replaceChildren(
       el(
         "div",
         { class: "card-head" },
         el("h2", {}, "Result"),
-        hasReport ? el("a", link, "Open the report", el("span", { class: "for-readers" }, " in a new tab")) : null,
+        hasReport ? this.reportLink() : null,
       ),
       el(
         "div",
@@ -62,6 +57,11 @@ export class Finished {
           .map((name) => this.film(name)),
       ),
     );
+  }
+
+  reportLink() {
+    const link = { class: "button", href: this.source.address("/report/"), target: "_blank", rel: "noopener" };
+    return el("a", link, "Open the report", el("span", { class: "for-readers" }, " in a new tab"));
   }
 
   policyAnswer({ checkpoint, confirmation, random }) {
@@ -81,8 +81,7 @@ export class Finished {
   }
 
   film(name) {
-    const source = address(ofSweep(this.name, `/films/${name}`));
-    const options = { src: source, controls: true, loop: true, playsinline: true, preload: "metadata" };
+    const options = { src: this.source.address(`/films/${name}`), controls: true, loop: true, playsinline: true, preload: "metadata" };
     const video = el("video", { ...options, "aria-label": CAPTIONS[name] });
     // As an attribute it says how a film begins alone.
     video.muted = true;

@@ -1,13 +1,12 @@
 // Which hyperparameters the scores depend on, as it firms up.
-import { ask, ofSweep } from "./api.js";
 import { el, reconcile, setAttribute, setText } from "./dom.js";
 
 const width = (share) => `${100 * share}%`;
 const percentText = (share) => `${Math.round(100 * share)} %`;
 
 export class ImportanceCard {
-  constructor(card, name) {
-    Object.assign(this, { card, name });
+  constructor(card, source) {
+    Object.assign(this, { card, source });
     this.numEnded = -1;
     this.isAsking = false;
     this.caption = el("p", { class: "quiet small" });
@@ -25,7 +24,7 @@ export class ImportanceCard {
     this.isAsking = true;
     this.numEnded = ended;
     try {
-      this.show(await ask(ofSweep(this.name, "/importance")));
+      this.show(await this.source.importance());
     } catch (error) {
       setText(this.caption, error.message);
     } finally {

@@ -58,9 +58,8 @@ export function bandOf(lines, numPoints = 80) {
 }
 
 // The best return that any trial had shown, over the env steps that all had trained for by then. When a trial's
-// iterations ended is taken from when it began and ended, as if it had trained at one speed.
-export function bestSoFar(trials, curves) {
-  const now = Date.now() / 1000;
+// iterations ended is taken from when it began and ended, as if it had trained at one speed; running ones train `now`.
+export function bestSoFar(trials, curves, now) {
   const hasEvaluations = [...curves.values()].some((curve) => curve.evaluation_return.some((value) => value !== null));
   const moments = [];
   for (const trial of trials) {

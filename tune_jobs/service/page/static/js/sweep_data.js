@@ -1,5 +1,4 @@
 // What is known of one sweep: its summary, its sweep file, its trials and their curves.
-import { ask, askAll, ofSweep } from "./api.js";
 import { axesOf } from "./parallel_axes.js";
 
 const FIELDS = [
@@ -26,8 +25,9 @@ const LOG_DOMAINS = ["loguniform", "qloguniform", "lograndint", "qlograndint"];
 const LISTED = ["grid", "choice"];
 
 export class SweepData {
-  constructor(name) {
-    this.name = name;
+  // `source` is where it comes from: a ServerSource or a FileSource.
+  constructor(source) {
+    this.source = source;
     this.summary = null;
     this.spec = null;
     this.trials = [];
@@ -38,14 +38,14 @@ export class SweepData {
   }
 
   // Fetch all; the curves come first, as the events continue from them. `onPart()` is called when there is something to
-  // show, and more to come. Returns the path of the events.
+  // show, and more to come. Returns what the source said with the curves.
   async load(onPart = () => {}) {
-    const curves = await ask(ofSweep(this.name, "/curves"));
-    const [summary, spec] = await Promise.all([ask(ofSweep(this.name)), this.spec ?? ask(ofSweep(this.name, "/spec"))]);
+    const { source } = this;
+    const curves = await source.curves();
+    const [summary, spec] = await Promise.all([source.summary(), this.spec ?? source.spec()]);
     const isFirst = this.summary === null;
     Object.assign(this, { summary, spec, curves: new Map(Object.entries(curves.trials)) });
-    const query = { fields: FIELDS, sort: "index", order: "asc" };
-    const trials = await askAll(ofSweep(this.name, "/trials"), "trials", query, (some) => {
+    const trials = await source.trials(FIELDS, (some) => {
       // Later on there is more to be seen than a part.
       if (!isFirst || this.trials.length) return;
       this.trials = some.slice();
@@ -53,7 +53,12 @@ export class SweepData {
     });
     this.trials = trials;
     this.places = new Map(trials.map((trial, place) => [trial.trial_id, place]));
-    return ofSweep(this.name, `/events?last_event_id=${encodeURIComponent(curves.last_event_id)}`);
+    return curves;
+  }
+
+  // Unix time, seconds, that all this is of.
+  now() {
+    return this.source.now();
   }
 
   // What is worked out of the trials, kept until there are others.

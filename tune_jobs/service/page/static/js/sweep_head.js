@@ -4,7 +4,7 @@ import { ago, compact, count, counted, duration, moment, percent, pointText, ret
 import { isLive, stateOf, stateReason, TRIAL_STATUSES } from "./states.js";
 
 export class SweepHead {
-  constructor(host, { name, actions, alert, onOpen }) {
+  constructor(host, { source, actions, alert, onOpen }) {
     this.state = el("span", { class: "state" });
     this.what = el("p", { class: "quiet" });
     this.tags = el("p", { class: "tag-line" });
@@ -39,8 +39,8 @@ export class SweepHead {
       el(
         "div",
         { class: "title-row sweep-title" },
-        el("div", {}, el("div", { class: "with-state" }, el("h1", {}, name), this.state), this.what, this.tags),
-        actions.node,
+        el("div", {}, el("div", { class: "with-state" }, el("h1", {}, source.name), this.state), this.what, this.tags),
+        el("div", { class: "head-links" }, actions.node),
       ),
       alert.node,
       this.reason,

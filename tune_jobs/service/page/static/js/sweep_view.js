@@ -1,16 +1,15 @@
 // One sweep, live. What is looked at is in the address: sort, filter, ranges, the chosen trials and the opened one.
 import { makeActions } from "./actions.js";
-import { ask, ofSweep } from "./api.js";
 import { BestChart } from "./best_chart.js";
 import { COLOURS, CurvesChart } from "./curves_chart.js";
 import { makeAlert, refusal } from "./dialogs.js";
 import { colour, el, isTyping } from "./dom.js";
 import { filterOf } from "./filter.js";
 import { Finished } from "./finished.js";
-import { follow } from "./follow.js";
 import { ImportanceCard } from "./importance.js";
 import { Parallel } from "./parallel.js";
 import { keep } from "./route.js";
+import { ServerSource } from "./server_source.js";
 import { SweepData } from "./sweep_data.js";
 import { SweepHead } from "./sweep_head.js";
 import { columnsOf, sortRows } from "./trial_columns.js";
@@ -18,6 +17,7 @@ import { TrialPanel } from "./trial_panel.js";
 import { TrialTable } from "./trial_table.js";
 
 const RANGE = "in.";
+const NO_ACTIONS = { node: null, show() {}, close() {} };
 
 function seenOf(params) {
   const ranges = Object.entries(params)
@@ -34,8 +34,9 @@ function seenOf(params) {
   };
 }
 
-export function openSweep(main, route) {
-  const data = new SweepData(route.name);
+// `source` is where the sweep comes from: a ServerSource, or a FileSource, which can only be looked at.
+export function openSweep(main, route, source = new ServerSource(route.name)) {
+  const data = new SweepData(source);
   let seen = seenOf(route.params);
   let columns = [];
   let columnKey = "";
@@ -44,14 +45,16 @@ export function openSweep(main, route) {
   let frame = 0;
 
   const alert = makeAlert();
-  const actions = makeActions({
-    state: () => data.summary,
-    alert,
-    onDone: refreshHead,
-    onGone: () => {
-      location.hash = "#/";
-    },
-  });
+  const actions = source.isFile
+    ? NO_ACTIONS
+    : makeActions({
+        state: () => data.summary,
+        alert,
+        onDone: refreshHead,
+        onGone: () => {
+          location.hash = "#/";
+        },
+      });
   const page = el("div", { class: "sweep-page", hidden: true });
   const loading = el("p", { class: "empty quiet", role: "status" }, "Loading…");
   const content = el("div", { class: "sweep-content" });
@@ -60,7 +63,7 @@ export function openSweep(main, route) {
   const open = (id) => {
     if (id) change({ trial: id });
   };
-  const head = new SweepHead(content, { name: route.name, actions, alert, onOpen: open });
+  const head = new SweepHead(content, { source, actions, alert, onOpen: open });
   const card = (label, kind) => el("section", { class: `card ${kind}`, "aria-label": label });
   const cards = {
     finished: card("Result", "finished"),
@@ -71,11 +74,11 @@ export function openSweep(main, route) {
     table: card("Trials", "table-card trials-card"),
   };
   content.append(el("div", { class: "grid" }, ...Object.values(cards)));
-  const finished = new Finished(cards.finished, route.name, { onOpen: open });
+  const finished = new Finished(cards.finished, source, { onOpen: open });
   const curves = new CurvesChart(cards.curves, { onOpen: open, onMetric: (metric) => change({ metric }) });
   const best = new BestChart(cards.best, { onOpen: open });
   const parallel = new Parallel(cards.parallel, { onRange: setRange, onOpen: open });
-  const importance = new ImportanceCard(cards.importance, route.name);
+  const importance = new ImportanceCard(cards.importance, source);
   const filter = el("input", {
     type: "search",
     "aria-label": "Filter trials",
@@ -97,7 +100,7 @@ export function openSweep(main, route) {
   });
   bar.append(table.told);
   const panel = new TrialPanel(page, {
-    sweep: route.name,
+    source,
     onClose: () => {
       const id = seen.trial;
       change({ trial: null });
@@ -200,7 +203,7 @@ export function openSweep(main, route) {
   // The events tell it too, a moment later.
   async function refreshHead() {
     try {
-      data.summary = await ask(ofSweep(route.name));
+      data.summary = await source.summary();
       showHead();
     } catch (error) {
       alert.show(error);
@@ -212,12 +215,12 @@ export function openSweep(main, route) {
     actions.show();
   }
 
-  const followed = follow({
+  const followed = source.follow({
     kinds: ["status", "trials", "iterations", "deleted"],
     load: () => data.load(() => showAll()),
     apply(kind, changes) {
       if (kind === "deleted")
-        alert.show({ message: `Sweep ${route.name} was deleted.`, hint: "What is shown is how it was." });
+        alert.show({ message: `Sweep ${source.name} was deleted.`, hint: "What is shown is how it was." });
       else data.apply(kind, changes);
     },
     show(error) {

@@ -1,15 +1,12 @@
 // One trial: its point, its curve, why it failed, and its log, which follows while it runs.
-import { ask, ofSweep } from "./api.js";
 import { colour, el, reconcile, setAttribute, setText } from "./dom.js";
 import { count, counted, duration, moment, returnText, settingText } from "./format.js";
 import { drawLine, lineOf, valueAt } from "./lines.js";
 import { Plot, withAir } from "./plot.js";
-import { repeat } from "./repeat.js";
 import { trialTone } from "./states.js";
 
 const POLL_MS = 2000;
 const ENDED_POLL_MS = 15_000;
-const LOG_LINES = 400;
 const KEYS = [
   ["training return", "series-0"],
   ["evaluation return", "series-1"],
@@ -18,8 +15,8 @@ const WIDE = matchMedia("(min-width: 75rem)");
 
 export class TrialPanel {
   // `onClose()` is called when the reader closes it, `onStep(1 | -1)` when they want the next one in the table.
-  constructor(host, { sweep, onClose, onStep }) {
-    Object.assign(this, { sweep, onClose });
+  constructor(host, { source, onClose, onStep }) {
+    Object.assign(this, { source, onClose });
     this.id = null;
     this.curve = [];
     this.lines = [];
@@ -76,7 +73,7 @@ export class TrialPanel {
           ),
         ),
         el("section", { "aria-label": "Facts" }, el("h3", {}, "Facts"), this.facts, this.notes),
-        el("section", { "aria-label": "Log" }, el("h3", {}, "Log"), this.log),
+        el("section", { "aria-label": "Log", hidden: source.isFile }, el("h3", {}, "Log"), this.log),
         el("details", {}, el("summary", {}, "All hyperparameters"), this.fixed),
       ),
     );
@@ -109,7 +106,7 @@ export class TrialPanel {
     setAttribute(this.state, "class", "state");
     setText(this.state, "");
     if (isFirst) this.reopen();
-    this.asked = repeat(
+    this.asked = this.source.repeat(
       () => this.refresh(id),
       () => (this.trial && ["completed", "failed", "stopped"].includes(this.trial.status) ? ENDED_POLL_MS : POLL_MS),
     );
@@ -139,20 +136,15 @@ export class TrialPanel {
   }
 
   async refresh(id) {
-    const path = ofSweep(this.sweep, `/trials/${encodeURIComponent(id)}`);
     try {
-      const [trial, log, more] = await Promise.all([
-        ask(path),
-        ask(`${path}/log`, { query: { lines: LOG_LINES } }),
-        ask(`${path}/iterations`, { query: { after: this.curve.at(-1)?.iteration ?? 0 } }),
-      ]);
+      const { trial, log, iterations } = await this.source.trial(id, this.curve.at(-1)?.iteration ?? 0);
       if (id !== this.id) return;
-      this.curve.push(...more.filter((row) => row.iteration > (this.curve.at(-1)?.iteration ?? 0)));
+      this.curve.push(...iterations.filter((row) => row.iteration > (this.curve.at(-1)?.iteration ?? 0)));
       // A trial that was tried again begins anew.
       if (this.curve.length && trial.num_iterations < this.curve.at(-1).iteration && trial.status === "running")
         this.curve = this.curve.filter((row) => row.iteration <= trial.num_iterations);
       setText(this.problem, "");
-      this.show(trial, log.text);
+      this.show(trial, log);
     } catch (error) {
       if (id === this.id) setText(this.problem, [error.message, error.hint].filter(Boolean).join(" "));
       throw error;

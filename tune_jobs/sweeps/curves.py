@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from math import isnan, nan
 from typing import TypedDict
 
+from analysis.records import IterationRecord
 from policies.errors import CheckpointError
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Sweep
@@ -54,7 +55,7 @@ class Curve:
         """Remove all points."""
         self._keep([])
 
-    def append(self, points: Iterable[CurvePoint]) -> None:
+    def append(self, points: Iterable[CurvePoint | IterationRecord]) -> None:
         """Add points behind the others."""
         for point in points:
             self._iteration.append(point.iteration)
