@@ -12,17 +12,20 @@ import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, cast, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, Self, cast, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.acting.policy import Policy
+from policies.acting.policy import Action, Policy
 from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
 from policies.envs.faults import close_env, env_failed
 from policies.envs.make import make_env, make_vector_env
 from policies.errors import EnvError, EnvFailedError, SpecError
+
+EndedBy = Literal["terminated", "truncated", "cap"]
+"""How an episode ended: in a state that ends it, by a limit of the env, or at the cap on its steps."""
 
 MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
@@ -44,6 +47,26 @@ class Episodes:
     def mean_return(self) -> float:
         """The mean of the episodes' returns."""
         return math.fsum(self.returns) / len(self.returns)
+
+
+class Moment(NamedTuple):
+    """One moment of an episode: after the reset, or after a step."""
+
+    num_env_steps: int
+    """Env steps so far."""
+    total: float
+    """The return so far."""
+    observation: NDArray[Any] | None
+    """What the policy saw before its action; None after the reset."""
+    action: Action | None
+    """What it did; None after the reset."""
+    ended_by: EndedBy | None
+    """How the episode ended; None: it goes on."""
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode is over."""
+        return self.ended_by is not None
 
 
 @runtime_checkable
@@ -178,13 +201,11 @@ def play_episode(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episo
 
     Arguments and errors are those of `episode_steps`.
     """
-    *_, (length, total, _) = episode_steps(policy, env, seed, max_episode_steps=max_episode_steps)
-    return total, length
+    (last,) = deque(episode_steps(policy, env, seed, max_episode_steps=max_episode_steps), maxlen=1)
+    return last.total, last.num_env_steps
 
 
-def episode_steps(
-    policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int
-) -> Iterator[tuple[int, float, bool]]:
+def episode_steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_episode_steps: int) -> Iterator[Moment]:
     """Play one greedy episode in one environment, step by step.
 
     Args:
@@ -194,7 +215,7 @@ def episode_steps(
         max_episode_steps: Cap on the env steps of the episode.
 
     Yields:
-        After the reset and after each step, the env steps so far, the return so far, and whether the episode is over.
+        What there is after the reset and after each step; the last one is over.
 
     Raises:
         EnvError: The env raised an error.
@@ -202,11 +223,17 @@ def episode_steps(
     if isinstance(policy, Resettable):
         policy.reset(seed)
     episode = _Running(env, 0, seed)
-    over = False
-    yield 0, 0.0, over
-    while not over:
-        over = episode.step(policy.act(episode.observation)) or episode.length >= max_episode_steps
-        yield episode.length, episode.total, over
+    ended_by: EndedBy | None = None
+    yield Moment(0, 0.0, None, None, ended_by)
+    while ended_by is None:
+        # A copy: an env may write its next observation into the same array.
+        observation = np.array(episode.observation)
+        action = policy.act(observation)
+        if episode.step(action):
+            ended_by = "terminated" if episode.has_terminated else "truncated"
+        elif episode.length >= max_episode_steps:
+            ended_by = "cap"
+        yield Moment(episode.length, episode.total, observation, action, ended_by)
 
 
 def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
@@ -268,6 +295,7 @@ class _Running:
         self.env, self.index, self.seed = env, index, seed
         self.length = 0
         self.total = 0.0
+        self.has_terminated = False
         try:
             self.observation, _ = env.reset(seed=seed)
         except BaseException as error:  # an env may raise anything
@@ -289,6 +317,7 @@ class _Running:
         if not (math.isfinite(reward) and is_sound(np.asarray(self.observation))):
             check_reward(reward, self._env_id, self.length)
             check_observation(self.observation, self._env_id, self.length)
+        self.has_terminated = bool(terminated)
         return bool(terminated or truncated)
 
     @property

@@ -6,18 +6,19 @@ import base64
 import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from policies.acting.evaluate import Resettable, check_policy, check_seeds, episode_cap, episode_steps
+from policies.acting.evaluate import EndedBy, check_policy, check_seeds, episode_cap, episode_steps
 from policies.acting.policy import Action, NetworkPolicy, Policy
+from policies.envs.action_names import action_names
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.rendering import draw_without_display
-from policies.errors import EnvError
+from policies.errors import EnvError, said_by
 
 ScoreKind = Literal["probabilities", "values", "advantages", "gaussian"]
 
@@ -35,6 +36,8 @@ class LiveStep:
     total: float
     """The return so far."""
     over: bool
+    ended_by: EndedBy | None
+    """How the episode ended; None: it goes on."""
     picture: str | None
     """A JPEG as base64; None: the environment can't be drawn."""
     observation: list[float | None] | None
@@ -48,6 +51,19 @@ class LiveStep:
 
 
 @dataclass(frozen=True)
+class LiveActions:
+    """What actions there are."""
+
+    first: int | None
+    """The number of the first one; None: actions are vectors."""
+    names: tuple[str, ...] | None
+    """Their names in their order; None: they have none."""
+    low: list[float | None] | None
+    high: list[float | None] | None
+    """Bounds of each component of a vector, None where it has none; None: actions are numbers."""
+
+
+@dataclass(frozen=True)
 class LiveInfo:
     """What is to be known before the first step."""
 
@@ -58,10 +74,11 @@ class LiveInfo:
     is_drawn: bool
     why_not: str
     """Why the environment is not drawn."""
+    actions: LiveActions
 
 
 def watch_episode(
-    policy: Policy, env_id: str, env_args: Mapping[str, Any] | None, seed: int
+    policy: Policy, env_id: str, env_args: Mapping[str, Any] | None, seed: int, *, start: int = 0
 ) -> tuple[LiveInfo, Iterator[LiveStep]]:
     """Begin an episode; what is returned plays it step by step.
 
@@ -70,6 +87,7 @@ def watch_episode(
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
         seed: The seed that the env is reset with.
+        start: The first step that is watched: those before it come without pictures and scores.
 
     Raises:
         EnvError: The environment cannot be made, or does not go with the policy.
@@ -83,65 +101,55 @@ def watch_episode(
         close_env(env)
         raise
     fps = float(env.metadata.get("render_fps") or 30.0)
-    info = LiveInfo(env_id, policy.description, fps, not why_not, why_not)
-    return info, _steps(policy, env, seed, draws=not why_not)
+    info = LiveInfo(env_id, policy.description, fps, not why_not, why_not, _actions(env))
+    return info, _steps(policy, env, seed, draws=not why_not, start=start)
 
 
 def _drawable(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[gym.Env[Any, Any], str]:
     """Return an env that can be drawn, or one that can't and why."""
     draw_without_display()
+    why_not = ""
     try:
         env = make_env(env_id, env_args, render_mode="rgb_array")
     except EnvError as error:
         # The same error comes again if it is not about drawing.
-        return make_env(env_id, env_args), error.message
+        env, why_not = make_env(env_id, env_args), error.message
     modes = env.metadata.get("render_modes") or ()
     if "rgb_array" not in modes:
         return env, f"{env_id} can't be drawn: its render modes are {', '.join(map(str, modes)) or 'none'}."
-    return env, ""
+    return env, why_not
 
 
-class _Seen(Policy):
-    """Acts as another policy does, and keeps what it saw and did last."""
-
-    def __init__(self, policy: Policy) -> None:
-        super().__init__(
-            policy.observation_space, policy.action_space,
-            env_id=policy.env_id, env_args=policy.env_args, description=policy.description,
-        )  # fmt: skip
-        self._policy = policy
-        self.observation: Any = None
-        self.action: Action | None = None
-
-    def reset(self, seed: int) -> None:
-        """Seed a policy that draws its actions."""
-        if isinstance(self._policy, Resettable):
-            self._policy.reset(seed)
-
-    def act(self, observations: Any) -> Action:
-        self.observation = observations
-        self.action = self._policy.act(observations)
-        return self.action
-
-    def _act_batch(self, observations: Any) -> Any:
-        raise NotImplementedError("one observation at a time is watched")
+def _actions(env: gym.Env[Any, Any]) -> LiveActions:
+    space = env.action_space
+    if isinstance(space, gym.spaces.Discrete):
+        return LiveActions(int(space.start), action_names(env), None, None)
+    box = cast("gym.spaces.Box", space)
+    return LiveActions(None, None, _numbers(box.low), _numbers(box.high))
 
 
-def _steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, draws: bool) -> Iterator[LiveStep]:
-    seen = _Seen(policy)
+def _steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, draws: bool, start: int) -> Iterator[LiveStep]:
     try:
-        for steps, total, over in episode_steps(seen, env, seed, max_episode_steps=episode_cap(env, None)):
-            scores, kind = _scores(policy, seen.observation)
+        for moment in episode_steps(policy, env, seed, max_episode_steps=episode_cap(env, None)):
+            is_watched = moment.over or moment.num_env_steps >= start
+            scores, kind = _scores(policy, moment.observation) if is_watched else (None, None)
             yield LiveStep(
-                steps, float(total), over, _picture(env) if draws else None, _vector(seen.observation),
-                _plain(seen.action), scores, kind,
+                moment.num_env_steps, float(moment.total), moment.over, moment.ended_by,
+                _picture(env) if draws and is_watched else None,
+                _vector(moment.observation), _plain(moment.action), scores, kind,
             )  # fmt: skip
     finally:
         close_env(env)
 
 
 def _picture(env: gym.Env[Any, Any]) -> str | None:
-    frame = np.asarray(env.render())
+    try:
+        frame = np.asarray(env.render())
+    except Exception as error:  # an env may raise anything
+        env_id = env.spec.id if env.spec is not None else "The env"
+        raise EnvError(
+            f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.", "Mend its render()."
+        ) from error
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         return None
     picture = Image.fromarray(frame)

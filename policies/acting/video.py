@@ -177,8 +177,8 @@ class _Stage:
 
     def play(self, seed: int) -> Iterator[_Panel]:
         """Play the episode of a seed, and yield a panel for the reset and for each step."""
-        for steps, total, over in episode_steps(self._policy, self._env, seed, max_episode_steps=self._cap):
-            yield _Panel(self._draw(), self._title, steps, total, over)
+        for moment in episode_steps(self._policy, self._env, seed, max_episode_steps=self._cap):
+            yield _Panel(self._draw(), self._title, moment.num_env_steps, moment.total, moment.over)
 
     def _draw(self) -> Image.Image:
         env_id = self._env.spec.id if self._env.spec is not None else "The env"

@@ -15,6 +15,7 @@ from policies.acting.evaluate import Episodes, Evaluator, episode_steps, evaluat
 from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
 from policies.envs.make import make_env
 from policies.errors import EnvError, NonFiniteWeightsError, SpecError
+from tests.narrowing import present
 
 register_test_envs()
 pytestmark = pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date")
@@ -216,9 +217,43 @@ def test_seeds_and_caps_out_of_range_are_refused(seeds: list[int], cap: int | No
 def test_an_episode_step_by_step() -> None:
     policy, env = balancing_policy(skill="poor"), make_env("CartPole-v0")
     steps = list(episode_steps(policy, env, 3, max_episode_steps=200))
-    assert [length for length, _, _ in steps] == list(range(len(steps)))
-    assert [over for _, _, over in steps] == [False] * (len(steps) - 1) + [True]
-    assert play_episode(policy, env, 3, max_episode_steps=200) == (steps[-1][1], steps[-1][0])
+    assert [moment.num_env_steps for moment in steps] == list(range(len(steps)))
+    assert [moment.over for moment in steps] == [False] * (len(steps) - 1) + [True]
+    assert play_episode(policy, env, 3, max_episode_steps=200) == (steps[-1].total, steps[-1].num_env_steps)
+    assert steps[-1].ended_by == "terminated"
+    assert (steps[0].observation, steps[0].action) == (None, None)
+    assert [moment.action for moment in steps[1:]] == [policy.act(present(moment.observation)) for moment in steps[1:]]
+
+
+@pytest.mark.parametrize(("limit", "cap", "ended_by"), [(5, 200, "truncated"), (200, 5, "cap")])
+def test_it_is_said_how_an_episode_ended(limit: int, cap: int, ended_by: str) -> None:
+    env = make_env("CartPole-v0", {"max_episode_steps": limit})
+    *_, last = episode_steps(balancing_policy(), env, 3, max_episode_steps=cap)
+    assert (last.num_env_steps, last.ended_by) == (5, ended_by)
+
+
+class SameArray(gym.Env[Any, Any]):
+    """Writes each observation into the array that it has given before."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self) -> None:
+        self.numbers = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.numbers, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.numbers += 1
+        return self.numbers, 1.0, bool(self.numbers[0] == 3), False, {}
+
+
+def test_a_moment_has_what_the_policy_saw_where_an_env_writes_over_it() -> None:
+    env = SameArray()
+    policy = RandomPolicy(env.observation_space, env.action_space, env_id="SameArray")
+    _, *steps = episode_steps(policy, env, 0, max_episode_steps=9)
+    assert [present(moment.observation).tolist() for moment in steps] == [[0.0], [1.0], [2.0]]
 
 
 def test_episodes_are_plain_values() -> None:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from policies.acting.evaluate import evaluate_policy
-from policies.acting.live import LiveStep, watch_episode
+from policies.acting.live import LiveActions, LiveStep, watch_episode
 from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
 from policies.envs.make import check_env
 from policies.envs.spaces import describe_space
@@ -50,6 +50,7 @@ def test_it_is_the_episode_that_is_evaluated() -> None:
     )
     assert [step.num_env_steps for step in steps] == list(range(len(steps)))
     assert not any(step.over for step in steps[:-1])
+    assert [step.ended_by for step in steps] == [None] * (len(steps) - 1) + ["terminated"]
 
 
 def test_a_step_has_what_the_policy_saw_and_did() -> None:
@@ -91,6 +92,25 @@ def test_a_gaussian_policy_tells_its_spread() -> None:
     assert isinstance(first.action, list)
 
 
+def test_what_actions_there_are_is_told() -> None:
+    info, _ = watched(policy_for("CartPole-v1", "categorical", 2), "CartPole-v1")
+    assert info.actions == LiveActions(0, ("push left", "push right"), None, None)
+    info, _ = watched(RandomPolicy.for_env("Pendulum-v1"), "Pendulum-v1")
+    assert info.actions == LiveActions(None, None, [-2.0], [2.0])
+
+
+def test_steps_that_are_skipped_have_no_pictures() -> None:
+    policy = policy_for("CartPole-v1", "categorical", 2)
+    _, whole = watched(policy, "CartPole-v1")
+    for start in (3, len(whole) - 1, len(whole) + 5):
+        _, steps = watch_episode(policy, "CartPole-v1", {}, 3, start=start)
+        found = list(steps)
+        first = min(start, len(whole) - 1)
+        assert found[first:] == whole[first:]
+        assert [(step.picture, step.scores) for step in found[:first]] == [(None, None)] * first
+        assert [step.total for step in found] == [step.total for step in whole]
+
+
 def test_a_random_policy_plays_the_same_for_the_same_seed() -> None:
     actions = [
         [step.action for step in watched(RandomPolicy.for_env("CartPole-v1"), "CartPole-v1", seed)[1]]
@@ -126,6 +146,27 @@ def test_what_cannot_be_drawn_is_shown_by_its_observations(not_drawn: str) -> No
     assert "can't be drawn" in info.why_not or "render" in info.why_not
     assert [step.picture for step in steps] == [None, None]
     assert steps[1].observation == [1.0, 2.0]
+
+
+class BadlyDrawn(NotDrawn):
+    """Fails where it is to be drawn."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self, **given: Any) -> None:
+        self.render_mode = given.get("render_mode")
+
+    def render(self) -> Any:
+        raise RuntimeError("no canvas")
+
+
+def test_an_env_that_fails_to_draw_is_said() -> None:
+    gym.register("BadlyDrawn-v0", BadlyDrawn)
+    try:
+        with pytest.raises(EnvError, match="BadlyDrawn-v0 cannot be drawn: RuntimeError: no canvas"):
+            watched(RandomPolicy.for_env("BadlyDrawn-v0"), "BadlyDrawn-v0")
+    finally:
+        del gym.registry["BadlyDrawn-v0"]
 
 
 def test_a_policy_for_another_env_is_refused() -> None:

@@ -53,6 +53,15 @@ def test_an_episode_from_its_beginning_to_its_end(client: TestClient) -> None:
     assert (last, end["total"], end["over"]) == ("end", steps[-1][1]["total"], True)
 
 
+def test_an_episode_goes_on_from_a_step(client: TestClient) -> None:
+    query = {"trial": "t0003", "seed": 5, "speed": 10}
+    _, *whole = events(client.get("/api/v1/sweeps/done/play", params=query).text)
+    (first, info), *rest = events(client.get("/api/v1/sweeps/done/play", params=query | {"start": 4}).text)
+    assert (first, info["actions"]["names"]) == ("info", ["push left", "push right"])
+    assert rest == whole[4:]
+    assert rest[-1][1]["ended_by"] == "terminated"
+
+
 def test_a_random_policy_beside_it(client: TestClient) -> None:
     answer = client.get("/api/v1/sweeps/done/play", params={"random": True, "speed": 10})
     (_, info), *_, (last, _) = events(answer.text)
@@ -66,6 +75,7 @@ def test_a_random_policy_beside_it(client: TestClient) -> None:
     ({}, 404, "no best policy"),
     ({"trial": "t0003", "seed": -1}, 422, "seed"),
     ({"trial": "t0003", "speed": 0}, 422, "speed"),
+    ({"trial": "t0003", "start": 10_001}, 422, "start"),
 ])  # fmt: skip
 def test_what_cannot_be_played(client: TestClient, query: dict[str, Any], status: int, told: str) -> None:
     answer = client.get("/api/v1/sweeps/done/play", params=query)

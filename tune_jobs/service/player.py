@@ -51,9 +51,9 @@ def play(request: Mapping[str, Any], say: Callable[[Mapping[str, Any]], None]) -
     """Play an episode.
 
     Args:
-        request: `policy` (a folder, or "random"), `env_id`, `env_args`, `modules`, `seed`, and `speed` (1: the
-            environment's own time).
-        say: Takes what is to be told: `info`, then a `step` each, then `end`.
+        request: `policy` (a folder, or "random"), `env_id`, `env_args`, `modules`, `seed`, `speed` (1: the
+            environment's own time), and `start` (the first env step that is told; 0: all are).
+        say: Takes what is to be told: `info`, then a `step` each, then `end`; `skipped` once a second before `start`.
 
     Raises:
         TuneJobsError: The policy can't be read, or the environment failed.
@@ -65,18 +65,27 @@ def play(request: Mapping[str, Any], say: Callable[[Mapping[str, Any]], None]) -
         policy: Policy = RandomPolicy.for_env(env_id, env_args)
     else:
         policy = load_policy(request["policy"])
-    info, steps = watch_episode(policy, env_id, env_args, seed)
+    start = request["start"]
+    info, steps = watch_episode(policy, env_id, env_args, seed, start=start)
     say({"event": "info", **asdict(info), "seed": seed})
     pause = 1.0 / info.fps / min(MOST_SPEED, max(LEAST_SPEED, request["speed"]))
     due, step = time.monotonic(), None
+    told_at = due
     for step in steps:
+        if step.num_env_steps < start and not step.over:
+            # Who waits hears that the environment does not hang.
+            if time.monotonic() - told_at > 1.0:
+                say({"event": "skipped", "num_env_steps": step.num_env_steps})
+                told_at = time.monotonic()
+            continue
         say({"event": "step", **asdict(step)})
         if step.num_env_steps >= MAX_STEPS:
             break
         due = max(due + pause, time.monotonic() - pause)
         time.sleep(max(0.0, due - time.monotonic()))
     if step is not None:
-        say({"event": "end", "num_env_steps": step.num_env_steps, "total": step.total, "over": step.over})
+        told = {"num_env_steps": step.num_env_steps, "total": step.total}
+        say({"event": "end", **told, "over": step.over, "ended_by": step.ended_by})
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from fastapi.responses import StreamingResponse
 from policies.errors import NotFoundError
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.problems import TooManyError
-from tune_jobs.service.player import LEAST_SPEED, MOST_SPEED
+from tune_jobs.service.player import LEAST_SPEED, MAX_STEPS, MOST_SPEED
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import stored_spec
 
@@ -50,6 +50,7 @@ async def play(
     random: Annotated[bool, Query(description="A random policy instead.")] = False,
     seed: Annotated[int, Query(ge=0, le=2**32 - 1, description="Seed of the episode.")] = 0,
     speed: Annotated[float, Query(ge=LEAST_SPEED, le=MOST_SPEED, description="1: the env's own time.")] = 1.0,
+    start: Annotated[int, Query(ge=0, le=MAX_STEPS, description="The first env step that is told.")] = 0,
 ) -> StreamingResponse:
     """Play one greedy episode: the events `info`, `step` after step, and `end`, or `problem`."""
     request = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
@@ -58,7 +59,7 @@ async def play(
         raise TooManyError(f"{limit} episodes are being played.", "Close one, or wait for its end.")
     # An abandoned connection ends the generator, and with it the process.
     return StreamingResponse(
-        _events({**request, "seed": seed, "speed": speed}, str(service.config.storage)),
+        _events({**request, "seed": seed, "speed": speed, "start": start}, str(service.config.storage)),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
