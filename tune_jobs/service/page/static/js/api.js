@@ -29,7 +29,8 @@ async function problemOf(answer) {
   }
 }
 
-export async function ask(path, { method = "GET", query = {}, body, headers = {}, signal } = {}) {
+// The answer itself, where it was not refused.
+export async function answerTo(path, { method = "GET", query = {}, body, headers = {}, signal } = {}) {
   const url = new URL(path, BASE);
   for (const [name, value] of Object.entries(query)) {
     if (value !== null && value !== undefined && value !== "") url.searchParams.set(name, value);
@@ -51,6 +52,11 @@ export async function ask(path, { method = "GET", query = {}, body, headers = {}
     if (answer.status === 401 && path !== "login") dispatchEvent(new CustomEvent("sign-in-needed"));
     throw refused;
   }
+  return answer;
+}
+
+export async function ask(path, options) {
+  const answer = await answerTo(path, options);
   return answer.status === 204 ? null : answer.json();
 }
 

@@ -1,6 +1,7 @@
 // What a finished sweep has come to: the policy to deploy, the setting to train with, its report and films.
 import { el } from "./dom.js";
 import { counted, pointText, returnText } from "./format.js";
+import { playLink } from "./play_links.js";
 import { stateOf } from "./states.js";
 
 const CAPTIONS = { before_mp4: "Before: a random policy", after_mp4: "After: the best policy" };
@@ -77,6 +78,7 @@ export class Finished {
       el("p", { class: "score" }, returnText(confirmation.mean_return), " ", solved === null ? null : badge),
       el("p", { class: "quiet small" }, `mean over ${episodes}; a random policy has ${returnText(random.mean_return)}`),
       el("p", { class: "small" }, trial, ` at ${counted(checkpoint.num_env_steps, "env step")}`),
+      this.source.isFile ? null : el("p", {}, playLink(this.source.name)),
     );
   }
 

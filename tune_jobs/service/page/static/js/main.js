@@ -5,17 +5,18 @@ import { counted } from "./format.js";
 import { read } from "./route.js";
 import { openLogin } from "./login.js";
 import { openNew } from "./new_view.js";
+import { openPlay } from "./play_view.js";
 import { openSweep } from "./sweep_view.js";
 import { openSweeps } from "./sweeps_view.js";
 import { me } from "./who.js";
 
-const VIEWS = { sweeps: openSweeps, sweep: openSweep, new: openNew };
+const VIEWS = { sweeps: openSweeps, sweep: openSweep, play: openPlay, new: openNew };
 const main = document.getElementById("main");
 let open = null;
 let isSigningIn = false;
 
 function heading(route) {
-  return { sweeps: "Sweeps", new: "New sweep", sweep: route.name }[route.view];
+  return { sweeps: "Sweeps", new: "New sweep", sweep: route.name, play: `Watch ${route.name}` }[route.view];
 }
 
 function show() {

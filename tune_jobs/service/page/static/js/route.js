@@ -4,6 +4,7 @@ export function read() {
   const parts = path.split("/").filter(Boolean).map(decode);
   const params = Object.fromEntries(new URLSearchParams(query));
   if (parts[0] === "new") return { view: "new", params };
+  if (parts[0] === "sweeps" && parts[2] === "play") return { view: "play", name: parts[1], params };
   if (parts[0] === "sweeps" && parts.length > 1) return { view: "sweep", name: parts[1], params };
   return { view: "sweeps", params };
 }
@@ -19,6 +20,10 @@ function decode(text) {
 
 export function sweepAddress(name, params = {}) {
   return write(`/sweeps/${encodeURIComponent(name)}`, params);
+}
+
+export function playAddress(name, params = {}) {
+  return write(`/sweeps/${encodeURIComponent(name)}/play`, params);
 }
 
 function write(path, params) {

@@ -1,6 +1,7 @@
 // The head of a sweep's page: what it is, how far it is, and what there is to say of it.
 import { el, reconcile, setAttribute, setText } from "./dom.js";
 import { ago, compact, count, counted, duration, moment, percent, pointText, returnText, timeLeft } from "./format.js";
+import { playLink } from "./play_links.js";
 import { isLive, stateOf, stateReason, TRIAL_STATUSES } from "./states.js";
 
 export class SweepHead {
@@ -33,6 +34,8 @@ export class SweepHead {
       " ",
       el("small"),
     );
+    this.play = playLink(source.name);
+    this.isFile = source.isFile;
     this.leftName = el("dt", {}, "Time left");
     this.spoken = el("p", { class: "for-readers", role: "status" });
     host.append(
@@ -40,7 +43,7 @@ export class SweepHead {
         "div",
         { class: "title-row sweep-title" },
         el("div", {}, el("div", { class: "with-state" }, el("h1", {}, source.name), this.state), this.what, this.tags),
-        el("div", { class: "head-links" }, actions.node),
+        el("div", { class: "head-links" }, this.play, actions.node),
       ),
       alert.node,
       this.reason,
@@ -132,6 +135,8 @@ export class SweepHead {
   }
 
   showBest(best) {
+    // A file has records, and no policies.
+    this.play.hidden = !best || this.isFile;
     const [score, trial, point] = this.best.children;
     this.bestId = best?.trial_id;
     setText(score, best ? returnText(best.score) : "no evaluation yet");

@@ -2,6 +2,7 @@
 import { colour, el, reconcile, setAttribute, setText } from "./dom.js";
 import { count, counted, duration, moment, returnText, settingText } from "./format.js";
 import { drawLine, lineOf, valueAt } from "./lines.js";
+import { CheckpointLinks } from "./play_links.js";
 import { Plot, withAir } from "./plot.js";
 import { trialTone } from "./states.js";
 
@@ -42,6 +43,7 @@ export class TrialPanel {
     this.fixed = el("dl", { class: "pairs" });
     this.log = el("pre", { class: "log", role: "log", tabindex: 0, "aria-label": "Log", "aria-live": "off" });
     this.chart = el("div", {});
+    this.checkpoints = new CheckpointLinks(source);
     this.dialog = el(
       "dialog",
       { class: "panel", "aria-labelledby": "trial-title" },
@@ -73,6 +75,7 @@ export class TrialPanel {
           ),
         ),
         el("section", { "aria-label": "Facts" }, el("h3", {}, "Facts"), this.facts, this.notes),
+        this.checkpoints.node,
         el("section", { "aria-label": "Log", hidden: source.isFile }, el("h3", {}, "Log"), this.log),
         el("details", {}, el("summary", {}, "All hyperparameters"), this.fixed),
       ),
@@ -103,6 +106,7 @@ export class TrialPanel {
     setText(this.title, id);
     for (const node of [this.problem, this.log, this.point, this.facts, this.notes, this.fixed]) node.replaceChildren();
     this.why.hidden = true;
+    this.checkpoints.show(null);
     setAttribute(this.state, "class", "state");
     setText(this.state, "");
     if (isFirst) this.reopen();
@@ -160,6 +164,7 @@ export class TrialPanel {
     const values = Object.entries(trial.point).map(([name, value]) => [name, settingText(value)]);
     pairs(this.point, values.length ? values : [["", "nothing is searched"]]);
     pairs(this.facts, factsOf(trial));
+    this.checkpoints.show(trial);
     reconcile(
       this.notes,
       trial.notes,
