@@ -350,6 +350,15 @@ class ReplicationRecord(_Record):
     )
 
 
+class ChosenPointRecord(_Record):
+    """A point that somebody chose, beside those that the search gives; see `analysis.numbering`."""
+
+    num_points: Annotated[int, Field(ge=0, le=2**31)] = Field(
+        description="The points that the sweep had then, which is the index of this one."
+    )
+    point: dict[str, Any] = Field(description="Its values of the searched hyperparameters.")
+
+
 class SweepRecord(_Record):
     """The record of a sweep: sweep.json."""
 
@@ -369,6 +378,7 @@ class SweepRecord(_Record):
     address: str | None = None
     allowed_modules: tuple[str, ...] = Field((), description="Modules of the user's own that its trials may import.")
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
+    chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
 
     def section(self, name: str) -> Mapping[str, Any]:
         """Return a section of the sweep file, empty where a record lacks it or has something else there.

@@ -11,6 +11,8 @@ Streams derived from the seed of a sweep, by `spawn_key` of `numpy.random.SeedSe
 | (4, trial, change) | population based training: how a trial's change number `change` changes its values |
 | (5, point) | search method tpe: its sampler |
 
+Points are counted there without those that somebody chose, so that these change no other.
+
 Streams derived from the seed of a trial, which is the entropy together with further numbers. A trial that is continued
 from iteration i > 0 uses new numbers, because only packs save the state of their generators:
 

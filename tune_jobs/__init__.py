@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from tune_jobs.sweeps.verbs import extend as extend
     from tune_jobs.sweeps.verbs import figure as figure
     from tune_jobs.sweeps.verbs import importance as importance
+    from tune_jobs.sweeps.verbs import inject as inject
     from tune_jobs.sweeps.verbs import launch as launch
     from tune_jobs.sweeps.verbs import list_sweeps as list_sweeps
     from tune_jobs.sweeps.verbs import replicate as replicate
@@ -47,8 +48,8 @@ if TYPE_CHECKING:
 
 _SWEEPS = (
     "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
-    "export", "extend", "figure", "importance", "launch", "list_sweeps", "replicate", "report", "reproduce", "restore",
-    "resume", "status", "stop", "study", "trials", "video",
+    "export", "extend", "figure", "importance", "inject", "launch", "list_sweeps", "replicate", "report", "reproduce",
+    "restore", "resume", "status", "stop", "study", "trials", "video",
 )  # fmt: skip
 _HOME = {
     "TuneJobsError": "policies.errors",

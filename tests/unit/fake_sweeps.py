@@ -137,6 +137,7 @@ def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSweeps:
         "launch": result,
         "resume": result,
         "extend": result,
+        "inject": result,
         "replicate": result,
         "stop": True,
         "status": status,

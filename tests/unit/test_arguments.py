@@ -65,6 +65,7 @@ TAKES = {
     "names": {"texts", "empty list", "set"},
     "progress": set(),
     "finish": {"flag"},
+    "point": {"mapping", "empty mapping"},
     "retry_failed": {"flag"},
     "num_samples": {"whole", "huge"},
     "top": {"whole", "huge"},
@@ -87,6 +88,7 @@ def call(name: str, argument: str, value: Any) -> Any:
         key: "nothing" for key, one in inspect.signature(function).parameters.items() if one.default is one.empty
     }
     given |= {"num_samples": 1} if "num_samples" in given else {}
+    given |= {"point": {"lr": 1}} if "point" in given else {}
     given |= {"format": "csv"} if "format" in given else {}
     return function(**{**given, argument: value})
 
@@ -98,7 +100,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_whole_api_is_looked_at() -> None:
-    assert len(FUNCTIONS) == 26
+    assert len(FUNCTIONS) == 27
     assert {argument for _, argument in CASES} == set(TAKES)
 
 

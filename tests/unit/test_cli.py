@@ -40,6 +40,10 @@ COMMANDS = [
     ("resume mine", ("resume", ("mine",), options(retry_failed=False))),
     ("resume mine --retry-failed --no-finish", ("resume", ("mine",), options(retry_failed=True, finish=False))),
     ("extend mine --num-samples 3 --storage s", ("extend", ("mine", 3), options(storage="s"))),
+    (
+        "inject mine lr=1e-3 b=[64,64] --storage s",
+        ("inject", ("mine", {"lr": 1e-3, "b": [64, 64]}), options(storage="s")),
+    ),
     ("stop mine", ("stop", ("mine",), {"storage": None})),
     ("status mine --storage s", ("status", ("mine",), {"storage": "s"})),
     ("list --storage s", ("list_sweeps", ("s",), {})),
@@ -66,11 +70,11 @@ COMMANDS = [
 
 @pytest.mark.parametrize(("arguments", "call"), COMMANDS)
 def test_commands_pass_their_arguments_on(
-    run: RunCommand, sweeps: FakeSweeps, arguments: str, call: tuple[str, tuple[int | str, ...], dict[str, Any]]
+    run: RunCommand, sweeps: FakeSweeps, arguments: str, call: tuple[str, tuple[Any, ...], dict[str, Any]]
 ) -> None:
     result = run(*arguments.split())
     assert sweeps.calls == [call]
-    assert result.exit_code == (3 if call[0] in ("launch", "resume", "extend") else 0)
+    assert result.exit_code == (3 if call[0] in ("launch", "resume", "extend", "inject") else 0)
 
 
 @pytest.mark.parametrize("arguments", [arguments for arguments, _ in COMMANDS])
@@ -295,6 +299,12 @@ def test_debug_shows_the_traceback(tmp_path: Path, sweeps: FakeSweeps) -> None:
         ["launch", "x", "--nme", "y"],
         ["extend", "mine"],
         ["extend", "mine", "--num-samples", "0"],
+        ["inject", "mine"],
+        ["inject", "mine", "lr"],
+        ["inject", "mine", "lr="],
+        ["inject", "mine", "=1"],
+        ["inject", "mine", "lr=[1"],
+        ["inject", "mine", "lr=1", "lr=2"],
         ["best", "mine", "--num-episodes", "x"],
         ["evaluate", "p", "--first-seed", "-1"],
         ["evaluate", "random"],

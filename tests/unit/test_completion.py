@@ -66,6 +66,16 @@ def test_a_source_is_a_sweep_a_trial_or_a_baseline(here: Path) -> None:
     assert completed("video best/pol") == [("file", "best/pol")]
 
 
+def test_a_point_is_completed_with_what_the_sweep_searches_and_has_no_value_yet(here: Path) -> None:
+    space = {"lr": {"uniform": [1e-4, 1e-2]}, "gamma": {"uniform": [0.9, 0.99]}}
+    make_sweep_folder(here / "sweeps" / "mine", iterations=1, space=space)
+    assert names("inject mine ") == ["lr=", "gamma="]
+    assert names("inject mine lr=1e-3 ") == ["gamma="]
+    assert names("inject mine g") == ["gamma="]
+    assert names("inject none l") == []
+    assert names("inject mi") == ["mine"]
+
+
 def test_an_algorithm_is_completed() -> None:
     assert names("hyperparams ") == ["ppo", "dqn", "random", "constant"]
 

@@ -28,6 +28,7 @@ _UNCHANGED = {
     "replicate": "No trial had begun, and nothing was changed.",
     "reproduce": "Nothing was changed.",
     "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
+    "inject": "No trial had begun, and nothing was changed.",
 }
 _JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -199,7 +200,7 @@ def stdout_for(*, as_json: bool) -> Iterator[None]:
 
 
 def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> SweepResult:
-    """Return the result of a launch, resume or extend, also if a signal ended it.
+    """Return the result of a launch, resume, extend or inject, also if a signal ended it.
 
     Raises:
         KeyboardInterrupt: A signal ended it before the sweep had begun.

@@ -31,6 +31,7 @@ from tune_jobs.cli.base import (
     sweep_argument,
 )
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
+from tune_jobs.cli.inject_command import inject
 from tune_jobs.cli.result_commands import compare, export, importance, reproduce
 from tune_jobs.cli.serve_command import serve
 from tune_jobs.cli.token_commands import token
@@ -328,7 +329,7 @@ def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
     cli_output.show_paths({"report": path}, as_json=as_json)
 
 
-for _command in (compare, export, importance, reproduce, serve, token):
+for _command in (compare, export, importance, inject, reproduce, serve, token):
     cli.add_command(_command)
 
 

@@ -7,12 +7,15 @@ that cannot be read has nothing to complete.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import click
 from click.shell_completion import CompletionItem
+
+if TYPE_CHECKING:
+    from tune_jobs.store.contract import Sweep
 
 _SUFFIXES = (".yaml", ".yml")
 _BASELINES = ("random", "constant")
@@ -48,6 +51,13 @@ def complete_sources(ctx: click.Context, _: click.Parameter, incomplete: str) ->
     return [*_by_shell("file", incomplete), *_items([*_BASELINES, *_sweep_names(ctx)], incomplete)]
 
 
+def complete_searched(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the sweep's searched hyperparameters that have no value yet, each with an equals sign behind it."""
+    given = {text.partition("=")[0] for text in ctx.params.get("values") or ()}
+    names = _searched_names(ctx, str(ctx.params.get("sweep") or ""))
+    return _items((f"{name}=" for name in names if name not in given), incomplete)
+
+
 def complete_algorithms(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Return the algorithms."""
     from policies.hyperparams import Algorithm
@@ -80,11 +90,19 @@ def _sweep_names(ctx: click.Context) -> list[str]:
 
 
 def _trial_names(ctx: click.Context, sweep: str) -> list[str]:
+    return _of_sweep(ctx, sweep, lambda store: [trial.trial_id for trial in store.read_trials()])
+
+
+def _searched_names(ctx: click.Context, sweep: str) -> list[str]:
+    return _of_sweep(ctx, sweep, lambda store: list(store.read_record().section("space")))
+
+
+def _of_sweep(ctx: click.Context, sweep: str, names: Callable[[Sweep], list[str]]) -> list[str]:
     from policies.errors import TuneJobsError
     from tune_jobs.store.local_storage import open_storage
     from tune_jobs.sweeps.storage import storage_folder
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):
         store = open_storage(storage_folder(ctx.params.get("storage"))).sweep(sweep)
-        return [trial.trial_id for trial in store.read_trials()] if store.exists() else []
+        return names(store) if store.exists() else []
     return []

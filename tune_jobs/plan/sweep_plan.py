@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from analysis.numbering import planned_places
-from analysis.records import FINISHED, ReplicationRecord, TrialPlan, TrialRecord
+from analysis.records import FINISHED, ChosenPointRecord, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
 from policies.envs.make import EnvInfo
 from policies.errors import SpecError
@@ -30,6 +30,7 @@ from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
 from tune_jobs.plan.user_code import check_rl_module
+from tune_jobs.search.chosen_point import outside_notes
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.tpe import check_installed
 from tune_jobs.spec.domains import num_points
@@ -104,6 +105,7 @@ def make_plan(
     records: Sequence[TrialRecord] = (),
     *,
     replications: Sequence[ReplicationRecord] = (),
+    chosen_points: Sequence[ChosenPointRecord] = (),
     retry_failed: bool = False,
 ) -> SweepPlan:
     """Plan a sweep for a machine.
@@ -113,6 +115,7 @@ def make_plan(
         machine: What it runs on.
         records: The records of trials that exist already, which keep their engines.
         replications: More seeds of some points, oldest first.
+        chosen_points: Points that somebody chose, oldest first.
         retry_failed: Whether the failed ones of them run again.
 
     Raises:
@@ -129,14 +132,14 @@ def make_plan(
     check_env_args(spec)
     env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
     check_rl_module(spec)
-    concurrent = max_concurrent(spec, machine, _num_trials(spec, replications))
-    points = _points(spec)
+    concurrent = max_concurrent(spec, machine, _num_trials(spec, replications, chosen_points))
+    points = _points(spec, chosen_points)
     known = [values for _, values in points if values is not None]
     check_env_rules(spec, env, known)
     trials, engine_notes = _trials(spec, env, points, records, replications)
     are_packed = [_is_packed(trial) for trial in trials if trial.seed_index == 0]
     idle = idle_notes(spec, env, [values for _, values in points], are_packed, may_refuse=not records)
-    sizes = _sizes(spec, known)
+    sizes = _sizes(spec, points, known)
     to_run = _to_run(trials, records, retry_failed=retry_failed)
     members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
@@ -155,19 +158,29 @@ def make_plan(
         max_disk_bytes=_SWEEP_BYTES + _total(trials, _largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
         env=env,
         machine=machine,
-        notes=(*_notes(spec, env, concurrent if packs is None else None), *idle_settings(spec), *idle, *engine_notes),
+        notes=(
+            *_notes(spec, env, concurrent if packs is None else None),
+            *idle_settings(spec),
+            *idle,
+            *engine_notes,
+            *outside_notes(spec, chosen_points),
+        ),
         packs=packs,
     )
 
 
-def num_points_of(spec: SweepSpec) -> int:
-    """Return the number of a sweep's points."""
-    return spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = ()) -> int:
+    """Return the number of a sweep's points, those among them that somebody chose."""
+    drawn = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+    return drawn + len(chosen_points)
 
 
-def _num_trials(spec: SweepSpec, replications: Sequence[ReplicationRecord]) -> int:
+def _num_trials(
+    spec: SweepSpec, replications: Sequence[ReplicationRecord], chosen_points: Sequence[ChosenPointRecord]
+) -> int:
     """Return the number of a sweep's trials; too many are refused."""
-    number = num_points_of(spec) * spec.seeds_per_point + sum(len(item.points) for item in replications)
+    searched = num_points_of(spec, chosen_points) * spec.seeds_per_point
+    number = searched + sum(len(item.points) for item in replications)
     if number > MAX_TRIALS:
         raise SpecError(
             f"The sweep has {number:,} trials; at most {MAX_TRIALS:,} can be planned.",
@@ -176,11 +189,11 @@ def _num_trials(spec: SweepSpec, replications: Sequence[ReplicationRecord]) -> i
     return number
 
 
-def _points(spec: SweepSpec) -> list[_Point]:
+def _points(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord]) -> list[_Point]:
     """Return each point with all its hyperparameters."""
     return [
         (None, None) if point is None else (point, point_hyperparams(spec, point, index))
-        for index, point in enumerate(planned_points(spec))
+        for index, point in enumerate(planned_points(spec, chosen_points))
     ]
 
 
@@ -256,12 +269,13 @@ def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequ
     return members
 
 
-def _sizes(spec: SweepSpec, known: list[Hyperparams]) -> list[list[Hyperparams]]:
+def _sizes(spec: SweepSpec, points: Sequence[_Point], known: list[Hyperparams]) -> list[list[Hyperparams]]:
     """Return, for each point, the hyperparameters that its largest trials may have."""
     if spec.scheduler.type == "pbt":
         return [[values, *largest_hyperparams(spec, known)] for values in known]
-    unknown = spec.num_samples - len(known) if spec.search.type == "tpe" else 0
-    return [[values] for values in known] + ([largest_hyperparams(spec, known)] * unknown if unknown else [])
+    # One list for all points that are not known: `_largest` measures it once.
+    largest = largest_hyperparams(spec, known) if len(known) < len(points) else []
+    return [largest if values is None else [values] for _, values in points]
 
 
 def _total(trials: Sequence[TrialPlan], of_points: Sequence[int]) -> int:
@@ -278,8 +292,13 @@ def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], in
     return [known[id(values)] for values in sizes]
 
 
-def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int) -> Hyperparams:
+def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int | None) -> Hyperparams:
     """Return all hyperparameters of a point's trials, validated.
+
+    Args:
+        spec: The sweep.
+        point: The searched values.
+        point_index: The point's index; None: it is not one of the sweep's yet.
 
     Raises:
         SpecError: The values contradict each other.
@@ -291,7 +310,9 @@ def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: in
         problems = "; ".join(f"{dotted(detail['loc'])} {explain(detail)}".strip() for detail in details_of(error))
         raise SpecError(
             f"The values of {place} don't go together: {problems}",
-            "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
+            "Give other values."
+            if point_index is None
+            else "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
         ) from error
     if isinstance(values, RandomHyperparams) and spec.resources.num_env_runners:
         raise SpecError(
@@ -310,12 +331,14 @@ def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: in
     return values
 
 
-def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int) -> str:
+def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int | None) -> str:
     """Return what messages call a point."""
     if point is None:
         shown = f"chosen by {spec.search.type}"
     else:
         shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
+    if point_index is None:
+        return f"the new point ({shown})"
     return f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from ray.tune.search import Searcher
 
-from analysis.records import TrialRecord
+from analysis.numbering import drawn_index
+from analysis.records import ChosenPointRecord, TrialRecord
 from tune_jobs.plan.sweep_plan import point_hyperparams
 from tune_jobs.search.tpe import propose_point
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -21,6 +22,7 @@ class PointChooser:
 
     Args:
         spec: The sweep.
+        chosen_points: Points of it that somebody chose, which are not drawn.
         records: Returns the newest records of all trials.
         change: Changes a trial's record, on disk too.
     """
@@ -28,10 +30,11 @@ class PointChooser:
     def __init__(
         self,
         spec: SweepSpec,
+        chosen_points: Sequence[ChosenPointRecord],
         records: Callable[[], Sequence[TrialRecord]],
         change: Callable[[str, Callable[[TrialRecord], TrialRecord]], None],
     ) -> None:
-        self._spec = spec
+        self._spec, self._chosen_points = spec, chosen_points
         self._given: set[str] = set()
         self._records = records
         self._change = change
@@ -59,7 +62,8 @@ class PointChooser:
             # Another seed has a point already: the driver was killed before it could write it to this trial's record.
             self._write(point_index, records, known[0].point)
             return
-        point = propose_point(spec, records, point_index, lambda point: point_hyperparams(spec, point, point_index))
+        drawn = drawn_index(point_index, self._chosen_points)
+        point = propose_point(spec, records, drawn, lambda point: point_hyperparams(spec, point, point_index))
         self._write(point_index, records, point)
 
     def _write(self, point_index: int, records: Sequence[TrialRecord], point: dict[str, Any]) -> None:

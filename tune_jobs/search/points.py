@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from analysis.numbering import with_chosen
+from analysis.records import ChosenPointRecord
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, as_sizes
 from tune_jobs.spec.domains import Domain, Listed, Range, draw_point, draw_points
@@ -20,8 +22,20 @@ _DECIDE_SIZE = (
 """The hyperparameters that a trial's env steps, disk space and memory depend on."""
 
 
-def planned_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
-    """Return the point of each index; None: the search method chooses it when its trial starts."""
+def planned_points(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = ()) -> list[dict[str, Any] | None]:
+    """Return the point of each index; None: the search method chooses it when its trial starts.
+
+    Args:
+        spec: The sweep.
+        chosen_points: Points that somebody chose, oldest first.
+
+    Raises:
+        ValueError: As for `with_chosen`.
+    """
+    return with_chosen(_drawn_points(spec), chosen_points)
+
+
+def _drawn_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
     if spec.search.type == "random":
         return list(draw_points(spec.space, spec.num_samples, spec.seed))
     num_random = min(spec.search.num_startup_trials, spec.num_samples)

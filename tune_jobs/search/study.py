@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from analysis.objectives import score_of
 from analysis.records import FINISHED, TrialRecord
 from analysis.tables import cell_value
 from policies.errors import CannotRunError, SpecError
+from tune_jobs.search.chosen_point import is_inside
 from tune_jobs.spec.domains import Listed, Range
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -59,11 +61,13 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
         study = optuna.create_study(study_name=name, direction="maximize", storage=_storage(path))
-        distributions = {key: _distribution(domain) for key, domain in spec.space.items()}
+        trials = [trial for trial in data.trials if trial.status in FINISHED and trial.has_point]
+        distributions = {
+            key: _distribution(domain, [trial.point[key] for trial in trials]) for key, domain in spec.space.items()
+        }
         study.set_user_attr("objective", data.objective)
-        for trial in sorted(data.trials, key=lambda item: item.index):
-            if trial.status in FINISHED and trial.has_point:
-                study.add_trial(_as_optunas(spec, data, trial, distributions))
+        for trial in sorted(trials, key=lambda item: item.index):
+            study.add_trial(_as_optunas(spec, data, trial, distributions))
     finally:
         optuna.logging.set_verbosity(verbosity)
     return study
@@ -128,18 +132,20 @@ def _attributes(trial: TrialRecord) -> dict[str, Any]:
     }
 
 
-def _distribution(domain: Any) -> optuna.distributions.BaseDistribution:
+def _distribution(domain: Any, values: Sequence[Any]) -> optuna.distributions.BaseDistribution:
+    """Return a domain in Optuna's form, as wide as the values: a point that somebody chose may lie outside of it."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     if isinstance(domain, Listed):
-        return CategoricalDistribution(tuple(cell_value(value) for value in domain.values))
+        return CategoricalDistribution(tuple(dict.fromkeys(map(cell_value, [*domain.values, *values]))))
     assert isinstance(domain, Range)
-    low, high = domain.bounds
+    low, high = min([domain.bounds[0], *values]), max([domain.bounds[1], *values])
+    is_log = domain.is_log and low > 0
+    # A step and a logarithmic scale exclude each other in Optuna, and a step has to lead to each value.
+    q = None if is_log or any(not is_inside(domain, value) for value in values) else domain.q
     if domain.is_whole:
-        # A step and a logarithmic scale exclude each other in Optuna.
-        step = 1 if domain.is_log else int(domain.q or 1)
-        return IntDistribution(int(low), int(high), log=domain.is_log, step=step)
-    return FloatDistribution(low, high, log=domain.is_log, step=None if domain.is_log else domain.q)
+        return IntDistribution(int(low), int(high), log=is_log, step=int(q or 1))
+    return FloatDistribution(low, high, log=is_log, step=q)
 
 
 def _value(domain: Any, value: Any) -> Any:

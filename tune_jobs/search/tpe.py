@@ -7,7 +7,8 @@ results, and nothing is stored besides the records. What the model is given for 
 - ended early by a scheduler: the same, and how far it got. Such points count as worse than those that ended by
   themselves, and as better the further they got (Optuna's pruned trials);
 - failed, or without a finite evaluation: worse than all others;
-- still running: a bad score, so that trials that run at the same time are spread out (the constant liar).
+- still running: a bad score, so that trials that run at the same time are spread out (the constant liar);
+- chosen by somebody, with a value that the search could not give: nothing, as the model has no place for it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from analysis.records import FINISHED, TrialRecord
 from analysis.selection import score_trial
 from policies import random_streams
 from policies.errors import CannotRunError, SpecError
+from tune_jobs.search.chosen_point import outside
 from tune_jobs.spec.domains import Domain, Listed, Range, draw_point
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -47,7 +49,7 @@ def check_installed() -> None:
         )
 
 
-def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: int, check: Check) -> dict[str, Any]:
+def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check) -> dict[str, Any]:
     """Choose the next point to try.
 
     The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, the point
@@ -56,7 +58,7 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: 
     Args:
         spec: The sweep.
         records: The records of all its trials.
-        point_index: The index of the point to choose.
+        drawn_index: The index of the point to choose, among those that nobody chose.
         check: Raises SpecError for a point whose values contradict each other; then another is proposed.
 
     Raises:
@@ -68,12 +70,12 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], point_index: 
 
     known = _known_trials(spec, records)
     if sum(trial.state.is_finished() for trial in known) < spec.search.num_startup_trials:
-        return draw_point(spec.space, point_index, spec.seed)
+        return draw_point(spec.space, drawn_index, spec.seed)
     with warnings.catch_warnings():
         # Optuna 4 warns of arguments that are new in it.
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         sampler = optuna.samplers.TPESampler(
-            seed=random_streams.tpe_seed(spec.seed, point_index),
+            seed=random_streams.tpe_seed(spec.seed, drawn_index),
             n_startup_trials=0,
             multivariate=True,
             constant_liar=True,
@@ -119,6 +121,8 @@ def _known_trials(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[optun
     known = []
     for index in sorted(points):
         members = points[index]
+        if outside(spec.space, members[0].point):
+            continue
         told: dict[str, Any] = {"state": states.RUNNING}
         if all(record.status in FINISHED for record in members):
             score, level = _score(members), _level(spec, members)

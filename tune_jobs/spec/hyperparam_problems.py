@@ -44,7 +44,7 @@ def hyperparam_problems(
         ]
     for name, value in hyperparams.items():
         if name in fields:
-            problems += _value_problems(algorithm, name, value, path=f"hyperparams.{name}")
+            problems += value_problems(algorithm, name, value, path=f"hyperparams.{name}")
         if name in space:
             text = f"is fixed at {value!r} but also searched in space.{name}: take it out of one of them"
             problems.append(Problem(f"hyperparams.{name}", text))
@@ -65,14 +65,22 @@ def check_distinct(algorithm: Algorithm, space: Mapping[str, Domain]) -> None:
             continue
         seen: dict[str, int] = {}
         for index, value in enumerate(domain.values):
-            known = _alone(algorithm, name).model_validate({name: value}).model_dump(mode="json")
-            first = seen.setdefault(json.dumps(known), index)
+            first = seen.setdefault(in_one_form(algorithm, name, value), index)
             if first != index:
                 raise SpecError(
                     f"space.{name}.{domain.kind}[{index}]: {value!r} is the same as {domain.values[first]!r}, in "
                     f"{domain.kind}[{first}]: list it once (seeds_per_point repeats points with other seeds)",
                     SPEC_HINT,
                 )
+
+
+def in_one_form(algorithm: Algorithm, name: str, value: Any) -> str:
+    """Return a text that is equal for values of a hyperparameter that mean the same, as 64 and [64] do.
+
+    Raises:
+        pydantic.ValidationError: The hyperparameter does not take the value.
+    """
+    return json.dumps(_alone(algorithm, name).model_validate({name: value}).model_dump(mode="json"))
 
 
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
@@ -92,7 +100,7 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
     problems = []
     for index, value in domain.probes():
         path = f"space.{name}.{domain.kind}"
-        found = _value_problems(algorithm, name, value, path=path if index is None else f"{path}[{index}]")
+        found = value_problems(algorithm, name, value, path=path if index is None else f"{path}[{index}]")
         if found and index is None:
             text = f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
             found = [Problem(path, text)]
@@ -102,7 +110,15 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
     return problems
 
 
-def _value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -> list[Problem]:
+def value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) -> list[Problem]:
+    """Return what is wrong with one value of a hyperparameter.
+
+    Args:
+        algorithm: The algorithm that has the hyperparameter.
+        name: Its name.
+        value: The value.
+        path: What messages call its place.
+    """
     try:
         checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
     except ValidationError as error:

@@ -106,6 +106,25 @@ def check_replicable(spec: SweepFields) -> None:
         )
 
 
+def check_takes_points(spec: SweepFields) -> None:
+    """Check that points that somebody chooses can be added to the sweep.
+
+    Raises:
+        SpecError: Nothing is searched, or trials of a population change their values while they train.
+    """
+    if not spec.space:
+        raise SpecError(
+            "No point can be added to the sweep: it has no space, so that all its trials have the same values.",
+            "Launch a new sweep with other values under hyperparams.",
+        )
+    if spec.scheduler.type == "pbt":
+        raise SpecError(
+            "No point can be added to the sweep: with population based training (scheduler.type pbt) a trial goes on "
+            "from others' copies with other values, so that the point would not be trained as it was given.",
+            "Launch a sweep of these values, fixed under hyperparams; `tune-jobs extend` adds trials to a population.",
+        )
+
+
 def _tpe_problems(spec: SweepFields) -> Found:
     if is_baseline(spec):
         return [("search.type", f"tpe needs an algorithm that learns, and {spec.algorithm} does not: use random")]

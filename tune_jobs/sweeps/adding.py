@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.numbering import planned_places
-from analysis.records import FINISHED, SweepRecord
-from policies.errors import CannotRunError, CheckpointError
+from analysis.records import FINISHED, ChosenPointRecord, SweepRecord, TrialRecord
+from policies.errors import CannotRunError, CheckpointError, SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Hyperparams
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import SweepPlan, make_plan, num_points_of
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan, num_points_of, point_hyperparams
 from tune_jobs.process.interruption import current
+from tune_jobs.search.chosen_point import checked_point, trial_of_point
+from tune_jobs.search.points import planned_points
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.names import SWEEP_RECORD
@@ -28,18 +30,64 @@ def add_what_is_missing(
     retry_failed: bool = False,
 ) -> SweepPlan:
     """Plan the sweep of a record, and write the record and the trials that do not exist yet."""
-    _check_replications(record, spec)
+    _check_numbering(record, spec)
     trials = store.read_trials()
-    plan = make_plan(spec, machine, trials, replications=record.replications, retry_failed=retry_failed)
+    plan = make_plan(
+        spec, machine, trials, replications=record.replications, chosen_points=record.chosen_points,
+        retry_failed=retry_failed,
+    )  # fmt: skip
     check_same_trials(store, plan)
     with current().shielded():
         _add_trials(store, record, spec, plan, address, retry_failed=retry_failed)
     return plan
 
 
-def _check_replications(record: SweepRecord, spec: SweepSpec) -> None:
+def with_chosen_point(
+    record: SweepRecord, spec: SweepSpec, trials: Sequence[TrialRecord], given: Mapping[str, Any]
+) -> SweepRecord:
+    """Return the record of a sweep with one more point, which somebody chose.
+
+    Raises:
+        SpecError: The sweep takes no points, this one is wrong, or the sweep has it already.
+    """
+    num_points = num_points_of(spec, record.chosen_points)
+    added = ChosenPointRecord(num_points=num_points, point=new_point(record, spec, trials, given))
+    return record.model_copy(update={"chosen_points": (*record.chosen_points, added)})
+
+
+def new_point(
+    record: SweepRecord, spec: SweepSpec, trials: Sequence[TrialRecord], given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return a point that somebody chose, checked, and as the sweep's own points are written.
+
+    Args:
+        record: The sweep's record.
+        spec: The sweep.
+        trials: Its trials.
+        given: Values by the names of searched hyperparameters.
+
+    Raises:
+        SpecError: The sweep takes no points, this one is wrong, or a trial has it already.
+    """
+    point = checked_point(spec, given)
+    point_hyperparams(spec, point, None)
+    if (known := trial_of_point(spec, point, trials)) is not None:
+        raise SpecError(
+            f"Sweep {record.name} has this point already: trial {known.trial_id} has its values.",
+            f"Choose other values; `tune-jobs replicate {record.name}` trains the leading points with more seeds.",
+        )
+    if any(item.point == point for item in record.chosen_points):
+        raise SpecError(
+            f"Sweep {record.name} has this point already; it was not trained yet.",
+            f"Run what is missing with `tune-jobs resume {record.name}`.",
+        )
+    return point
+
+
+def _check_numbering(record: SweepRecord, spec: SweepSpec) -> None:
     try:
-        planned_places(num_points_of(spec), spec.seeds_per_point, record.replications)
+        planned_points(spec, record.chosen_points)
+        planned_places(num_points_of(spec, record.chosen_points), spec.seeds_per_point, record.replications)
     except ValueError as error:
         raise CheckpointError(
             f"The record of sweep {record.name} is damaged: {error}.", f"Restore {SWEEP_RECORD} from a backup."

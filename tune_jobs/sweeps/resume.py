@@ -1,9 +1,10 @@
-"""Resume, extend or replicate a sweep: take it over, add what is left to run, and run it."""
+"""Resume, extend or replicate a sweep, or inject a point: take it over, add what is left to run, and run it."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 from policies.envs.modules import allow_modules
 from policies.guard.guard import guarding
@@ -11,7 +12,7 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
 from tune_jobs.store.contract import Sweep
-from tune_jobs.sweeps.adding import add_what_is_missing
+from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
 from tune_jobs.sweeps.drive import connected, machine_here, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.stages import MoreSeeds, run_sweep
@@ -21,16 +22,17 @@ from tune_jobs.sweeps.stages import MoreSeeds, run_sweep
 def go_on(
     store: Sweep,
     address: str | None,
-    num_samples: int,
     *,
+    num_samples: int = 0,
+    point: Mapping[str, Any] | None = None,
     finish: bool,
     progress: str,
-    retry_failed: bool,
+    retry_failed: bool = False,
 ) -> SweepResult:
-    """Run what is missing of a sweep, and `num_samples` more samples of its space.
+    """Run what is missing of a sweep, `num_samples` more samples of its space, and a point that somebody chose.
 
     Raises:
-        SpecError: The space has nothing to draw more samples from.
+        SpecError: The space has nothing to draw more samples from, or the point is wrong or known.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
     with _taken_over(store, address) as (machine, where):
@@ -39,6 +41,8 @@ def go_on(
         if num_samples:
             check_extendable(spec)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
+        if point is not None:
+            record = with_chosen_point(record, spec, store.read_trials(), point)
         plan = add_what_is_missing(store, record, spec, where, address, retry_failed=retry_failed)
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 

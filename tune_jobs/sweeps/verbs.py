@@ -1,14 +1,15 @@
 """Everything one can do with a sweep: the functions behind both the command line and the Python API.
 
 Words: *create* writes a new sweep, *drive* runs it, *launch* does both, *resume* continues an interrupted one,
-*extend* adds points to one, *replicate* trains its leading points with more seeds, *stop* ends one that another process
-or thread runs. A sweep is named by its folder, or by its name in the storage folder.
+*extend* adds points to one, *inject* a point that somebody chose, *replicate* trains its leading points with more
+seeds, *stop* ends one that another process or thread runs. A sweep is named by its folder, or by its name in the
+storage folder.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,8 +34,8 @@ from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storag
 
 __all__ = [
     "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
-    "export", "extend", "figure", "importance", "launch", "list_sweeps", "replicate", "report", "reproduce", "restore",
-    "resume", "status", "stop", "study", "trials", "video",
+    "export", "extend", "figure", "importance", "inject", "launch", "list_sweeps", "replicate", "report", "reproduce",
+    "restore", "resume", "status", "stop", "study", "trials", "video",
 ]  # fmt: skip
 
 Progress = Literal["auto", "none"]
@@ -223,7 +224,7 @@ def resume(
     from tune_jobs.sweeps.resume import go_on
 
     store = find_sweep(sweep, storage)
-    return go_on(store, address, 0, finish=finish, progress=progress, retry_failed=retry_failed)
+    return go_on(store, address, finish=finish, progress=progress, retry_failed=retry_failed)
 
 
 @checked
@@ -257,7 +258,46 @@ def extend(
     from tune_jobs.sweeps.resume import go_on
 
     store = find_sweep(sweep, storage)
-    return go_on(store, address, num_samples, finish=finish, progress=progress, retry_failed=False)
+    return go_on(store, address, num_samples=num_samples, finish=finish, progress=progress)
+
+
+@checked
+@run_alone
+def inject(
+    sweep: str | Path,
+    point: Mapping[str, Any],
+    *,
+    storage: str | Path | None = None,
+    address: str | None = None,
+    finish: bool = True,
+    progress: Progress = "auto",
+) -> SweepResult:
+    """Add a point of one's own to a sweep and run it (and whatever else is missing).
+
+    It is trained with all of the sweep's `seeds_per_point`, and is shown, compared and chosen like any other. Points
+    that are drawn later are the same as without it; a search method learns from it.
+
+    Args:
+        sweep: Name or folder.
+        point: A value for each searched hyperparameter, by its name. A value outside of its domain is trained too, if
+            the algorithm takes it; tpe's model learns nothing from such a point, and a note says so.
+        storage: Folder for sweeps.
+        address: Ray cluster to run on.
+        finish: The same as for `launch`.
+        progress: The same as for `launch`.
+
+    Raises:
+        SpecError: A name is not searched or is missing, a value is not allowed, the sweep has the point already, it has
+            no space, or it is one of population based training.
+        NotFoundError: There is no such sweep.
+        CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
+        SweepInterrupted: In the same cases as `launch`.
+    """
+    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.resume import go_on
+
+    store = find_sweep(sweep, storage)
+    return go_on(store, address, point=point, finish=finish, progress=progress)
 
 
 @checked

@@ -1,0 +1,130 @@
+"""A point that a person chooses: checked, and written as the points are that the search gives."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from analysis.records import ChosenPointRecord, TrialRecord
+from analysis.wording import is_number, short_text
+from policies.errors import SpecError, shortened
+from policies.suggestions import did_you_mean
+from tune_jobs.spec.domains import Domain, Listed, Range
+from tune_jobs.spec.hyperparam_problems import in_one_form, value_problems
+from tune_jobs.spec.plain_data import to_plain
+from tune_jobs.spec.rules import check_takes_points
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+def checked_point(spec: SweepSpec, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a point that a person gave, in the order of the space, with values written as the space has them.
+
+    A value may lie outside of its domain, if the algorithm takes it.
+
+    Args:
+        spec: The sweep.
+        given: Values by the names of searched hyperparameters.
+
+    Raises:
+        SpecError: The sweep takes no points, a name is not searched or is missing, or a value is not allowed; the
+            message lists every problem.
+    """
+    check_takes_points(spec)
+    values: dict[str, Any] = to_plain(given, "point")
+    problems = [_unknown(spec, name) for name in values if name not in spec.space]
+    if missing := [name for name in spec.space if name not in values]:
+        problems.append(f"it has no {' and no '.join(missing)}: give a value for each searched hyperparameter")
+    point = {}
+    for name, domain in spec.space.items():
+        if name in values:
+            if found := _problems(spec, name, domain, values[name]):
+                problems += found
+            else:
+                point[name] = _written(spec, name, domain, values[name])
+    if problems:
+        told = problems[0] if len(problems) == 1 else "\n  ".join([f"{len(problems)} problems:", *problems])
+        raise SpecError(f"point: {told}", f"The sweep searches {domains_text(spec.space)}.")
+    return point
+
+
+def _unknown(spec: SweepSpec, name: str) -> str:
+    if name in spec.hyperparams:
+        return f"{name} is fixed at {shortened(spec.hyperparams[name])} in this sweep, and not searched: leave it out"
+    return f"{shortened(name)} is not searched in this sweep: leave it out.{did_you_mean(name, spec.space)}"
+
+
+def _problems(spec: SweepSpec, name: str, domain: Domain, value: Any) -> list[str]:
+    # Elsewhere values of a range are numbers: on axes, in models of what mattered.
+    if isinstance(domain, Range) and not (is_number(value) and (not domain.is_whole or float(value).is_integer())):
+        kind = "whole number" if domain.is_whole else "number"
+        return [f"{name}: {shortened(value)} is not a {kind}, and its domain is {domain_text(domain)}"]
+    path = f"point.{name}"
+    found = value_problems(spec.algorithm, name, value, path=path)
+    return [f"{problem.path.removeprefix('point.')}: {problem.text}" for problem in found]
+
+
+def _written(spec: SweepSpec, name: str, domain: Domain, value: Any) -> Any:
+    if isinstance(domain, Range):
+        return int(value) if domain.is_whole else float(value)
+    assert isinstance(domain, Listed)
+    meant = in_one_form(spec.algorithm, name, value)
+    same = (listed for listed in domain.values if in_one_form(spec.algorithm, name, listed) == meant)
+    return next(same, value)
+
+
+def trial_of_point(spec: SweepSpec, point: Mapping[str, Any], trials: Sequence[TrialRecord]) -> TrialRecord | None:
+    """Return the first trial that has the values of a point, in whatever form; None: none has."""
+    meant = _meaning(spec, point)
+    known = (trial for trial in trials if trial.has_point and trial.point.keys() == point.keys())
+    return next((trial for trial in known if trial.point == point or _meaning(spec, trial.point) == meant), None)
+
+
+def _meaning(spec: SweepSpec, point: Mapping[str, Any]) -> str | None:
+    try:
+        return json.dumps({name: in_one_form(spec.algorithm, name, point[name]) for name in spec.space})
+    except (KeyError, ValidationError):
+        return None  # of a version that took other values
+
+
+def outside(space: Mapping[str, Domain], point: Mapping[str, Any]) -> list[str]:
+    """Return the names of those values of a point that its domains can't give."""
+    return [name for name, domain in space.items() if not is_inside(domain, point[name])]
+
+
+def is_inside(domain: Listed | Range, value: Any) -> bool:
+    """Whether a domain can give a value."""
+    if isinstance(domain, Listed):
+        return json.dumps(value) in map(json.dumps, domain.values)
+    low, high = domain.bounds
+    if not (is_number(value) and low <= value <= high):
+        return False
+    q = domain.q or (1.0 if domain.is_whole else None)
+    return q is None or math.isclose(domain.at_factor(round(value / q)), value, abs_tol=1e-9 * q)
+
+
+def outside_notes(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord]) -> tuple[str, ...]:
+    """Return the plan's notes on chosen points that the search could not have given."""
+    notes = []
+    for item in chosen_points:
+        if names := outside(spec.space, item.point):
+            told = ", ".join(f"{name} {short_text(item.point[name])}" for name in names)
+            model = ", but tpe's model can't learn from it" if spec.search.type == "tpe" else ""
+            domains = domains_text({name: spec.space[name] for name in names})
+            notes.append(
+                f"Point {item.num_points} was chosen with {told}, outside of space ({domains}): it is trained{model}."
+            )
+    return tuple(notes)
+
+
+def domains_text(space: Mapping[str, Domain]) -> str:
+    """Return domains as a sentence has them."""
+    return ", ".join(f"{name} ({domain_text(domain)})" for name, domain in space.items())
+
+
+def domain_text(domain: Domain) -> str:
+    """Return a domain as a sweep file has it, without brackets."""
+    return f"{domain.kind} {shortened(domain.model_dump(mode='json')[domain.kind])}"
