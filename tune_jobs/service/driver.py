@@ -124,12 +124,21 @@ def _done(request: Mapping[str, Any]) -> Any:
             if missing > 0:
                 return verbs.extend(folder, missing, **common)
             return verbs.resume(folder, **common)
+        case "inject" if not _has_point(folder, arguments["point"]):
+            return verbs.inject(folder, arguments["point"], **common)
         case "replicate":
             return verbs.replicate(folder, top=arguments["top"], seeds=arguments["seeds"], **common)
         case "retry":
             return verbs.resume(folder, retry_failed=True, **common)
         case _:
             return verbs.resume(folder, **common)
+
+
+def _has_point(folder: str, point: Mapping[str, Any]) -> bool:
+    """Whether an attempt before this one has added a point that somebody chose; what is missing of it is run, then."""
+    from tune_jobs.store.local_storage import open_sweep
+
+    return any(item.point == point for item in open_sweep(Path(folder)).read_record().chosen_points)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Verb = Literal["drive", "extend", "replicate", "retry"]
+Verb = Literal["drive", "extend", "inject", "replicate", "retry"]
 JobState = Literal["creating", "waiting", "running", "ended"]
 Outcome = Literal["completed", "failed", "stopped", "cancelled"]
 
@@ -21,7 +21,10 @@ class Job(BaseModel):
     id: int = Field(description="Number of the job, in the order of submission.")
     uid: str = Field(description="Random name of the job, by which its files are known.")
     sweep: str = Field(description="Name of the sweep.")
-    verb: Verb = Field(description="What is done: run what is missing, add points, add seeds, or retry failed trials.")
+    verb: Verb = Field(
+        description="What is done: run what is missing, add points, add one that somebody chose, add "
+        "seeds, or retry failed trials."
+    )
     arguments: dict[str, Any] = Field(description="What the verb needs, such as the number of samples.")
     owner: str = Field(description="Who asked for it.")
     priority: int = Field(description="Higher ones go first; 0 is the default.")

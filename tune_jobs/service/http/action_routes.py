@@ -1,4 +1,4 @@
-"""What is done with a sweep: stop, resume, extend, replicate, retry."""
+"""What is done with a sweep: stop, resume, extend, inject a point, replicate, retry."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from fastapi import APIRouter
 from policies.errors import SpecError
 from tune_jobs.service.access.callers import Caller
 from tune_jobs.service.http.caller import AChanger, TheService
-from tune_jobs.service.http.models import Extend, Replicate
+from tune_jobs.service.http.models import Extend, Inject, Replicate
 from tune_jobs.service.http.problems import NotNowError
 from tune_jobs.service.jobs import Job, Verb
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
+from tune_jobs.sweeps.adding import new_point
 
 router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["actions"])
 
@@ -59,10 +60,21 @@ def extend(name: str, more: Extend, service: TheService, caller: AChanger) -> Jo
     waiting = [job for job in service.queue.jobs("waiting", "running", sweep=name) if job.verb == "extend"]
     known = max([spec.num_samples, *(job.arguments["to_num_samples"] for job in waiting)])
     trials = len(service.statuses.see(name).trials.records) // max(1, spec.num_samples) * (known + more.num_samples)
-    limit = service.config.limits.trials
-    if trials > limit:
-        raise SpecError(f"The sweep would have about {trials:,} trials; here a sweep may have at most {limit:,}.")
+    _check_limit(service, trials)
     return _enqueue(service, caller, name, "extend", {"to_num_samples": known + more.num_samples})
+
+
+@router.post("/trials", status_code=202)
+def inject(name: str, chosen: Inject, service: TheService, caller: AChanger) -> Job:
+    """Add a point that somebody chose, and train it with all seeds of a point."""
+    seen = service.statuses.see(name)
+    record, trials = seen.status.sweep, seen.trials.records
+    spec = stored_spec(record)
+    # As the sweep writes it, so that a request that says the same in other words is known to be the same.
+    point = new_point(record, spec, trials, chosen.point)
+    waiting = [job for job in service.queue.jobs("waiting", "running", sweep=name) if job.verb == "inject"]
+    _check_limit(service, len(trials) + (len(waiting) + 1) * spec.seeds_per_point)
+    return _enqueue(service, caller, name, "inject", {"point": point})
 
 
 @router.post("/replicate", status_code=202)
@@ -70,6 +82,12 @@ def replicate(name: str, race: Replicate, service: TheService, caller: AChanger)
     """Train the leading settings again with fresh seeds."""
     check_replicable(stored_spec(service.statuses.see(name).status.sweep))
     return _enqueue(service, caller, name, "replicate", race.model_dump())
+
+
+def _check_limit(service: Service, trials: int) -> None:
+    limit = service.config.limits.trials
+    if trials > limit:
+        raise SpecError(f"The sweep would have about {trials:,} trials; here a sweep may have at most {limit:,}.")
 
 
 def _enqueue(service: Service, caller: Caller, name: str, verb: Verb, arguments: Mapping[str, Any]) -> Job:

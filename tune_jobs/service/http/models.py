@@ -53,6 +53,15 @@ class Extend(_Request):
     num_samples: int = Field(ge=1, le=100_000, description="Random draws for each combination of the grids.")
 
 
+class Inject(_Request):
+    """A point that somebody chose."""
+
+    point: dict[str, Any] = Field(
+        max_length=1_000,
+        description="A value for each searched hyperparameter, by its name; it may lie outside of its domain.",
+    )
+
+
 class Replicate(_Request):
     """More seeds for the leading settings."""
 
