@@ -1,13 +1,15 @@
 // What is done with a sweep: each asks the service, and shows what it says when it refuses.
 import { ask, ofSweep } from "./api.js";
+import { pointDialog, takesPoints } from "./chosen_point.js";
 import { askInDialog } from "./dialogs.js";
 import { el, toast } from "./dom.js";
 import { counted } from "./format.js";
 import { isLive, isWaiting } from "./states.js";
 import { mayChange } from "./who.js";
 
-// `state()` is the sweep's summary; `onDone()` is called after a change, `onGone()` after the sweep is deleted.
-export function makeActions({ state, alert, onDone, onGone }) {
+// `state()` is the sweep's summary, `data` all that is known of it. `onDone()` is called after a change, `onGone()` after
+// the sweep is deleted.
+export function makeActions({ state, data, alert, onDone, onGone }) {
   const name = () => state().name;
   const post = (verb, body) => ask(ofSweep(name(), `/${verb}`), { method: "POST", body });
 
@@ -53,6 +55,18 @@ export function makeActions({ state, alert, onDone, onGone }) {
         ],
         act: (values) => post("extend", values),
       }),
+    inject: () =>
+      inDialog(
+        pointDialog({
+          name: name(),
+          spec: data.spec,
+          trials: data.trials,
+          post: async (body) => {
+            await post("trials", body);
+            toast(`${name()}: the point is trained when its turn has come.`);
+          },
+        }),
+      ),
     replicate: () =>
       inDialog({
         title: `Replicate the leaders of ${name()}`,
@@ -141,6 +155,7 @@ export function makeActions({ state, alert, onDone, onGone }) {
     "div",
     { class: "menu", popover: "auto", id: "more-actions", role: "group", "aria-label": "More actions" },
     button("extend", "Extend…"),
+    button("inject", "Add a point…"),
     button("replicate", "Replicate leaders…"),
     button("retry", "Retry failed trials"),
     el("hr"),
@@ -182,6 +197,7 @@ export function makeActions({ state, alert, onDone, onGone }) {
       const retry = menu.querySelector('[data-action="retry"]');
       retry.hidden = failed === 0;
       retry.textContent = `Retry ${counted(failed, "failed trial")}`;
+      menu.querySelector('[data-action="inject"]').hidden = !takesPoints(data.spec);
     },
     close: () => removeEventListener("scroll", follow),
   };

@@ -1,7 +1,8 @@
 // Dialogs with a few fields: the browser keeps the focus inside and gives it back.
 import { el, setText } from "./dom.js";
 
-// A field: { name, label, type: "number" | "text" | "textarea" | "checkbox", value, min, max, hint }.
+// A field: { name, label, type: "number" | "text" | "textarea" | "checkbox" | "select", value, min, max, hint }; a number may
+// have a `step`, 1 if left out, and a select has `options`: { text, value }, of which the value may be anything.
 function fieldOf(spec) {
   const id = `field-${spec.name}`;
   const hint = spec.hint ? el("small", { id: `${id}-hint` }, spec.hint) : null;
@@ -14,6 +15,13 @@ function fieldOf(spec) {
       hint,
     );
   }
+  if (spec.type === "select") {
+    const chosen = JSON.stringify(spec.value);
+    const options = spec.options.map((option) =>
+      el("option", { selected: JSON.stringify(option.value) === chosen }, option.text),
+    );
+    return el("div", { class: "field" }, el("label", { for: id }, spec.label), el("select", common, ...options), hint);
+  }
   const input =
     spec.type === "textarea"
       ? el("textarea", { ...common, rows: 4, maxlength: spec.max })
@@ -22,7 +30,7 @@ function fieldOf(spec) {
           type: spec.type,
           min: spec.min,
           max: spec.type === "number" ? spec.max : null,
-          step: spec.type === "number" ? 1 : null,
+          step: spec.type === "number" ? (spec.step ?? 1) : null,
           required: spec.type === "number",
           maxlength: spec.type === "text" ? spec.max : null,
           autocomplete: "off",
@@ -36,6 +44,7 @@ function valuesOf(form, fields) {
     fields.map((spec) => {
       const input = form.elements[spec.name];
       if (spec.type === "checkbox") return [spec.name, input.checked];
+      if (spec.type === "select") return [spec.name, spec.options[input.selectedIndex].value];
       return [spec.name, spec.type === "number" ? Number(input.value) : input.value];
     }),
   );
@@ -78,7 +87,7 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
   document.body.append(dialog);
   dialog.showModal();
   // A dangerous one begins where nothing happens.
-  (form.querySelector("input, textarea") ?? (isDangerous ? cancel : submit)).focus();
+  (form.querySelector("input, select, textarea") ?? (isDangerous ? cancel : submit)).focus();
   return dialog;
 }
 

@@ -49,6 +49,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     ? NO_ACTIONS
     : makeActions({
         state: () => data.summary,
+        data,
         alert,
         onDone: refreshHead,
         onGone: () => {

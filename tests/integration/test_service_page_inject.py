@@ -1,0 +1,94 @@
+"""A point of one's own, on the page: a field for each searched hyperparameter, filled with the best trial's values."""
+
+from collections.abc import Iterator
+
+import pytest
+
+selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
+
+from live_service import Live, serving  # noqa: E402
+from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
+from page_sweeps import write_sweep  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
+from selenium.webdriver.support.ui import Select  # noqa: E402
+from synthetic_sweep import make_sweep  # noqa: E402
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
+]
+SPACE = {"lr": {"loguniform": [1e-5, 1e-1]}, "hidden_sizes": {"grid": [[32], [64]]}, "num_epochs": {"randint": [2, 9]}}
+POINTS = [
+    {"lr": 1e-5, "hidden_sizes": [32], "num_epochs": 3},
+    {"lr": 3.25e-3, "hidden_sizes": [64], "num_epochs": 5},
+]
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    storage = tmp_path_factory.mktemp("page") / "sweeps"
+    made = make_sweep(name="mine", points=POINTS, with_best=False, max_steps=20_000)
+    write_sweep(storage, made, spec={"space": SPACE, "seeds_per_point": 1})
+    plain = make_sweep(name="plain", points=[{}], with_best=False, max_steps=5_000)
+    write_sweep(storage, plain, spec={"space": {}})
+    with serving(storage) as found:
+        yield found
+
+
+def open_dialog(page: Page, **how: object) -> None:
+    page.open("#/sweeps/mine", **how)  # type: ignore[arg-type]
+    page.says(".trials-card", "2 trials")
+    page.button("More").click()
+    page.button("Add a point…").click()
+
+
+def test_a_point_is_filled_in_changed_and_added(page: Page, live: Live) -> None:
+    open_dialog(page)
+    values = page.run("return [...document.querySelectorAll('dialog input, dialog select')].map((node) => node.value)")
+    assert values == ["0.00325", "64", "5"]
+    # As it stands there it is the best trial's.
+    page.button("Add and train", "dialog").click()
+    page.says("dialog [role=alert]", "has this point already: trial t0001")
+    lr = page.one("dialog #field-point-lr")
+    lr.clear()
+    lr.send_keys("0.5")
+    Select(page.one("dialog #field-point-hidden_sizes")).select_by_visible_text("32")
+    page.button("Add and train", "dialog").click()
+    page.wait("return document.querySelector('.dialog') === null")
+    page.says("#toasts", "the point is trained when its turn has come")
+    (job,) = live.service.queue.jobs(sweep="mine")
+    assert (job.verb, job.arguments) == ("inject", {"point": {"lr": 0.5, "hidden_sizes": [32], "num_epochs": 5}})
+    page.says(".sweep-title", "waiting")
+
+
+def test_numbers_are_asked_for_as_the_space_has_them(page: Page) -> None:
+    open_dialog(page)
+    assert page.focused() == "lr"
+    page.says("dialog", "Searched from 1e-5 to 0.1, on a log scale. Other values may be tried.")
+    page.says("dialog", "Searched from 2 to 8.")
+    epochs = page.one("dialog #field-point-num_epochs")
+    epochs.clear()
+    epochs.send_keys("2.5")
+    page.button("Add and train", "dialog").click()
+    assert page.run("return document.querySelector('dialog form').checkValidity()") is False
+    page.keys(Keys.ESCAPE)
+    page.wait("return document.querySelector('.dialog') === null")
+
+
+def test_where_nothing_is_searched_it_is_not_offered(page: Page) -> None:
+    page.open("#/sweeps/plain")
+    page.says(".trials-card", "1 trial")
+    page.button("More").click()
+    page.says(".menu", "Replicate leaders…")
+    assert "Add a point" not in page.text(".menu")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [400, 1280])
+def test_the_dialog_is_accessible_and_fits(page: Page, width: int, theme: str) -> None:
+    open_dialog(page, width=width, theme=theme)
+    assert page.violations() == []
+    box = page.run("return document.querySelector('dialog').getBoundingClientRect().toJSON()")
+    assert box["left"] >= 0
+    assert box["right"] <= width
