@@ -8,9 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from analysis.best_so_far import best_so_far, has_evaluations, is_moment
 from analysis.charts.model import Axis, Bar, Chart, Line, Number, Plot, Plots, Timeline, drawable
 from analysis.charts.subject import Subject
-from analysis.records import IterationRecord, TrialRecord
+from analysis.records import TrialRecord
 from analysis.wording import counted, duration, return_text
 
 _MAX_BARS = 2_000
@@ -25,44 +26,26 @@ def make_charts(subject: Subject) -> list[Chart]:
 
 
 def _best_so_far(subject: Subject) -> Chart:
-    evaluated = any(i.evaluation_return is not None for items in subject.results.values() for i in items)
+    evaluated = has_evaluations(subject.results)
     what = "evaluation return" if evaluated else "training return"
     title = "Best so far against what was spent"
     caption = f"The best {what} that any trial had shown, over the env steps that all trials had trained for by then."
-    trials = sorted(subject.begun, key=lambda trial: trial.index)
-    timed = all(_is_moment(trial.started_at) for trial in trials)
-    moments = []
-    for trial in trials:
-        began = trial.started_at if timed and trial.started_at is not None else 0.0
-        steps = 0
-        for item in subject.results.get(trial.trial_id, ()):
-            moment = began + item.time_s if timed and math.isfinite(item.time_s) else began
-            moments.append(((moment, trial.index, item.iteration), max(0, item.num_env_steps - steps), trial, item))
-            steps = max(steps, item.num_env_steps)
-    moments.sort(key=lambda moment: moment[0])
-    spent, best = 0, -math.inf
-    x: list[Number] = []
-    y: list[Number] = []
-    texts: list[str] = []
-    for _, steps, trial, item in moments:
-        spent += steps
-        value = drawable(item.evaluation_return if evaluated else item.training_return)
-        if value is not None and value > best:
-            best = value
-            x, y, texts = [*x, spent], [*y, value], [*texts, f"{trial.trial_id}, {_at(item)}"]
-    if not x:
-        why = "No trial has shown a return yet." if trials else "No trial has begun."
+    found = best_so_far(subject.begun, subject.results, evaluated=evaluated)
+    if not found.improvements:
+        why = "No trial has shown a return yet." if subject.begun else "No trial has begun."
         return Chart("best_so_far", "cost", title, caption, None, why)
-    x, y, texts = [*x, spent], [*y, best], [*texts, "all that was spent"]
+    rising = found.improvements
+    x: tuple[Number, ...] = (*(item.spent for item in rising), found.spent)
+    y: tuple[Number, ...] = tuple(drawable(item.value) for item in (*rising, rising[-1]))
+    texts = (
+        *(f"{item.trial_id}, at {item.num_env_steps:,} of its own env steps" for item in rising),
+        "all that was spent",
+    )
     untimed = ("The records lack when trials began, so they are taken one after the other by their number.",)
-    line = Line(f"best {what} so far", "series-0", tuple(x), tuple(y), is_stepped=True, texts=tuple(texts))
+    line = Line(f"best {what} so far", "series-0", x, y, is_stepped=True, texts=texts)
     axes = Axis("env steps spent by all trials", low=0), Axis(f"best {what}")
     plot = Plot(*axes, (line,), goal=drawable(subject.goal))
-    return Chart("best_so_far", "cost", title, caption, Plots((plot,)), notes=() if timed else untimed)
-
-
-def _at(item: IterationRecord) -> str:
-    return f"at {item.num_env_steps:,} of its own env steps"
+    return Chart("best_so_far", "cost", title, caption, Plots((plot,)), notes=() if found.is_timed else untimed)
 
 
 def _timeline(subject: Subject) -> Chart:
@@ -71,7 +54,7 @@ def _timeline(subject: Subject) -> Chart:
         "Each bar is a trial, from its first start to its last end; each row is one of the places that a node's trials "
         "had side by side."
     )
-    known = [trial for trial in subject.begun if _is_moment(trial.started_at) and _end(trial) is not None]
+    known = [trial for trial in subject.begun if is_moment(trial.started_at) and _end(trial) is not None]
     if not known:
         why = "The records hold no times of trials." if subject.begun else "No trial has begun."
         return Chart("timeline", "cost", title, caption, None, why)
@@ -163,12 +146,8 @@ def _start(trial: TrialRecord) -> float:
 
 def _end(trial: TrialRecord) -> float | None:
     """Return when a trial ended; one that runs has lasted as long as it has trained. None: not known."""
-    ended = trial.ended_at if _is_moment(trial.ended_at) else _start(trial) + trial.time_s
-    return ended if ended is not None and _is_moment(ended) and ended >= _start(trial) else None
-
-
-def _is_moment(time: float | None) -> bool:
-    return time is not None and 0.0 <= time < 1e12
+    ended = trial.ended_at if is_moment(trial.ended_at) else _start(trial) + trial.time_s
+    return ended if ended is not None and is_moment(ended) and ended >= _start(trial) else None
 
 
 def _unit(seconds: float) -> tuple[str, float]:

@@ -11,7 +11,8 @@ from typing import Any
 
 from analysis.comparison.entries import Entry, Wanted, judged_alike, make_entry
 from analysis.comparison.pairs import Pair, make_pair
-from analysis.records import FINISHED, Objective, TrialRecord
+from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
+from analysis.report_data import env_of
 from analysis.wording import counted
 
 MAX_ENTRIES = len(string.ascii_uppercase)
@@ -52,7 +53,7 @@ def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Com
         for letter, item in zip(string.ascii_uppercase, wanted, strict=False)
     }
     entries = tuple(make_entry(item, letter) for letter, item in ready.items())
-    reasons = _not_comparable(wanted, entries)
+    reasons = why_not_comparable([item.sweep for item in wanted], [entry.letter for entry in entries])
     pairs = () if reasons else tuple(make_pair(one, other, ready) for one, other in _pairs(entries))
     notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries)]
     return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes))
@@ -77,27 +78,32 @@ def _pairs(entries: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
     return [(leader, entry) for entry in entries if entry is not leader]
 
 
-def _not_comparable(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
-    """Return why returns can't be compared: they are of different environments."""
-    first = entries[0]
+def why_not_comparable(sweeps: Sequence[SweepRecord], names: Sequence[str]) -> list[str]:
+    """Return why returns can't be compared: they are of different environments; empty if they can.
+
+    Args:
+        sweeps: At least one.
+        names: What each is called in the sentences.
+    """
+    first, env_id, arguments = names[0], env_of(sweeps[0]), _arguments_of(sweeps[0])
     reasons = []
-    for item, entry in zip(wanted[1:], entries[1:], strict=True):
-        if entry.env_id != first.env_id:
+    for sweep, name in zip(sweeps[1:], names[1:], strict=True):
+        if env_of(sweep) != env_id:
             reasons.append(
-                f"{first.letter} is on {first.env_id}, {entry.letter} on {entry.env_id}: returns of different "
-                "environments are on different scales."
+                f"{first} is on {env_id}, {name} on {env_of(sweep)}: returns of different environments are on "
+                "different scales."
             )
-        elif _env_of(item) != _env_of(wanted[0]):
+        elif _arguments_of(sweep) != arguments:
             reasons.append(
-                f"{first.letter} and {entry.letter} give {first.env_id} different arguments "
-                f"({_env_of(wanted[0])} and {_env_of(item)}), which may change its returns."
+                f"{first} and {name} give {env_id} different arguments ({arguments} and {_arguments_of(sweep)}), "
+                "which may change its returns."
             )
     return reasons
 
 
-def _env_of(item: Wanted) -> dict[str, Any]:
+def _arguments_of(sweep: SweepRecord) -> dict[str, Any]:
     """Return the arguments of an environment; what is made of its observations doesn't change returns."""
-    return dict(item.sweep.section("env").get("args") or {})
+    return dict(sweep.section("env").get("args") or {})
 
 
 def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
@@ -146,7 +152,8 @@ def _same_trainings(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[
     notes = []
     for one, other in itertools.combinations(range(len(wanted)), 2):
         pair = (wanted[one], wanted[other])
-        if entries[one].sweep == entries[other].sweep or _not_comparable(pair, (entries[one], entries[other])):
+        same_sweep = entries[one].sweep == entries[other].sweep
+        if same_sweep or why_not_comparable([item.sweep for item in pair], [item.name for item in pair]):
             continue
         ours, theirs = ({_training(trial) for trial in _counted(item)} for item in pair)
         if same := len(ours & theirs):

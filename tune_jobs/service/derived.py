@@ -1,10 +1,10 @@
-"""What is made of all results of a sweep, which takes seconds: once for all who ask, and anew when they changed."""
+"""What is made of all results of sweeps, which takes seconds: once for all who ask, and anew when they changed."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from tune_jobs.sweeps.status import SweepStatus
 
 if TYPE_CHECKING:
     from analysis.importance import WhatMattered
+    from tune_jobs.sweeps.side_by_side import SideBySide
 
 _SHARE = 0.1
 """The share of a core that making one thing anew of a running sweep takes."""
@@ -22,7 +23,8 @@ _MOST_KEPT = 64
 
 @dataclass(frozen=True)
 class _Made:
-    of: tuple[Trials, SweepStatus]
+    of: tuple[tuple[Trials, SweepStatus], ...]
+    """What each sweep was like."""
     value: Any
     at: float
     took_s: float
@@ -39,7 +41,7 @@ class Derived:
 
     def __init__(self, storage: Storage, statuses: Statuses, clock: Callable[[], float] = time.monotonic) -> None:
         self._storage, self._statuses, self._clock = storage, statuses, clock
-        self._made: dict[tuple[str, float, str], _Made] = {}
+        self._made: dict[tuple[str, tuple[tuple[str, float], ...]], _Made] = {}
         # One at a time: two at once would take as long, and twice the memory.
         self._lock = threading.Lock()
 
@@ -65,21 +67,45 @@ class Derived:
         text: str = self._get(name, "trials.csv", trials_csv)
         return text
 
+    def comparison(self, names: Sequence[str]) -> SideBySide:
+        """Put sweeps side by side, as of a while ago if any of them runs.
+
+        Raises:
+            NotFoundError: There is no such sweep, or it is damaged.
+            SpecError: They can't be compared.
+        """
+        from tune_jobs.sweeps import side_by_side
+
+        for name in names:
+            self._statuses.see(name)
+        side_by_side.check_comparable([self._storage.sweep(name) for name in names])
+        found: SideBySide = self._get_of(names, "comparison", side_by_side.side_by_side)
+        return found
+
     def _get(self, name: str, what: str, make: Callable[[Sweep], Any]) -> Any:
-        self._statuses.see(name)
+        return self._get_of((name,), what, lambda sweeps: make(*sweeps))
+
+    def _get_of(self, names: Sequence[str], what: str, make: Callable[[Sequence[Sweep]], Any]) -> Any:
+        for name in names:
+            self._statuses.see(name)
         with self._lock:
             # Looked at again, as one may have waited here for long.
-            seen, now = self._statuses.see(name), self._clock()
+            seen, now = [self._statuses.see(name) for name in names], self._clock()
             # A sweep of that name that was deleted is another one.
-            key = (name, seen.status.sweep.created_at, what)
+            key = (what, tuple((one.name, one.status.sweep.created_at) for one in seen))
             known = self._made.pop(key, None)
             if known is not None:
-                is_of_now = known.of[0] is seen.trials and known.of[1] is seen.status
-                if is_of_now or (not seen.is_over and now - known.at < known.took_s / _SHARE):
+                is_of_now = all(
+                    trials is one.trials and status is one.status
+                    for one, (trials, status) in zip(seen, known.of, strict=True)
+                )
+                runs = any(not one.is_over for one in seen)
+                if is_of_now or (runs and now - known.at < known.took_s / _SHARE):
                     self._made[key] = known
                     return known.value
-            value = make(self._storage.sweep(name))
-            self._made[key] = _Made((seen.trials, seen.status), value, now, self._clock() - now)
+            value = make([self._storage.sweep(name) for name in names])
+            of = tuple((one.trials, one.status) for one in seen)
+            self._made[key] = _Made(of, value, now, self._clock() - now)
             while len(self._made) > _MOST_KEPT:
                 # The first is the one that nobody has asked for the longest.
                 del self._made[next(iter(self._made))]

@@ -68,9 +68,19 @@ def compare(
 def _wanted(source: str | Path, storage: str | Path | None) -> Wanted:
     store, trial_id = find_source(source, storage)
     if trial_id is None:
-        return _of(store, store.name, None)
+        return wanted_sweep(store)
     trial = find_trial(store, trial_id)
     return _of(store, f"{store.name}/{trial.trial_id}", trial.point_index)
+
+
+def wanted_sweep(store: Sweep) -> Wanted:
+    """Return a whole sweep as one that is to be compared.
+
+    Raises:
+        NotFoundError: There is no such sweep.
+        CheckpointError: The record of the sweep or of a trial is damaged.
+    """
+    return _of(store, store.name, None)
 
 
 def _of(store: Sweep, name: str, point_index: int | None) -> Wanted:
@@ -86,7 +96,7 @@ def _settings_of(source: str | Path, top: int, storage: str | Path | None) -> li
         raise SpecError(
             f"Only {store.name}/{trial_id} was given to be compared.", "Name another trial or sweep to compare it with."
         )
-    whole = _of(store, store.name, None)
+    whole = wanted_sweep(store)
     ranking = ranked_settings(whole.data)[:top]
     if len(ranking) < 2:
         raise NotFoundError(

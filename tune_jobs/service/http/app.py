@@ -13,6 +13,7 @@ from tune_jobs.service.access.middleware import PUBLIC_PATHS, AccessMiddleware
 from tune_jobs.service.http import (
     access_routes,
     action_routes,
+    comparison_routes,
     download_routes,
     event_routes,
     meta_routes,
@@ -84,6 +85,7 @@ def make_app(service: Service) -> FastAPI:
         sweep_routes,
         action_routes,
         event_routes,
+        comparison_routes,
         download_routes,
         play_routes,
         page_routes,

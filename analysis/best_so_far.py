@@ -1,0 +1,78 @@
+"""The best return that any trial of a sweep had shown, against the env steps that all had trained for by then."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from analysis.records import IterationRecord, TrialRecord, finite_or_none
+
+_LAST_MOMENT = 1e12
+"""A time that is later is none: it was written by something else than a clock."""
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """A return that was better than all that had been shown before."""
+
+    spent: int
+    """Env steps that all trials had trained for by then."""
+    value: float
+    trial_id: str
+    num_env_steps: int
+    """Env steps that the trial itself had trained for."""
+
+
+@dataclass(frozen=True)
+class BestSoFar:
+    """How the best return of a sweep rose."""
+
+    improvements: tuple[Improvement, ...]
+    """In the order in which they came; none: no trial has shown a return."""
+    spent: int
+    """Env steps that all trials have trained for."""
+    is_timed: bool
+    """Whether it is known when trials began; else they are taken one after the other by their number."""
+
+
+def has_evaluations(results: Mapping[str, Sequence[IterationRecord]]) -> bool:
+    """Return whether any trial was evaluated."""
+    return any(item.evaluation_return is not None for items in results.values() for item in items)
+
+
+def best_so_far(
+    trials: Sequence[TrialRecord], results: Mapping[str, Sequence[IterationRecord]], *, evaluated: bool
+) -> BestSoFar:
+    """Return how the best return of a sweep rose.
+
+    Args:
+        trials: The trials that have begun.
+        results: Iterations by trial id, oldest first; a trial may have none.
+        evaluated: Whether it is of greedy evaluations; else of training returns.
+    """
+    trials = sorted(trials, key=lambda trial: trial.index)
+    is_timed = all(is_moment(trial.started_at) for trial in trials)
+    moments = []
+    for trial in trials:
+        began = trial.started_at if is_timed and trial.started_at is not None else 0.0
+        steps = 0
+        for item in results.get(trial.trial_id, ()):
+            moment = began + item.time_s if is_timed and math.isfinite(item.time_s) else began
+            moments.append(((moment, trial.index, item.iteration), max(0, item.num_env_steps - steps), trial, item))
+            steps = max(steps, item.num_env_steps)
+    moments.sort(key=lambda moment: moment[0])
+    spent, best = 0, -math.inf
+    found: list[Improvement] = []
+    for _, steps, trial, item in moments:
+        spent += steps
+        value = finite_or_none(item.evaluation_return if evaluated else item.training_return)
+        if value is not None and value > best:
+            best = value
+            found.append(Improvement(spent, value, trial.trial_id, item.num_env_steps))
+    return BestSoFar(tuple(found), spent, is_timed)
+
+
+def is_moment(time: float | None) -> bool:
+    """Return whether a Unix time is known and can be one."""
+    return time is not None and 0.0 <= time < _LAST_MOMENT
