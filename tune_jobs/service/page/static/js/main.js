@@ -1,5 +1,6 @@
 // The page: its bar, and the view that the address names.
 import { ask } from "./api.js";
+import { openCompare } from "./compare_view.js";
 import { el, setText, speak } from "./dom.js";
 import { counted } from "./format.js";
 import { read } from "./route.js";
@@ -10,13 +11,14 @@ import { openSweep } from "./sweep_view.js";
 import { openSweeps } from "./sweeps_view.js";
 import { me } from "./who.js";
 
-const VIEWS = { sweeps: openSweeps, sweep: openSweep, play: openPlay, new: openNew };
+const VIEWS = { sweeps: openSweeps, sweep: openSweep, play: openPlay, new: openNew, compare: openCompare };
 const main = document.getElementById("main");
 let open = null;
 let isSigningIn = false;
 
 function heading(route) {
-  return { sweeps: "Sweeps", new: "New sweep", sweep: route.name, play: `Watch ${route.name}` }[route.view];
+  const { name, view } = route;
+  return { sweeps: "Sweeps", new: "New sweep", compare: "Compare", sweep: name, play: `Watch ${name}` }[view];
 }
 
 function show() {

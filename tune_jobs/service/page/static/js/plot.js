@@ -6,8 +6,9 @@ const { uPlot } = window;
 const FONT = '12px system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "Liberation Sans", sans-serif';
 
 export class Plot {
-  // `paint(context, places)` draws; `find(places, left, top)` returns what is near the cursor as { lines, id }, or null.
-  constructor(host, { label, xLabel, height, paint, find, onPick }) {
+  // `paint(context, places)` draws; `find(places, left, top)` returns what is near the cursor as { lines, id }, or null;
+  // `axes` are options of uPlot for the horizontal and the vertical axis, where they are others than those of numbers.
+  constructor(host, { label, xLabel, height, paint, find, onPick, axes = [] }) {
     this.range = { x: [0, 1], y: [0, 1] };
     this.isZoomed = false;
     this.found = null;
@@ -46,8 +47,9 @@ export class Plot {
             gap: 4,
             space: 70,
             values: (_, values) => values.map(compact),
+            ...axes[0],
           },
-          { ...axis, size: 52, gap: 6, space: 34, values: (_, values) => values.map(compact) },
+          { ...axis, size: 52, gap: 6, space: 34, values: (_, values) => values.map(compact), ...axes[1] },
         ],
         series: [{}, { show: true, paths: () => null, points: { show: false } }],
         cursor: {

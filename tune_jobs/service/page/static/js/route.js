@@ -3,6 +3,7 @@ export function read() {
   const [path, query = ""] = location.hash.replace(/^#/, "").split("?");
   const parts = path.split("/").filter(Boolean).map(decode);
   const params = Object.fromEntries(new URLSearchParams(query));
+  if (parts[0] === "compare") return { view: "compare", params };
   if (parts[0] === "new") return { view: "new", params };
   if (parts[0] === "sweeps" && parts[2] === "play") return { view: "play", name: parts[1], params };
   if (parts[0] === "sweeps" && parts.length > 1) return { view: "sweep", name: parts[1], params };
@@ -25,6 +26,8 @@ export function sweepAddress(name, params = {}) {
 export function playAddress(name, params = {}) {
   return write(`/sweeps/${encodeURIComponent(name)}/play`, params);
 }
+
+export const compareAddress = (names) => write("/compare", { sweeps: names.join(",") });
 
 function write(path, params) {
   const known = Object.entries(params).filter(([, value]) => value !== null && value !== undefined && value !== "");

@@ -19,6 +19,7 @@ const FIELDS = [
   "started_at",
   "ended_at",
   "node",
+  "pid",
   "num_failures",
 ].join(",");
 const LOG_DOMAINS = ["loguniform", "qloguniform", "lograndint", "qlograndint"];

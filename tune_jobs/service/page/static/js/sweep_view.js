@@ -12,6 +12,7 @@ import { keep } from "./route.js";
 import { ServerSource } from "./server_source.js";
 import { SweepData } from "./sweep_data.js";
 import { SweepHead } from "./sweep_head.js";
+import { Timeline } from "./timeline.js";
 import { columnsOf, sortRows } from "./trial_columns.js";
 import { TrialPanel } from "./trial_panel.js";
 import { TrialTable } from "./trial_table.js";
@@ -72,6 +73,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     best: card("Best so far", "best-card"),
     parallel: card("Values and scores", "values"),
     importance: card("Importance", "importance"),
+    timeline: card("Timeline", "timeline"),
     table: card("Trials", "table-card trials-card"),
   };
   content.append(el("div", { class: "grid" }, ...Object.values(cards)));
@@ -80,6 +82,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
   const best = new BestChart(cards.best, { onOpen: open });
   const parallel = new Parallel(cards.parallel, { onRange: setRange, onOpen: open });
   const importance = new ImportanceCard(cards.importance, source);
+  const timeline = new Timeline(cards.timeline, { isOpen: route.params.timeline === "open", onOpen: open });
   const filter = el("input", {
     type: "search",
     "aria-label": "Filter trials",
@@ -198,6 +201,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     const named = new Map(seen.chosen.map((id, index) => [id, COLOURS[index % COLOURS.length]]));
     curves.show({ data, matching, chosen: named, metric: seen.metric });
     best.show({ data });
+    timeline.show({ data, matching });
     parallel.show({ data, matching: new Set(matching.map((trial) => trial.trial_id)), ranges: seen.ranges, chosen });
   }
 
@@ -250,13 +254,14 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
       seen = seenOf(params);
       route.params = { ...params };
       filter.value = seen.filter;
+      timeline.setOpen(params.timeline === "open");
       show();
     },
     close() {
       isClosed = true;
       followed.close();
       removeEventListener("keydown", shortcut);
-      for (const part of [actions, curves, best, parallel, table, panel]) part.close();
+      for (const part of [actions, curves, best, parallel, timeline, table, panel]) part.close();
     },
   };
 }

@@ -1,5 +1,6 @@
 // All sweeps: what runs, waits and ended; it keeps itself up to date.
 import { askAll } from "./api.js";
+import { CompareChoice, makeBox, namesOf } from "./compare_choice.js";
 import { el, reconcile, setAttribute, setText } from "./dom.js";
 import { ago, count, counted, duration, moment, percent, pointText, returnText, timeLeft } from "./format.js";
 import { follow } from "./follow.js";
@@ -86,6 +87,7 @@ export function openSweeps(main, route) {
     card,
     more,
   );
+  const choice = new CompareChoice({ place: main, body, names: namesOf(seen.compare), onChange: show });
   search.addEventListener("input", () => change({ search: search.value }));
 
   function change(changes) {
@@ -115,6 +117,7 @@ export function openSweeps(main, route) {
   }
 
   function show() {
+    if (sweeps !== null) choice.show(new Map(sweeps.map((sweep) => [sweep.name, sweep])));
     for (const button of groups.children)
       setAttribute(button, "aria-pressed", String(button.dataset.group === seen.state));
     for (const head of heads) {
@@ -136,7 +139,11 @@ export function openSweeps(main, route) {
       seen,
     );
     const shown = isAll ? found : found.slice(0, FIRST_ROWS);
-    reconcile(body, shown, (sweep) => sweep.name, makeRow, updateRow);
+    const update = (row, sweep) => {
+      updateRow(row, sweep);
+      choice.updateBox(row.querySelector(".to-compare"), sweep.name);
+    };
+    reconcile(body, shown, (sweep) => sweep.name, makeRow, update);
     more.hidden = shown.length === found.length;
     setText(more, `Show all ${counted(found.length, "sweep")}`);
     setText(told, found.length === sweeps.length ? "" : `${count(found.length)} of ${counted(sweeps.length, "sweep")}`);
@@ -174,6 +181,7 @@ export function openSweeps(main, route) {
     follow(params) {
       Object.assign(seen, { search: "", state: "", sort: "created_at", order: "desc" }, params);
       search.value = seen.search;
+      choice.names = namesOf(params.compare);
       show();
     },
   };
@@ -223,6 +231,7 @@ function makeRow(sweep) {
       el("a", { href: sweepAddress(sweep.name) }, sweep.name),
       el("span", { class: "under" }),
       el("span", { class: "tags" }),
+      makeBox(sweep.name),
     ),
     cell("c-state", el("span", { class: "state" }), el("span", { class: "under" })),
     cell(
