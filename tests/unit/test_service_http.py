@@ -1,7 +1,9 @@
 """The REST interface: submit, plan, list, change, and what it says to requests that are wrong."""
 
+import dataclasses
 import json
 import re
+import shutil
 import threading
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,10 @@ from fastapi.testclient import TestClient
 from services import FAKE, client, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
+from analysis.records import ReplicationRecord
+from tune_jobs.service.config import Limits
 from tune_jobs.service.database.opening import sqlite_url
+from tune_jobs.service.http.app import make_app
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import preset_names
 
@@ -305,6 +310,25 @@ def test_a_finished_sweep_is_extended_and_replicated_in_turn(client: TestClient,
     raced = client.post("/api/v1/sweeps/done/replicate", json={"top": 2}).json()
     assert raced["arguments"] == {"top": 2, "seeds": 5}
     assert "that job already" in problem(client.post("/api/v1/sweeps/done/replicate", json={"top": 2}), 409)["detail"]
+
+
+def test_how_many_trials_an_extended_sweep_will_have_is_planned_not_guessed(service: Service) -> None:
+    spec = {"space": {"lr": {"uniform": [1e-4, 1e-2]}, "gamma": {"grid": [0.9, 0.99]}}, "seeds_per_point": 3}
+    store = make_sweep_folder(service.config.storage / "done", iterations=1, num_samples=2, **spec)
+    replication = ReplicationRecord(num_points=4, points=(0, 1, 1))
+    store.write_record(store.read_record().model_copy(update={"replications": (replication,)}))
+    # As a sweep is whose driver was killed while it wrote its trials.
+    for trial in store.read_trials()[1:]:
+        shutil.rmtree(store.folder / "trials" / trial.trial_id)
+    extend = {"num_samples": 3}
+    # Five samples for each of two values, with three seeds, and three more.
+    for limit, status in ((32, 422), (33, 202)):
+        limited = dataclasses.replace(service, config=dataclasses.replace(service.config, limits=Limits(trials=limit)))
+        with TestClient(make_app(limited), base_url="http://127.0.0.1:8265") as asking:
+            answer = asking.post("/api/v1/sweeps/done/extend", json=extend)
+        assert answer.status_code == status, answer.text
+        if status == 422:
+            assert "would have 33 trials; here a sweep may have at most 32" in answer.json()["detail"]
 
 
 def test_actions_that_cannot_be(client: TestClient, finished: str) -> None:

@@ -60,4 +60,4 @@ def test_known_points_limits_and_sweeps_that_are_not_there(client: TestClient, s
     object.__setattr__(service.config.limits, "trials", 6)
     assert client.post(finished, json={"point": {"lr": 1e-3}}).status_code == 202
     told = client.post(finished, json={"point": {"lr": 2e-3}}).json()
-    assert "about 8 trials; here a sweep may have at most 6" in told["detail"]
+    assert "would have 8 trials; here a sweep may have at most 6" in told["detail"]

@@ -175,12 +175,21 @@ def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = 
     return drawn + len(chosen_points)
 
 
+def num_trials_of(
+    spec: SweepSpec,
+    replications: Sequence[ReplicationRecord] = (),
+    chosen_points: Sequence[ChosenPointRecord] = (),
+) -> int:
+    """Return the number of a sweep's trials, those among them of chosen points and of more seeds of some points."""
+    searched = num_points_of(spec, chosen_points) * spec.seeds_per_point
+    return searched + sum(len(item.points) for item in replications)
+
+
 def _num_trials(
     spec: SweepSpec, replications: Sequence[ReplicationRecord], chosen_points: Sequence[ChosenPointRecord]
 ) -> int:
-    """Return the number of a sweep's trials; too many are refused."""
-    searched = num_points_of(spec, chosen_points) * spec.seeds_per_point
-    number = searched + sum(len(item.points) for item in replications)
+    """Return the number of trials to be planned; too many are refused."""
+    number = num_trials_of(spec, replications, chosen_points)
     if number > MAX_TRIALS:
         raise SpecError(
             f"The sweep has {number:,} trials; at most {MAX_TRIALS:,} can be planned.",
