@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
@@ -17,7 +18,7 @@ from sweep_folders import make_sweep_folder
 from tune_jobs.service.access.attempts import RateLimit
 from tune_jobs.service.access.audit import Audit, Entry
 from tune_jobs.service.access.callers import Role
-from tune_jobs.service.access.gate import Gate
+from tune_jobs.service.access.gate import Gate, opened_gate
 from tune_jobs.service.access.tokens import Tokens
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.http.app import make_app
@@ -90,6 +91,12 @@ def place(service: Service, *, limit: int = 10, **settings: Any) -> Place:
     gate = Gate(config, Tokens(service.engine, clock), Audit(service.engine, clock), RateLimit(limit, 60.0, clock))
     made = dataclasses.replace(service, config=config, gate=gate)
     return Place(made, make_app(made), clock)
+
+
+def make_token(storage: Path, name: str, role: Role) -> str:
+    """The secret of a new token for the service of a storage folder, which need not run yet."""
+    with opened_gate(ServiceConfig(storage=storage)) as gate:
+        return gate.tokens.make(name, role)[1]
 
 
 def bearer(secret: str) -> dict[str, str]:

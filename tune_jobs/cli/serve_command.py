@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-import logging
 import shlex
-import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from tune_jobs.cli.base import json_option, storage_option
+
+if TYPE_CHECKING:
+    from tune_jobs.service.logs import LogFormat
 
 database_option = click.option(
     "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
@@ -49,6 +51,8 @@ database_option = click.option(
               help="Believe X-Forwarded-For and -Proto of a proxy on this machine, or at ADDRESS.")  # fmt: skip
 @click.option("--tls-certificate", type=click.Path(path_type=Path), metavar="FILE", help="Certificate chain, PEM.")
 @click.option("--tls-key", type=click.Path(path_type=Path), metavar="FILE", help="The certificate's key, PEM.")
+@click.option("--log-format", type=click.Choice(("text", "json")), default="text", show_default=True,
+              help="Of the log on standard error; json: one object a line, requests too.")  # fmt: skip
 @storage_option
 @json_option
 def serve(
@@ -70,6 +74,7 @@ def serve(
     behind_proxy: str | None,
     tls_certificate: Path | None,
     tls_key: Path | None,
+    log_format: LogFormat,
     storage: str | None,
     as_json: bool,
 ) -> None:
@@ -77,19 +82,20 @@ def serve(
 
     On 127.0.0.1 it needs no token; anywhere else it does: `tune-jobs token make`.
     """
+    from tune_jobs.service import logs
     from tune_jobs.service.config import ServiceConfig
     from tune_jobs.service.serve import serve as run
     from tune_jobs.sweeps.storage import storage_folder
 
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     config = ServiceConfig(
         storage=storage_folder(storage), host=host, port=port, address=address, database=database,
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,
         webhooks=webhooks, webhook_secret=webhook_secret, stuck_s=stuck_s,
         command=tuple(shlex.split(run_command or "")),
         public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
-        tls_certificate=tls_certificate, tls_key=tls_key,
+        tls_certificate=tls_certificate, tls_key=tls_key, log_format=log_format,
     )  # fmt: skip
+    logs.configure(log_format, secrets=config.secrets)
 
     def say(url: str) -> None:
         # One line, as whoever reads it waits for its end.

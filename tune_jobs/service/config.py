@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from policies.errors import SpecError
-from tune_jobs.service.database.opening import sqlite_url
+from tune_jobs.service.database.opening import password_in, sqlite_url
 from tune_jobs.service.events import STUCK_S
 from tune_jobs.service.job_files import own_database, own_folder
-from tune_jobs.service.telling import COMMAND, check_target
+from tune_jobs.service.logs import LogFormat
+from tune_jobs.service.telling import COMMAND, check_target, secrets_of
 
 LOOPBACK = "loopback"
 """As the address of a proxy: one on this machine."""
@@ -71,6 +72,7 @@ class ServiceConfig:
         behind_proxy: The address of the proxy whose headers are believed; `loopback`: one on this machine.
         tls_certificate: A file with the certificate and those above it, PEM.
         tls_key: A file with its key, PEM.
+        log_format: Of the service's own log.
     """
 
     storage: Path
@@ -92,6 +94,7 @@ class ServiceConfig:
     behind_proxy: str | None = None
     tls_certificate: Path | None = None
     tls_key: Path | None = None
+    log_format: LogFormat = "text"
 
     def __post_init__(self) -> None:
         for url in self.webhooks:
@@ -119,6 +122,12 @@ class ServiceConfig:
     def targets(self) -> tuple[str, ...]:
         """Who is told what happens."""
         return (*self.webhooks, *([COMMAND + json.dumps(self.command)] if self.command else []))
+
+    @property
+    def secrets(self) -> tuple[str, ...]:
+        """What never appears in a log."""
+        known = [self.webhook_secret or "", *password_in(self.database_url)]
+        return tuple(item for item in [*known, *(part for url in self.webhooks for part in secrets_of(url))] if item)
 
     @property
     def folder(self) -> Path:

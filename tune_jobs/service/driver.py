@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import socket
@@ -21,7 +22,10 @@ from typing import Any
 from policies.envs.modules import allow_modules
 from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.process.interruption import end_in_order
+from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
+
+_log = logging.getLogger(__name__)
 
 READY = b"ready"
 _MAX_BYTES = 1 << 20
@@ -41,7 +45,10 @@ def main(descriptor: int) -> None:
                 settings = asked.recv(_MAX_BYTES)
                 if not settings:
                     return
-                warm_up(stack, json.loads(settings))
+                known = json.loads(settings)
+                # Until there is a job, this is said where the service says its own.
+                logs.configure(known.get("log_format", "text"), process={"process": "spare"}, level=logging.WARNING, anew=True)
+                warm_up(stack, known)
                 with contextlib.suppress(OSError):
                     asked.sendall(READY)
                 message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
@@ -58,8 +65,14 @@ def _do(request: Mapping[str, Any], lock: int, log: int) -> None:
     os.dup2(log, 2)
     os.close(log)
     files = JobFiles(Path(request["service"]), request["job"])
-    files.say_who(Holder(pid=os.getpid(), sweep=Path(request["sweep"]).name))
+    sweep = Path(request["sweep"]).name
+    files.say_who(Holder(pid=os.getpid(), sweep=sweep))
+    # The end of this log is shown to people who want to know why a job failed.
+    logs.configure("text", process={"job": request["number"], "sweep": sweep}, level=logging.WARNING, anew=True)
+    _log.setLevel(logging.INFO)
+    _log.info("Attempt %d is run by process %d.", request["attempt"], os.getpid())
     ended = _ended(request)
+    _log.info("Attempt %d has ended: %s.", request["attempt"], ended.outcome)
     # Whatever comes now, the outcome is written.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -85,8 +98,10 @@ def warm_up(stack: contextlib.ExitStack, settings: Mapping[str, Any]) -> None:
         from tune_jobs.ray_tune.warm import warm_ray
 
         # If Ray can't be started, the sweep says so, in its own words.
-        with contextlib.suppress(CannotRunError):
+        try:
             stack.enter_context(warm_ray(local_machine()))
+        except CannotRunError as error:
+            _log.warning("Ray can't be started before there is a sweep: %s", error)
 
 
 def _ended(request: Mapping[str, Any]) -> Ended:

@@ -37,3 +37,8 @@ class Job(BaseModel):
     submitted_at: float
     started_at: float | None
     ended_at: float | None
+
+    @property
+    def log_fields(self) -> dict[str, Any]:
+        """What a line of the log that is about this job says besides its message."""
+        return {"job": self.id, "sweep": self.sweep, "owner": self.owner or None}

@@ -10,9 +10,10 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Engine, RowMapping, delete, insert, select, update
+from sqlalchemy import Connection, Engine, RowMapping, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from policies.errors import NotFoundError, SpecError
@@ -22,6 +23,20 @@ from tune_jobs.service.jobs import Job, JobState, Outcome, Verb
 
 class KeyUsedError(SpecError):
     """An idempotency key was used for another request."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """How much there is to do."""
+
+    counts: Mapping[tuple[JobState, Verb], int]
+    """The jobs that have not ended, by state and verb; those that there are none of are left out."""
+    num_cpus: float
+    """CPUs that running jobs take."""
+    num_owners: int
+    """How many people's jobs have not ended."""
+    waited_s: float
+    """How long the job that waits the longest has waited, in seconds; 0: none waits."""
 
 
 class Queue:
@@ -227,6 +242,24 @@ class Queue:
             query = query.where(jobs.c.sweep == sweep)
         with self._engine.begin() as connection:
             return _jobs(connection, query)
+
+    def load(self) -> Load:
+        """Return how much there is to do, without reading the jobs one by one."""
+        is_open = jobs.c.state != "ended"
+        by_kind = select(
+            jobs.c.state, jobs.c.verb, func.count(), func.sum(jobs.c.num_cpus), func.min(jobs.c.submitted_at)
+        ).where(is_open)
+        owners = select(func.count(jobs.c.owner.distinct())).where(is_open)
+        with self._engine.begin() as connection:
+            rows = connection.execute(by_kind.group_by(jobs.c.state, jobs.c.verb)).all()
+            num_owners = connection.execute(owners).scalar_one()
+        since = [row[4] for row in rows if row.state == "waiting"]
+        return Load(
+            {(row.state, row.verb): row[2] for row in rows},
+            sum(row[3] for row in rows if row.state == "running"),
+            num_owners,
+            max(0.0, self._now() - min(since)) if since else 0.0,
+        )
 
     def _change(self, job_id: int, values: Mapping[str, Any], states: Sequence[JobState]) -> Job:
         with self._engine.begin() as connection:

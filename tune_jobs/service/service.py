@@ -21,8 +21,11 @@ from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database
 from tune_jobs.service.derived import Derived
 from tune_jobs.service.events import Watch
+from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import Labels
+from tune_jobs.service.metrics import Metrics
 from tune_jobs.service.queue import Queue
+from tune_jobs.service.state_metrics import StateCollector
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.submitting import Submitter
 from tune_jobs.service.supervisor import Supervisor, Surroundings
@@ -47,6 +50,7 @@ class Service:
     supervisor: Supervisor
     watching: Watching
     derived: Derived
+    metrics: Metrics
 
 
 @contextlib.contextmanager
@@ -65,11 +69,32 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             statuses = Statuses(storage)
             # A cluster shares its CPUs among the trials of all sweeps by itself.
             num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
-            where = Surroundings(config.storage, config.folder, config.address, num_cpus, config.modules)
+            where = Surroundings(
+                config.storage, config.folder, config.address, num_cpus, config.modules, config.log_format
+            )
+            metrics = Metrics()
             watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
-            teller = Teller(engine, config.targets, secret=config.webhook_secret)
+            teller = Teller(engine, config.targets, secret=config.webhook_secret, on_attempt=metrics.delivered)
             watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s)
-            supervisor = Supervisor(queue, storage, where, spare_idle_s=config.spare_idle_s, on_end=watch.ended)
+
+            def on_end(job: Job) -> None:
+                watch.ended(job)
+                metrics.job_ended(job)
+
+            supervisor = Supervisor(
+                queue, storage, where,
+                spare_idle_s=config.spare_idle_s, on_end=on_end, on_death=metrics.driver_died,
+            )  # fmt: skip
+            metrics.add(
+                StateCollector(
+                    queue=queue,
+                    storage=storage,
+                    statuses=statuses,
+                    supervisor=supervisor,
+                    watching=watching,
+                    teller=teller,
+                )
+            )
             with contextlib.ExitStack() as stack:
                 for part in (teller, watch, supervisor):
                     part.start()
@@ -87,6 +112,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     supervisor=supervisor,
                     watching=watching,
                     derived=Derived(storage, statuses),
+                    metrics=metrics,
                 )
         finally:
             engine.dispose()

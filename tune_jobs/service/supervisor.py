@@ -20,6 +20,7 @@ from typing import Any
 from policies.errors import TuneJobsError
 from tune_jobs.service.job_files import JobFiles, held_jobs
 from tune_jobs.service.jobs import Job, Outcome
+from tune_jobs.service.logs import LogFormat
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver, memory_of_tree
 from tune_jobs.store.contract import Storage, Sweep
@@ -42,6 +43,8 @@ class Surroundings:
     num_cpus: float
     modules: tuple[str, ...]
     """Modules that specs may name; the operator's choice."""
+    log_format: LogFormat = "text"
+    """Of what processes without a job say, on this one's standard error."""
 
 
 class Supervisor:
@@ -53,6 +56,7 @@ class Supervisor:
         where: Where they run.
         spare_idle_s: How long a driver process is kept warm while no sweep comes, in seconds; 0: not at all.
         on_end: Called with each job that has ended; after a kill perhaps again.
+        on_death: Called when a driver has died before its job had ended.
         make_driver: Starts a driver process.
     """
 
@@ -64,10 +68,16 @@ class Supervisor:
         *,
         spare_idle_s: float = 1_800.0,
         on_end: Callable[[Job], None] = lambda _: None,
+        on_death: Callable[[], None] = lambda: None,
         make_driver: Callable[[Mapping[str, Any]], Driver] = Driver,
     ) -> None:
         self._queue, self._storage, self._where = queue, storage, where
-        self._spare_idle_s, self._on_end, self._make_driver = spare_idle_s, on_end, make_driver
+        self._spare_idle_s, self._on_end, self._on_death, self._make_driver = (
+            spare_idle_s,
+            on_end,
+            on_death,
+            make_driver,
+        )
         self._idle_since = time.monotonic()
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
@@ -130,6 +140,10 @@ class Supervisor:
             return None
         return {"warm": spare.is_usable() and spare.is_warm(), "memory_bytes": memory_of_tree(spare.pid)}
 
+    def num_drivers(self) -> int:
+        """Return how many processes drive sweeps now, as the locks of running jobs say."""
+        return sum(self._files(job).is_run() for job in self._queue.jobs("running"))
+
     @property
     def num_cpus(self) -> float:
         """CPUs that running sweeps share."""
@@ -159,7 +173,7 @@ class Supervisor:
             try:
                 state = sweep.read_record().state
             except TuneJobsError as error:
-                _log.warning("Sweep %s is left alone: %s", sweep.name, error)
+                _log.warning("Sweep %s is left alone: %s", sweep.name, error, extra={"sweep": sweep.name})
                 continue
             if state in ("created", "running"):
                 self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.num_cpus)
@@ -216,12 +230,16 @@ class Supervisor:
     def _died(self, job: Job, files: JobFiles) -> None:
         """Let another driver go on, after a while, or give up."""
         if job.num_attempts >= MAX_ATTEMPTS:
+            self._on_death()
             said = files.last_lines()
             message = f"The process that ran the sweep died {job.num_attempts} times." + (f"\n{said}" if said else "")
             self._finish(job, "failed", message)
         elif self._retry_at.setdefault(job.id, time.monotonic() + _wait_s(job.num_attempts)) <= time.monotonic():
             del self._retry_at[job.id]
-            _log.warning("The driver of job %d (sweep %s) died; another one goes on.", job.id, job.sweep)
+            self._on_death()
+            _log.warning(
+                "The driver of job %d (sweep %s) died; another one goes on.", job.id, job.sweep, extra=job.log_fields
+            )
             self._start(self._queue.again(job.id))
 
     def _interrupt(self, job: Job, files: JobFiles) -> None:
@@ -234,7 +252,8 @@ class Supervisor:
             os.kill(holder.pid, signal.SIGTERM)
 
     def _finish(self, job: Job, outcome: Outcome, message: str | None = None) -> None:
-        _log.info("Job %d (%s of sweep %s) has ended: %s.", job.id, job.verb, job.sweep, outcome)
+        told = (job.id, job.verb, job.sweep, outcome)
+        _log.info("Job %d (%s of sweep %s) has ended: %s.", *told, extra=job.log_fields)
         # First it is told: whoever is killed in between tells it twice, and not never.
         self._on_end(job.model_copy(update={"state": "ended", "outcome": outcome, "message": message}))
         self._queue.end(job.id, outcome, message)
@@ -250,6 +269,7 @@ class Supervisor:
             request = {
                 "service": str(self._where.service_folder),
                 "job": job.uid,
+                "number": job.id,
                 "attempt": job.num_attempts,
                 "sweep": str(self._sweep(job.sweep).folder),
                 "verb": job.verb,
@@ -258,10 +278,11 @@ class Supervisor:
             }
             driver.give(request, lock, files.log)
             self._children[driver.pid] = driver
-            _log.info("Job %d (%s of sweep %s) is run by process %d.", job.id, job.verb, job.sweep, driver.pid)
+            told = (job.id, job.verb, job.sweep, driver.pid)
+            _log.info("Job %d (%s of sweep %s) is run by process %d.", *told, extra=job.log_fields)
         except TuneJobsError as error:
             # It is looked at again, as one whose driver died.
-            _log.warning("Job %d can't be started: %s", job.id, error)
+            _log.warning("Job %d can't be started: %s", job.id, error, extra=job.log_fields)
         finally:
             os.close(lock)
 
@@ -274,6 +295,7 @@ class Supervisor:
     def _settings(self, *, warm: bool) -> dict[str, Any]:
         return {
             "modules": self._where.modules,
+            "log_format": self._where.log_format,
             "working_folder": str(self._where.storage_folder),
             # A cluster has its own.
             "warm_ray": warm and self._where.address is None,

@@ -9,9 +9,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+import http.client
 import json
 import logging
 import os
+import re
 import subprocess
 import threading
 import time
@@ -19,13 +21,17 @@ import urllib.error
 import urllib.request
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
-from sqlalchemy import Engine, delete, insert, or_, select, update
+from sqlalchemy import Engine, delete, func, insert, or_, select, update
 
 from policies.errors import SpecError
 from tune_jobs.service.database.tables import messages
 
+Kind = Literal["webhook", "command"]
+Delivery = Literal["arrived", "failed", "given_up"]
 Event = Literal["sweep.ended", "sweep.failed", "sweep.stopped", "sweep.best", "sweep.stuck"]
 
 COMMAND = "command:"
@@ -33,6 +39,8 @@ COMMAND = "command:"
 WAITS_S = (5.0, 30.0, 120.0, 600.0, 3_600.0, 6 * 3_600.0, 12 * 3_600.0)
 """How long to wait after each attempt that failed; after the last one it is given up."""
 _ENCODED = "whsec_"
+_SHORTEST_PATH = 8
+"""Of a path that may be a secret, in characters: `/hook` is a word, and not one."""
 _TIMEOUT_S = 15.0
 _COMMAND_TIMEOUT_S = 60.0
 _KEPT_S = 7 * 24 * 3_600.0
@@ -47,7 +55,37 @@ def check_target(url: str) -> str:
     """
     if not url.startswith(("http://", "https://")) or len(url) > 2_000:
         raise SpecError(f"{url[:80]!r} is no URL of a webhook.", "Begin it with https:// or http://.")
+    try:
+        parts = urlsplit(url)
+        is_usable = bool(parts.hostname) and parts.port != 0 and url.isascii() and url.isprintable() and " " not in url
+    except ValueError:
+        is_usable = False
+    if not is_usable:
+        raise SpecError(
+            f"The URL of a webhook at {told_target(url)!r} can't be used.",
+            "Give https://HOST/PATH, or https://HOST:PORT/PATH; write other characters as %XX.",
+        )
+    if parts.username is not None or parts.password is not None:
+        raise SpecError(
+            f"The URL of a webhook at {parts.hostname!r} has a name or a password before its host, which is not sent.",
+            "Leave it out, and let the receiver check `webhook-signature` (TUNE_JOBS_WEBHOOK_SECRET).",
+        )
     return url
+
+
+def told_target(target: str) -> str:
+    """Return what may be told of a target: the path of a URL, and a command's arguments, may be secrets."""
+    if target.startswith(COMMAND):
+        return f"the command {Path(json.loads(target.removeprefix(COMMAND))[0]).name}"
+    scheme, _, rest = target.partition("://")
+    return f"{scheme}://{re.split('[/?#]', rest)[0].rpartition('@')[2]}"
+
+
+def secrets_of(url: str) -> tuple[str, ...]:
+    """Return what of a webhook's URL never appears in a log: its path and its query, which say who may send there."""
+    rest = url.partition("://")[2]
+    path = rest[len(re.split("[/?#]", rest)[0]) :]
+    return (path, path.lstrip("/")) if len(path) > _SHORTEST_PATH else ()
 
 
 def signature(secret: str, message_id: str, timestamp: int, body: str) -> str:
@@ -74,6 +112,7 @@ class Teller:
         engine: The database.
         targets: URLs of webhooks, and commands as `command:` and a JSON list.
         secret: What webhooks are signed with; None: they are not.
+        on_attempt: Called after each attempt to send.
         now: Returns seconds since 1970.
     """
 
@@ -83,9 +122,11 @@ class Teller:
         targets: Sequence[str],
         *,
         secret: str | None = None,
+        on_attempt: Callable[[Kind, Delivery], None] = lambda _kind, _delivery: None,
         now: Callable[[], float] = time.time,
     ) -> None:
         self._engine, self._targets, self._secret, self._now = engine, tuple(targets), secret, now
+        self._on_attempt = on_attempt
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="telling", daemon=True)
 
@@ -116,6 +157,14 @@ class Teller:
             connection.execute(insert(messages), rows)
         self._wake.set()
 
+    def waiting(self) -> int:
+        """Return how many messages wait to be sent, those that are tried again among them."""
+        if not self._targets:
+            return 0
+        wanted = messages.c.next_at.is_not(None) & messages.c.target.in_(self._targets)
+        with self._engine.begin() as connection:
+            return int(connection.execute(select(func.count()).select_from(messages).where(wanted)).scalar_one())
+
     def _run(self) -> None:
         while not self._end.is_set():
             try:
@@ -142,8 +191,11 @@ class Teller:
             attempts = row["num_attempts"] + 1
             arrived += error is None
             wait = None if error is None or attempts > len(WAITS_S) else WAITS_S[attempts - 1]
+            delivery: Delivery = "arrived" if error is None else "given_up" if wait is None else "failed"
+            self._on_attempt("command" if row["target"].startswith(COMMAND) else "webhook", delivery)
             if error is not None:
-                _log.warning("%s could not be told %s (attempt %d): %s", row["target"], row["event"], attempts, error)
+                told = (told_target(row["target"]), row["event"], attempts, error)
+                _log.warning("%s could not be told %s (attempt %d): %s", *told)
             values = {
                 "num_attempts": attempts, "error": error, "next_at": None if wait is None else self._now() + wait,
             }  # fmt: skip
@@ -168,8 +220,8 @@ class Teller:
                 answer.read(1_000)
         except urllib.error.HTTPError as error:
             return f"it answered {error.code}"
-        except (OSError, ValueError) as error:
-            return str(getattr(error, "reason", error))[:500]
+        except (OSError, ValueError, http.client.HTTPException) as error:
+            return (str(getattr(error, "reason", error)) or type(error).__name__)[:500]
         return None
 
 
@@ -190,6 +242,9 @@ def _run_command(command: Sequence[str], message_id: str, event: str, body: str)
             list(command), input=body.encode(), env=os.environ | told, capture_output=True,
             timeout=_COMMAND_TIMEOUT_S, check=False, start_new_session=True,
         )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        # Its own words have the command's arguments.
+        return f"it took longer than {_COMMAND_TIMEOUT_S:g} s"
     except (OSError, subprocess.SubprocessError) as error:
         return str(error)[:500]
     if done.returncode == 0:

@@ -6,6 +6,7 @@ import logging
 import sqlite3
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, quote_plus
 
 from alembic import command
 from alembic.config import Config
@@ -16,6 +17,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
 
 from policies.errors import CannotRunError
+from tune_jobs.service.logs import Redaction
 
 BUSY_TIMEOUT_S = 10.0
 """How long a call waits for another one that writes."""
@@ -25,6 +27,15 @@ _MIGRATIONS = Path(__file__).with_name("migrations")
 def sqlite_url(file: Path) -> str:
     """Return the URL of an SQLite database in a file."""
     return f"sqlite:///{file}"
+
+
+def password_in(url: str) -> tuple[str, ...]:
+    """Return the password of a database's URL, as it is and as the URL has it; nothing where there is none."""
+    try:
+        password = make_url(url).password
+    except (ArgumentError, ValueError):
+        return ()
+    return () if password is None else (str(password), quote(str(password), safe=" +"), quote_plus(str(password)))
 
 
 def open_database(url: str) -> Engine:
@@ -46,10 +57,10 @@ def open_database(url: str) -> Engine:
                 f"{told}: the service keeps its queue in SQLite or PostgreSQL, not in {parsed.get_backend_name()}.",
                 "Give sqlite:///FILE or postgresql://USER@HOST/NAME.",
             )
-        engine = create_engine(parsed, pool_pre_ping=True)
-    except (ArgumentError, NoSuchModuleError) as error:
+        engine = create_engine(parsed, pool_pre_ping=True, hide_parameters=True)
+    except (ArgumentError, NoSuchModuleError, ValueError) as error:
         raise CannotRunError(
-            f"{url!r} is no database URL.", "Give sqlite:///FILE or postgresql://USER@HOST/NAME."
+            f"{Redaction()(url)!r} is no database URL.", "Give sqlite:///FILE or postgresql://USER@HOST/NAME."
         ) from error
     except ModuleNotFoundError as error:
         raise CannotRunError(

@@ -17,10 +17,12 @@ from tune_jobs.service.http import (
     download_routes,
     event_routes,
     meta_routes,
+    metrics_routes,
     play_routes,
     sweep_routes,
 )
 from tune_jobs.service.http.problems import add_handlers
+from tune_jobs.service.http.requests import RequestMiddleware
 from tune_jobs.service.page import routes as page_routes
 from tune_jobs.service.service import Service
 
@@ -45,11 +47,12 @@ class _App(FastAPI):
 
     def __init__(self, service: Service, **settings: Any) -> None:
         super().__init__(**settings)
-        self._gate = service.gate
+        self._gate, self._metrics = service.gate, service.metrics
 
     @override
     def build_middleware_stack(self) -> ASGIApp:
-        return AccessMiddleware(super().build_middleware_stack(), self._gate)
+        # What is refused is counted, too.
+        return RequestMiddleware(AccessMiddleware(super().build_middleware_stack(), self._gate), self._metrics)
 
     @override
     def openapi(self) -> dict[str, Any]:
@@ -78,10 +81,12 @@ def make_app(service: Service) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = service
+    service.metrics.ask_for_players(play_routes.num_playing)
     add_handlers(app)
     modules = (
         access_routes,
         meta_routes,
+        metrics_routes,
         sweep_routes,
         action_routes,
         event_routes,

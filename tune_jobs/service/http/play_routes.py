@@ -40,6 +40,11 @@ _PATIENCE_S = 60.0
 _playing: set[int] = set()
 
 
+def num_playing() -> int:
+    """Return how many episodes are being played."""
+    return len(_playing)
+
+
 @router.get("/play")
 async def play(
     name: str,

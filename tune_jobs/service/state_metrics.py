@@ -1,0 +1,179 @@
+"""What the service is just now, for Prometheus: queue, sweeps, trials, processes. It is looked up when asked for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+from sqlalchemy.exc import SQLAlchemyError
+
+from analysis.records import SweepState, TrialStatus
+from policies.errors import TuneJobsError
+from tune_jobs.service.jobs import JobState, Verb
+from tune_jobs.service.queue import Queue
+from tune_jobs.service.statuses import Seen, Statuses
+from tune_jobs.service.supervisor import Supervisor
+from tune_jobs.service.telling import Teller
+from tune_jobs.service.watching import Watching
+from tune_jobs.store.contract import Storage
+
+
+class StateCollector(Collector):
+    """Looks when it is asked; of a sweep it takes what `Statuses` knows, and reads only what that would read.
+
+    Args:
+        queue: The jobs.
+        storage: The sweeps.
+        statuses: What they look like.
+        supervisor: Runs the queue.
+        watching: Has the clients that follow sweeps.
+        teller: Has the messages that wait.
+    """
+
+    def __init__(
+        self,
+        *,
+        queue: Queue,
+        storage: Storage,
+        statuses: Statuses,
+        supervisor: Supervisor,
+        watching: Watching,
+        teller: Teller,
+    ) -> None:
+        self._queue, self._storage, self._statuses = queue, storage, statuses
+        self._supervisor, self._watching, self._teller = supervisor, watching, teller
+        self._steps = EnvSteps()
+
+    def collect(self) -> Iterator[Metric]:
+        """Return all of it; where the database is away, without what is in there."""
+        try:
+            found = [
+                *self._jobs(),
+                _gauge("tune_jobs_messages_waiting", "Messages that wait to be sent.", self._teller.waiting()),
+            ]
+        except SQLAlchemyError:
+            found = []
+        yield _gauge("tune_jobs_database_up", "Whether the database can be used.", bool(found))
+        yield from found
+        yield from self._sweeps()
+        yield from self._processes()
+
+    def _jobs(self) -> Iterator[Metric]:
+        load = self._queue.load()
+        kinds = [(state, verb) for state in get_args(JobState) for verb in get_args(Verb) if state != "ended"]
+        counts = {kind: load.counts.get(kind, 0) for kind in kinds}
+        yield _gauges("tune_jobs_jobs", "Jobs that have not ended.", ("state", "verb"), counts)
+        yield _gauge("tune_jobs_queue_owners", "How many people's jobs wait or run.", load.num_owners)
+        yield _gauge(
+            "tune_jobs_queue_oldest_wait_seconds", "How long the oldest job that waits has waited.", load.waited_s
+        )
+        yield _gauge("tune_jobs_cpus_used", "CPUs that running jobs take.", load.num_cpus)
+        if self._supervisor.num_cpus < float("inf"):
+            yield _gauge("tune_jobs_cpus", "CPUs that running jobs share.", self._supervisor.num_cpus)
+        yield _gauge("tune_jobs_drivers", "Processes that drive sweeps.", self._supervisor.num_drivers())
+
+    def _sweeps(self) -> Iterator[Metric]:
+        seen, names, num_unreadable = self._seen()
+        states = Counter[str](item.status.state for item in seen)
+        trials: Counter[str] = Counter()
+        for item in seen:
+            trials.update(item.status.counts)
+        yield _gauges("tune_jobs_sweeps", "Sweeps by state.", ("state",), _by(get_args(SweepState), states))
+        yield _gauge("tune_jobs_sweeps_unreadable", "Sweeps whose files can't be read.", num_unreadable)
+        yield _gauges(
+            "tune_jobs_trials", "Trials of all sweeps by status.", ("status",), _by(get_args(TrialStatus), trials)
+        )
+        yield CounterMetricFamily(
+            "tune_jobs_env_steps_total",
+            "Env steps that were trained since the service began.",
+            self._steps.update(seen, names),
+        )
+        rate = sum(item.status.env_steps_per_s or 0.0 for item in seen if item.status.alive)
+        yield _gauge("tune_jobs_env_steps_per_second", "Env steps per second of all running trials.", rate)
+
+    def _seen(self) -> tuple[list[Seen], set[str], int]:
+        found, num_unreadable = [], 0
+        try:
+            sweeps = self._storage.sweeps()
+        except TuneJobsError:
+            return [], set(), 1
+        for sweep in sweeps:
+            try:
+                found.append(self._statuses.see(sweep.name))
+            except TuneJobsError:
+                # One that was deleted just now is not there the next time.
+                num_unreadable += sweep.exists()
+        return found, {sweep.name for sweep in sweeps}, num_unreadable
+
+    def _processes(self) -> Iterator[Metric]:
+        yield _gauge("tune_jobs_queue_up", "Whether the queue is being run.", self._supervisor.is_alive)
+        yield _gauge(
+            "tune_jobs_draining", "Whether nothing more is started, as the service ends.", self._supervisor.is_draining
+        )
+        yield _gauge("tune_jobs_event_streams", "Clients that follow sweeps.", self._watching.num_watchers)
+        yield _gauge(
+            "tune_jobs_event_streams_limit", "How many clients may follow sweeps.", self._watching.max_watchers
+        )
+        spare = self._supervisor.spare() or {"warm": False, "memory_bytes": None}
+        yield _gauge("tune_jobs_spare_warm", "Whether a process is kept warm for the next sweep.", spare["warm"])
+        memory = spare["memory_bytes"] or 0
+        yield _gauge("tune_jobs_spare_memory_bytes", "Memory of the process that is kept for the next sweep.", memory)
+
+
+@dataclass
+class EnvSteps:
+    """Counts env steps from the numbers that sweeps have; threads may share one.
+
+    A counter must not go back: what a sweep has trained counts on when it is deleted. What was there before the service
+    began is not counted, as a counter begins at zero.
+    """
+
+    began_at: float = field(default_factory=time.time)
+    """Seconds since 1970."""
+    total: int = 0
+    _known: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """When a sweep was created, and its env steps when it was last seen."""
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def update(self, seen: Sequence[Seen], names: Collection[str]) -> int:
+        """Count what is new, and return the total.
+
+        Args:
+            seen: The sweeps as they are.
+            names: All sweeps that there are, those too that can't be read just now.
+        """
+        with self._lock:
+            for item in seen:
+                created_at, steps = item.status.sweep.created_at, item.status.num_env_steps
+                known = self._known.get(item.name)
+                if known is None or known[0] != created_at:
+                    # Another one of the same name, or one that is seen for the first time.
+                    before = 0 if created_at >= self.began_at else steps
+                else:
+                    before = known[1]
+                self.total += max(0, steps - before)
+                self._known[item.name] = (created_at, steps)
+            self._known = {name: known for name, known in self._known.items() if name in names}
+            return self.total
+
+
+def _by(names: Sequence[str], counts: Mapping[str, int]) -> dict[tuple[str, ...], int]:
+    return {(name,): counts.get(name, 0) for name in names}
+
+
+def _gauge(name: str, text: str, value: float) -> GaugeMetricFamily:
+    return GaugeMetricFamily(name, text, float(value))
+
+
+def _gauges(name: str, text: str, labels: Sequence[str], values: Mapping[Any, float]) -> GaugeMetricFamily:
+    made = GaugeMetricFamily(name, text, labels=labels)
+    for key, value in values.items():
+        made.add_metric(key, value)
+    return made
