@@ -53,6 +53,8 @@ database_option = click.option(
 @click.option("--tls-key", type=click.Path(path_type=Path), metavar="FILE", help="The certificate's key, PEM.")
 @click.option("--log-format", type=click.Choice(("text", "json")), default="text", show_default=True,
               help="Of the log on standard error; json: one object a line, requests too.")  # fmt: skip
+@click.option("--keep-audit", "keep_audit_days", type=click.FloatRange(0, min_open=True), default=365.0,
+              show_default=True, metavar="DAYS", help="How long the audit log keeps an entry.")  # fmt: skip
 @storage_option
 @json_option
 def serve(
@@ -75,6 +77,7 @@ def serve(
     tls_certificate: Path | None,
     tls_key: Path | None,
     log_format: LogFormat,
+    keep_audit_days: float,
     storage: str | None,
     as_json: bool,
 ) -> None:
@@ -93,7 +96,7 @@ def serve(
         webhooks=webhooks, webhook_secret=webhook_secret, stuck_s=stuck_s,
         command=tuple(shlex.split(run_command or "")),
         public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
-        tls_certificate=tls_certificate, tls_key=tls_key, log_format=log_format,
+        tls_certificate=tls_certificate, tls_key=tls_key, log_format=log_format, keep_audit_days=keep_audit_days,
     )  # fmt: skip
     logs.configure(log_format, secrets=config.secrets)
 

@@ -73,6 +73,7 @@ class ServiceConfig:
         tls_certificate: A file with the certificate and those above it, PEM.
         tls_key: A file with its key, PEM.
         log_format: Of the service's own log.
+        keep_audit_days: How long the audit log keeps an entry, in days.
     """
 
     storage: Path
@@ -95,6 +96,7 @@ class ServiceConfig:
     tls_certificate: Path | None = None
     tls_key: Path | None = None
     log_format: LogFormat = "text"
+    keep_audit_days: float = 365.0
 
     def __post_init__(self) -> None:
         for url in self.webhooks:

@@ -47,7 +47,9 @@ def main(descriptor: int) -> None:
                     return
                 known = json.loads(settings)
                 # Until there is a job, this is said where the service says its own.
-                logs.configure(known.get("log_format", "text"), process={"process": "spare"}, level=logging.WARNING, anew=True)
+                logs.configure(
+                    known.get("log_format", "text"), process={"process": "spare"}, level=logging.WARNING, anew=True
+                )
                 warm_up(stack, known)
                 with contextlib.suppress(OSError):
                     asked.sendall(READY)

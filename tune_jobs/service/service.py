@@ -16,6 +16,7 @@ from policies.errors import CannotRunError
 from tune_jobs.plan.machine import local_machine
 from tune_jobs.service.access.audit import Audit
 from tune_jobs.service.access.gate import Gate
+from tune_jobs.service.access.pruning import Pruning
 from tune_jobs.service.access.tokens import Tokens
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database
@@ -95,8 +96,9 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     teller=teller,
                 )
             )
+            pruning = Pruning(gate.audit, config.keep_audit_days)
             with contextlib.ExitStack() as stack:
-                for part in (teller, watch, supervisor):
+                for part in (teller, watch, supervisor, pruning):
                     part.start()
                     stack.callback(part.close)
                 stack.callback(watching.close)

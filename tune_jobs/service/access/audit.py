@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import Engine, insert, select
+from sqlalchemy import Engine, delete, insert, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from policies.errors import SpecError, fit
 from tune_jobs.service.database.tables import audit
 
+_AT_ONCE = 5_000
 _log = logging.getLogger(__name__)
 
 
@@ -71,6 +72,12 @@ class Audit:
                 connection.execute(insert(audit).values(values))
         except SQLAlchemyError as error:
             _log.error("The audit log can't be written (%s). It lacks %r.", type(error).__name__, values)
+
+    def remove_older(self, age_s: float, limit: int = _AT_ONCE) -> int:
+        """Remove the oldest entries of those that are older than this, in seconds; return how many were removed."""
+        old = select(audit.c.id).where(audit.c.at < self._now() - age_s).order_by(audit.c.id).limit(limit)
+        with self._engine.begin() as connection:
+            return connection.execute(delete(audit).where(audit.c.id.in_(old))).rowcount
 
     def page(
         self, *, limit: int, cursor: str | None = None, who: str | None = None, target: str | None = None
