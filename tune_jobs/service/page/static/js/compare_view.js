@@ -86,7 +86,7 @@ export function openCompare(main, route) {
     showTable(cards.differences, "What their sweep files say differently", entries, rows);
     if (!rows.length) cards.differences.append(el("p", { class: "quiet pad" }, "Nothing: they are the same."));
     cards.notes.hidden = notes.length === 0;
-    cards.notes.replaceChildren(el("h2", {}, "To read the numbers"), ...notes.map((note) => el("p", {}, note)));
+    cards.notes.replaceChildren(el("h2", {}, "To read the numbers"), ...notes.map((note) => el("p", {}, withCode(note))));
   }
 
   function begin() {
@@ -116,13 +116,16 @@ export function openCompare(main, route) {
 const isLive = (answer) =>
   answer.facts.some(({ title, cells }) => title === "state" && cells.some((state) => state === "running"));
 
+// Commands are in backticks, as on the terminal.
+const withCode = (text) => text.split("`").map((part, index) => (index % 2 ? el("code", {}, part) : part));
+
 const look = (entries, letter) => COLOURS[entries.findIndex((entry) => entry.letter === letter) % COLOURS.length];
 
 function showVerdicts(card, { verdicts }) {
   card.hidden = verdicts.length === 0;
   card.replaceChildren(
     el("h2", {}, "Which is better"),
-    ...verdicts.map(({ verdict, lines }) => el("div", {}, el("h3", {}, verdict), ...lines.map((line) => el("p", {}, line)))),
+    ...verdicts.map(({ verdict, lines }) => el("div", {}, el("h3", {}, withCode(verdict)), ...lines.map((line) => el("p", {}, withCode(line))))),
   );
 }
 

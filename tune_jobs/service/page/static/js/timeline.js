@@ -86,7 +86,8 @@ export class Timeline {
     if (!bars.length) return;
     this.plot ??= this.makePlot();
     this.plot.host.parentElement.style.minHeight = `${Math.min(MOST_PX, FIXED_PX + ROW_PX * numRows)}px`;
-    this.plot.setRange({ x: [0, lasted || 1], y: [0, numRows] });
+    // With room for the last label.
+    this.plot.setRange({ x: [0, 1.02 * lasted || 1], y: [0, numRows] });
   }
 
   makePlot() {
