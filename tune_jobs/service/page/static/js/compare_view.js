@@ -86,7 +86,7 @@ export function openCompare(main, route) {
     showTable(cards.differences, "What their sweep files say differently", entries, rows);
     if (!rows.length) cards.differences.append(el("p", { class: "quiet pad" }, "Nothing: they are the same."));
     cards.notes.hidden = notes.length === 0;
-    cards.notes.replaceChildren(el("h2", {}, "To read the numbers"), ...notes.map((note) => el("p", {}, withCode(note))));
+    cards.notes.replaceChildren(el("h2", {}, "To read the numbers"), ...notes.map(sentence));
   }
 
   function begin() {
@@ -118,6 +118,7 @@ const isLive = (answer) =>
 
 // Commands are in backticks, as on the terminal.
 const withCode = (text) => text.split("`").map((part, index) => (index % 2 ? el("code", {}, part) : part));
+const sentence = (text) => el("p", {}, withCode(text));
 
 const look = (entries, letter) => COLOURS[entries.findIndex((entry) => entry.letter === letter) % COLOURS.length];
 
@@ -125,7 +126,7 @@ function showVerdicts(card, { verdicts }) {
   card.hidden = verdicts.length === 0;
   card.replaceChildren(
     el("h2", {}, "Which is better"),
-    ...verdicts.map(({ verdict, lines }) => el("div", {}, el("h3", {}, withCode(verdict)), ...lines.map((line) => el("p", {}, withCode(line))))),
+    ...verdicts.map(({ verdict, lines }) => el("div", {}, el("h3", {}, withCode(verdict)), ...lines.map(sentence))),
   );
 }
 
@@ -200,7 +201,9 @@ function showTable(card, title, entries, rows) {
       ...cells.map((cell) => el("td", { class: isCode ? "mono" : null }, cell)),
     );
   const known = card.querySelector(".sideways");
-  const scroller = known ?? el("div", { class: "sideways", tabindex: 0, role: "region", "aria-label": `${title}: table` });
+  // What scrolls is reached by the Tab key.
+  const options = { class: "sideways", tabindex: 0, role: "region", "aria-label": `${title}: table` };
+  const scroller = known ?? el("div", options);
   scroller.replaceChildren(
     el(
       "table",

@@ -93,7 +93,8 @@ export class LinesChart {
       context.setLineDash([]);
     }
     // The first lies over the others.
-    for (const line of this.lines.toReversed()) this.paintLine(context, places, line, near !== null && near !== line.key);
+    for (const line of this.lines.toReversed())
+      this.paintLine(context, places, line, near !== null && near !== line.key);
   }
 
   paintLine(context, places, line, isBehind) {

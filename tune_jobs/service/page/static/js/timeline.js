@@ -45,7 +45,7 @@ export class Timeline {
     this.details = el(
       "details",
       { open: isOpen },
-      el("summary", {}, el("h2", {}, "Timeline"), el("span", { class: "quiet small" }, "Which trial ran when, and where")),
+      el("summary", {}, el("h2", {}, "Timeline"), el("span", { class: "quiet small" }, "Which trial ran when, where")),
       this.caption,
       this.room,
       this.none,
