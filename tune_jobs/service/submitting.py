@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from policies.envs.modules import allow_modules, allowed_again
-from policies.errors import SpecError
+from policies.errors import CannotRunError, SpecError
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
@@ -66,8 +66,7 @@ class Submitter:
         """Validate a sweep, and return what would run; nothing is written.
 
         Raises:
-            SpecError: The sweep is wrong, or not allowed here.
-            CannotRunError: It cannot run here.
+            SpecError: The sweep is wrong, not allowed here, or too large for this machine.
         """
         return self._planned(submission)
 
@@ -77,8 +76,9 @@ class Submitter:
         """Write a sweep and let it wait; return its job, and whether it is new.
 
         Raises:
-            SpecError: The sweep is wrong or not allowed here, its name is taken, or the key was used for another one.
-            CannotRunError: It cannot run here.
+            SpecError: The sweep is wrong, not allowed here or too large for this machine, its name is taken, or the key
+                was used for another one.
+            CannotRunError: It cannot be written.
         """
         keyed = None if key is None else (key, submission.digest)
         if keyed is not None and (known := self._queue.known(owner, *keyed)) is not None:
@@ -120,7 +120,11 @@ class Submitter:
                 f"env.id: the environment {spec.env.id!r} is not one that may be used here.",
                 "Choose one that the service's operator allows (serve --env).",
             )
-        plan = make_plan(spec, self._machine(spec))
+        try:
+            plan = make_plan(spec, self._machine(spec))
+        except CannotRunError as error:
+            # It is the sweep that is wrong here, and to send it again is of no use.
+            raise SpecError(error.message, error.hint) from error
         limits = self._config.limits
         if len(plan.trials) > limits.trials:
             raise SpecError(

@@ -26,7 +26,7 @@ from tune_jobs.service.access.hosts import Host, ServedNames, check_fetch_site, 
 from tune_jobs.service.access.proxy import Proxy, is_forwarded
 from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.access.tokens import FRESH_S, Token
-from tune_jobs.service.problem_documents import problem
+from tune_jobs.service.problem_documents import database_problem
 
 PUBLIC_PATHS = frozenset({"/", "/healthz", "/readyz", "/api/v1/login"})
 PUBLIC_FOLDERS = ("/static/",)
@@ -74,9 +74,7 @@ class AccessMiddleware:
             return
         except SQLAlchemyError as error:
             _log.error("The database can't be used: %s", error)
-            answer = problem(503, "The service's database can't be used just now. Try again.")
-            answer.headers["Retry-After"] = "5"
-            await answer(request.scope, receive, send)
+            await database_problem(error)(request.scope, receive, send)
             return
         except GoneError:
             return

@@ -9,6 +9,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from tune_jobs.service.access.credentials import WRONG_TOKEN, set_cookie
 from tune_jobs.service.http.caller import AnAdmin, TheCaller, TheService
 from tune_jobs.service.http.models import AuditPage, LoggedIn, Login
+from tune_jobs.service.problem_documents import problems
 
 _LONGEST_S = 30 * 86_400
 """How long a browser keeps a cookie at most."""
@@ -16,7 +17,15 @@ _LONGEST_S = 30 * 86_400
 router = APIRouter(prefix="/api/v1", tags=["access"])
 
 
-@router.post("/login", responses={401: {"description": "The token is none."}, 429: {"description": "Too many were."}})
+@router.post(
+    "/login",
+    responses=problems(
+        {
+            401: "The token is wrong, has expired or was revoked.",
+            429: "Too many wrong ones have come from this address.",
+        }
+    ),
+)
 def login(given: Login, service: TheService, request: Request, response: Response) -> LoggedIn:
     """Give the page a cookie in exchange for a token."""
     gate, state = service.gate, request.state

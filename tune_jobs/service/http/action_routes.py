@@ -15,13 +15,18 @@ from tune_jobs.service.http.caller import AChanger, TheService
 from tune_jobs.service.http.models import Extend, Inject, Replicate
 from tune_jobs.service.http.problems import NotNowError
 from tune_jobs.service.jobs import Job, Verb
+from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.adding import new_point
 
-router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["actions"])
+router = APIRouter(
+    prefix="/api/v1/sweeps/{name}",
+    tags=["actions"],
+    responses=problems({409: "It contradicts what the sweep does just now, or was asked for already."}),
+)
 
 
 @router.post("/stop", status_code=202)

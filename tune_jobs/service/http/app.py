@@ -9,7 +9,7 @@ from fastapi import FastAPI
 from starlette.types import ASGIApp
 from typing_extensions import override
 
-from tune_jobs.service.access.middleware import PUBLIC_PATHS, AccessMiddleware
+from tune_jobs.service.access.middleware import AccessMiddleware
 from tune_jobs.service.http import (
     access_routes,
     action_routes,
@@ -21,25 +21,11 @@ from tune_jobs.service.http import (
     play_routes,
     sweep_routes,
 )
+from tune_jobs.service.http.openapi import complete
 from tune_jobs.service.http.problems import add_handlers
 from tune_jobs.service.http.requests import RequestMiddleware
 from tune_jobs.service.page import routes as page_routes
 from tune_jobs.service.service import Service
-
-_SECURITY_SCHEMES = {
-    "token": {
-        "type": "http",
-        "scheme": "bearer",
-        "description": "Made by `tune-jobs token make`. On the service's own machine none is needed by default.",
-    },
-    "cookie": {
-        "type": "apiKey",
-        "in": "cookie",
-        "name": "tune-jobs-PORT",
-        "description": "The page's, given by `/api/v1/login`; with TLS its name begins with `__Host-`. Changes need "
-        "the header Origin or Sec-Fetch-Site, too.",
-    },
-}
 
 
 class _App(FastAPI):
@@ -56,15 +42,11 @@ class _App(FastAPI):
 
     @override
     def openapi(self) -> dict[str, Any]:
-        """Return the OpenAPI document, with what the access layer asks for."""
+        """Return the OpenAPI document, with what the routes do not say."""
         is_new = self.openapi_schema is None
         document = super().openapi()
         if is_new:
-            document["security"] = [{"token": []}, {"cookie": []}]
-            document.setdefault("components", {})["securitySchemes"] = _SECURITY_SCHEMES
-            for path in PUBLIC_PATHS & document["paths"].keys():
-                for operation in document["paths"][path].values():
-                    operation["security"] = []
+            complete(document)
         return document
 
 

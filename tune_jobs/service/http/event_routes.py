@@ -10,16 +10,19 @@ from pydantic_core import to_json
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.event_stream import EventStream
 from tune_jobs.service.http.models import CurvesOfSweep
+from tune_jobs.service.problem_documents import problems
 
 router = APIRouter(prefix="/api/v1", tags=["events"])
 
-LastId = Annotated[str | None, Header(alias="Last-Event-ID", max_length=200)]
+LastId = Annotated[
+    str | None, Header(alias="Last-Event-ID", max_length=200, description="The id of the last event that came.")
+]
 LastIdAgain = Annotated[
     str | None, Query(alias="last_event_id", max_length=200, description="For a first request; the header goes first.")
 ]
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Server-sent events."},
-    429: {"description": "As many clients watch as may."},
+    **problems({429: "As many clients watch as may, or too many wrong tokens came from this address."}),
 }
 
 

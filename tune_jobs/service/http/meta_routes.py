@@ -57,7 +57,10 @@ def me(service: TheService, caller: TheCaller) -> dict[str, Any]:
 
 
 @router.get("/api/v1/jobs")
-def jobs(service: TheService, state: Annotated[list[JobState] | None, Query()] = None) -> list[Job]:
+def jobs(
+    service: TheService,
+    state: Annotated[list[JobState] | None, Query(description="Only those in these states.")] = None,
+) -> list[Job]:
     """List jobs, in the order in which they came."""
     return service.queue.jobs(*(state or ()))
 

@@ -19,7 +19,8 @@ Note = Annotated[str, Field(max_length=2_000, description="A text for people.")]
 
 
 class _Request(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    # JSON has types: a text of digits is no number, and true is not 1.
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class NewSweep(_Request):

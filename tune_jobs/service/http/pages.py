@@ -62,7 +62,7 @@ def _encoded(last: tuple[Any, str]) -> str:
 def _decoded(cursor: str) -> tuple[Any, str]:
     try:
         value, identity = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
-    except (ValueError, binascii.Error, TypeError) as error:
+    except (ValueError, binascii.Error, TypeError, RecursionError) as error:
         raise _wrong() from error
     if not isinstance(identity, str) or not (value is None or isinstance(value, str | int | float)):
         raise _wrong()

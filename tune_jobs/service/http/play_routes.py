@@ -20,6 +20,7 @@ from policies.errors import NotFoundError
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.problems import TooManyError
 from tune_jobs.service.player import LEAST_SPEED, MAX_STEPS, MOST_SPEED
+from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import stored_spec
 
@@ -45,7 +46,15 @@ def num_playing() -> int:
     return len(_playing)
 
 
-@router.get("/play")
+class _Play(StreamingResponse):
+    media_type = "text/event-stream"
+
+
+@router.get(
+    "/play",
+    response_class=_Play,
+    responses=problems({429: "As many episodes are played as may, or too many wrong tokens came from this address."}),
+)
 async def play(
     name: str,
     service: TheService,
@@ -56,16 +65,15 @@ async def play(
     seed: Annotated[int, Query(ge=0, le=2**32 - 1, description="Seed of the episode.")] = 0,
     speed: Annotated[float, Query(ge=LEAST_SPEED, le=MOST_SPEED, description="1: the env's own time.")] = 1.0,
     start: Annotated[int, Query(ge=0, le=MAX_STEPS, description="The first env step that is told.")] = 0,
-) -> StreamingResponse:
+) -> _Play:
     """Play one greedy episode: the events `info`, `step` after step, and `end`, or `problem`."""
     request = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
     limit = service.config.limits.players
     if len(_playing) >= limit:
         raise TooManyError(f"{limit} episodes are being played.", "Close one, or wait for its end.")
     # An abandoned connection ends the generator, and with it the process.
-    return StreamingResponse(
+    return _Play(
         _events({**request, "seed": seed, "speed": speed, "start": start}, str(service.config.storage)),
-        media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 

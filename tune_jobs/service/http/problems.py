@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import logging
 from http import HTTPStatus
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import iter_route_contexts
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
+from starlette.routing import compile_path
 
 from policies.errors import CannotRunError, CheckpointError, EnvFailedError, NotFoundError, SpecError, TuneJobsError
 from tune_jobs.service.access.refusal import RefusedError
-from tune_jobs.service.problem_documents import problem
+from tune_jobs.service.problem_documents import database_problem, full_disk_problem, is_full, problem
 from tune_jobs.service.queue import KeyUsedError
 from tune_jobs.spec.problems import WrongSpecError
 
@@ -40,43 +43,84 @@ _STATUS: tuple[tuple[type[TuneJobsError], HTTPStatus], ...] = (
     (CannotRunError, HTTPStatus.SERVICE_UNAVAILABLE),
 )
 
+_FRAMEWORKS = {
+    "Not Found": ("There is nothing at this path.", "See the routes in /api/v1/openapi.json."),
+    "There was an error parsing the body": (
+        "The body of the request can't be read as JSON.",
+        "Send JSON in UTF-8; numbers have at most 4,300 digits.",
+    ),
+}
+"""What is said for what Starlette and FastAPI say."""
+
 
 def add_handlers(app: FastAPI) -> None:
     """Let all errors of an app be problem documents."""
+    handlers: dict[type[Exception], Any] = {
+        TuneJobsError: _told,
+        RefusedError: _refused,
+        RequestValidationError: _invalid,
+        HTTPException: _http,
+        SQLAlchemyError: _database,
+        OSError: _system,
+        Exception: _unexpected,
+    }
+    for kind, handler in handlers.items():
+        app.add_exception_handler(kind, handler)
 
-    @app.exception_handler(TuneJobsError)
-    async def _told(_: Request, error: TuneJobsError) -> JSONResponse:
-        status = next((code for kind, code in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
-        problems = [item._asdict() for item in error.problems] if isinstance(error, WrongSpecError) else []
-        return problem(status, error.message, hint=error.hint, problems=problems)
 
-    @app.exception_handler(RefusedError)
-    async def _refused(_: Request, error: RefusedError) -> JSONResponse:
-        return error.answer()
+async def _told(_: Request, error: TuneJobsError) -> JSONResponse:
+    status = next((code for kind, code in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
+    if status == HTTPStatus.SERVICE_UNAVAILABLE and is_full(error):
+        return full_disk_problem(error.message)
+    problems = [item._asdict() for item in error.problems] if isinstance(error, WrongSpecError) else []
+    return problem(status, error.message, hint=error.hint, problems=problems)
 
-    @app.exception_handler(RequestValidationError)
-    async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
-        problems = [
-            {"path": ".".join(str(part) for part in item["loc"]), "text": item["msg"]} for item in error.errors()[:100]
-        ]
-        told = "; ".join(f"{item['path']}: {item['text']}" for item in problems[:3])
-        return problem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The request is wrong: {told}", problems=problems)
 
-    @app.exception_handler(HTTPException)
-    async def _http(_: Request, error: HTTPException) -> JSONResponse:
-        answer = problem(error.status_code, str(error.detail))
-        answer.headers.update(error.headers or {})
-        return answer
+async def _refused(_: Request, error: RefusedError) -> JSONResponse:
+    return error.answer()
 
-    @app.exception_handler(SQLAlchemyError)
-    async def _database(_: Request, error: SQLAlchemyError) -> JSONResponse:
-        _log.error("The database can't be used: %s", error)
-        answer = problem(HTTPStatus.SERVICE_UNAVAILABLE, "The service's database can't be used just now. Try again.")
-        answer.headers["Retry-After"] = "5"
-        return answer
 
-    @app.exception_handler(Exception)
-    async def _unexpected(_: Request, error: Exception) -> JSONResponse:
-        _log.error("Unexpected %s", type(error).__name__, exc_info=error)
-        detail = f"Unexpected {type(error).__name__}; the service's log has the traceback."
-        return problem(HTTPStatus.INTERNAL_SERVER_ERROR, detail)
+async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+    problems = [
+        {"path": ".".join(str(part) for part in item["loc"]), "text": item["msg"]} for item in error.errors()[:100]
+    ]
+    told = "; ".join(f"{item['path']}: {item['text']}" for item in problems[:3])
+    return problem(HTTPStatus.UNPROCESSABLE_ENTITY, f"The request is wrong: {told}.", problems=problems)
+
+
+async def _http(request: Request, error: HTTPException) -> JSONResponse:
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        return _wrong_method(request)
+    detail, hint = _FRAMEWORKS.get(error.detail, (str(error.detail), ""))
+    answer = problem(error.status_code, detail, hint=hint)
+    answer.headers.update(error.headers or {})
+    return answer
+
+
+async def _database(_: Request, error: SQLAlchemyError) -> JSONResponse:
+    _log.error("The database can't be used: %s", error)
+    return database_problem(error)
+
+
+async def _system(request: Request, error: OSError) -> JSONResponse:
+    if is_full(error):
+        return full_disk_problem("There is no space left on the service's disk.")
+    return await _unexpected(request, error)
+
+
+async def _unexpected(_: Request, error: Exception) -> JSONResponse:
+    _log.error("Unexpected %s", type(error).__name__, exc_info=error)
+    detail = f"Unexpected {type(error).__name__}; the service's log has the traceback."
+    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, detail)
+
+
+def _wrong_method(request: Request) -> JSONResponse:
+    # Starlette names the methods of the first of several routes with this path.
+    routes = iter_route_contexts(request.app.routes)
+    matching = [route for route in routes if route.path and compile_path(route.path)[0].match(request.scope["path"])]
+    allowed = ", ".join(sorted({method for route in matching for method in route.methods or ()}))
+    answer = problem(
+        HTTPStatus.METHOD_NOT_ALLOWED, f"This path takes no {request.method[:20]}.", hint=f"It takes {allowed}."
+    )
+    answer.headers["Allow"] = allowed
+    return answer

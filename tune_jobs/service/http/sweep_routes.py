@@ -21,6 +21,7 @@ from tune_jobs.service.http.models import (
 from tune_jobs.service.http.pages import page_of
 from tune_jobs.service.http.problems import NotNowError, TooManyError
 from tune_jobs.service.labels import NOTHING
+from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
 from tune_jobs.service.summaries import SweepSummary, jobs_by_sweep, summary, trial_row, wanted_fields
 from tune_jobs.sweeps.plain import to_json
@@ -39,7 +40,14 @@ def plan(new: NewSweep, service: TheService, _: ASubmitter) -> Planned:
     return Planned(spec=spec.model_dump(mode="json"), plan=to_json(made.to_json()))
 
 
-@router.post("/sweeps", status_code=201, responses={200: {"description": "The key was used for this before."}})
+@router.post(
+    "/sweeps",
+    status_code=201,
+    responses={
+        200: {"model": Submitted, "description": "The key was used for this before."},
+        **problems({429: "You have as many sweeps that wait or run as you may, or too many wrong tokens were shown."}),
+    },
+)
 def submit(
     new: NewSweep,
     service: TheService,
@@ -47,7 +55,10 @@ def submit(
     *,
     request: Request,
     response: Response,
-    idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
+    idempotency_key: Annotated[
+        str | None,
+        Header(min_length=1, max_length=200, description="One for each sweep; a repeated request has the same."),
+    ] = None,
 ) -> Submitted:
     """Write a sweep, and let it wait for its turn."""
     _check_room(service, caller.name)
@@ -87,11 +98,13 @@ _SORTS: dict[str, Callable[[SweepSummary], Any]] = {
 def sweeps(
     service: TheService,
     *,
-    state: Annotated[str | None, Query(max_length=100)] = None,
-    owner: Annotated[str | None, Query(max_length=100)] = None,
-    tag: Annotated[str | None, Query(max_length=50)] = None,
+    state: Annotated[str | None, Query(max_length=100, description="Only those in this state.")] = None,
+    owner: Annotated[str | None, Query(max_length=100, description="Only this person's.")] = None,
+    tag: Annotated[str | None, Query(max_length=50, description="Only those with this tag.")] = None,
     search: Annotated[str | None, Query(max_length=100, description="A part of the name, the env or the note.")] = None,
-    sort: Literal["name", "created_at", "state", "num_env_steps", "best"] = "created_at",
+    sort: Annotated[
+        Literal["name", "created_at", "state", "num_env_steps", "best"], Query(description="What they are sorted by.")
+    ] = "created_at",
     order: Order = "desc",
     limit: Limit = 100,
     cursor: Cursor = None,
@@ -143,7 +156,9 @@ def change(name: str, to: Change, service: TheService, _: AChanger) -> SweepSumm
     return summary_of(service, name)
 
 
-@router.delete("/sweeps/{name}", status_code=204)
+@router.delete(
+    "/sweeps/{name}", status_code=204, responses=problems({409: "The sweep waits or runs, or has not finished."})
+)
 def delete(
     name: str,
     service: TheService,
@@ -169,7 +184,7 @@ def trials(
     name: str,
     service: TheService,
     *,
-    status: Annotated[str | None, Query(max_length=100)] = None,
+    status: Annotated[str | None, Query(max_length=100, description="Only those in this status.")] = None,
     sort: Annotated[str, Query(max_length=200, description="score, a column, or a searched hyperparameter.")] = "score",
     order: Order = "desc",
     fields: Annotated[
