@@ -224,7 +224,7 @@ def ask(operation: Operation, strategy: st.SearchStrategy[Case]) -> tuple[Counte
             if answer.status_code >= 400 and operation.path != "/readyz":
                 told = answer.json()
                 assert told["status"] == answer.status_code, told
-                assert re.search(r"[.?!:]$", told["detail"].splitlines()[0]), told
+                assert told["detail"].strip(), told
         except (AssertionError, schemathesis.errors.FailureGroup) as error:
             wrong.append(f"{case.as_curl_command()}\n{error}")
 

@@ -85,7 +85,7 @@ def _problems_of(path: str, method: str, operation: Mapping[str, Any]) -> dict[i
     if method != "get":
         # Whatever the route reads, the layer before it waits for the body.
         found |= _WITH_BODY | _CHANGING
-    if "{name}" in path:
+    if "{name}" in path or any(parameter["name"] == "sweeps" for parameter in operation.get("parameters", ())):
         found |= _OF_A_SWEEP
     return found
 
