@@ -138,9 +138,9 @@ def test_the_best_policy_is_watched_from_the_sweep(page: Page) -> None:
 def test_checkpoints_and_the_result_lead_there(page: Page) -> None:
     page.open(f"#/sweeps/drawn?trial={SHORT}")
     page.says(".panel .checkpoints", "Watch iteration 10 play")
-    page.button("Watch iteration 10 play", ".panel").click()
-    page.says(".player h2", f"{SHORT}, iteration 10")
-    assert page.address() == f"#/sweeps/drawn/play?trial={SHORT}&iteration=10"
+    page.button("Watch iteration 5 play", ".panel").click()
+    page.says(".player h2", f"{SHORT}, iteration 5")
+    assert page.address() == f"#/sweeps/drawn/play?trial={SHORT}&iteration=5"
     page.browser.back()
     page.says(".finished", "The policy to deploy")
     page.button("Watch it play", ".finished").click()
@@ -216,9 +216,17 @@ def test_what_cannot_be_drawn_is_shown_as_lines(page: Page) -> None:
 def test_actions_that_are_vectors_have_bars_within_their_bounds(page: Page) -> None:
     page.open("#/sweeps/torque/play?speed=2")
     page.until(lambda: num_steps(page) > 3)
+    page.button("Pause").click()
+    page.says(".player .state", "paused")
     page.says(".player .scores", "component 0")
-    assert re.fullmatch(r"-?[\d.]+, . [\d.]+", page.text(".player .scores .value"))
-    assert -2 <= float(fact(page, "Action")) <= 2
+    action = float(fact(page, "Action"))
+    told = present(re.fullmatch(r"(-?[\d.e-]+), . ([\d.]+)", page.text(".player .scores .value")))
+    assert float(told[1]) == pytest.approx(action, rel=0.01)
+    assert float(told[2]) > 0
+    # Torques are of -2 to 2, and zero is in the middle.
+    left, width = page.run("const { left, width } = document.querySelector('.scores i').style; return [left, width]")
+    assert float(width.rstrip("%")) == pytest.approx(25 * abs(action), abs=0.3)
+    assert float(left.rstrip("%")) == pytest.approx(50 + 25 * min(0, action), abs=0.3)
 
 
 def test_it_is_held_still_and_goes_on(page: Page) -> None:
@@ -240,6 +248,40 @@ def test_it_is_held_still_and_goes_on(page: Page) -> None:
     # The line has each step once.
     page.button("Play again").click()
     page.until(lambda: 0 < num_steps(page) < 400)
+
+
+PLAYED = "return performance.getEntriesByType('resource').filter(({ name }) => name.includes('/play?'))"
+"""The episodes that the page has asked for."""
+
+
+def test_a_place_that_becomes_free_is_taken(page: Page, live: Live) -> None:
+    limits = live.service.config.limits
+    object.__setattr__(limits, "players", 0)
+    try:
+        page.open("#/sweeps/drawn/play?speed=10")
+        page.wait(f"{PLAYED}.length > 0")
+    finally:
+        object.__setattr__(limits, "players", 4)
+    assert "500 env steps" in ending(page)
+    assert page.text(".player [role=alert]") == ""
+
+
+def test_who_clicks_through_seeds_sees_the_last(page: Page, live: Live) -> None:
+    limits = live.service.config.limits
+    # No more than these two have room: those that were left have to make way first.
+    object.__setattr__(limits, "players", 2)
+    try:
+        page.open("#/sweeps/drawn/play?with=random&speed=2")
+        page.until(lambda: num_steps(page) > 5)
+        next_seed = page.button("Next seed")
+        page.run("for (let number = 0; number < 3; number += 1) arguments[0].click()", next_seed)
+        assert "seed=3" in page.address()
+        page.until(lambda: num_steps(page, 2) > 5)
+        assert page.text(".player [role=alert]") == ""
+        # The first two, and the last two.
+        assert len(page.run(PLAYED)) <= 4
+    finally:
+        object.__setattr__(limits, "players", 4)
 
 
 HIDE = """

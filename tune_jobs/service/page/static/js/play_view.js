@@ -1,7 +1,7 @@
 // Watch a policy play, and another one beside it. The address says which ones, the seed and the speed.
 import { ask, ofSweep } from "./api.js";
 import { refusal } from "./dialogs.js";
-import { el, setText, speak } from "./dom.js";
+import { el, setText } from "./dom.js";
 import { Player } from "./player.js";
 import { policiesOf, policyOf, settled, textOf, usual } from "./play_policies.js";
 import { PolicyPicker } from "./policy_picker.js";
@@ -11,6 +11,8 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 10];
 const MOST_SEED = 2 ** 32 - 1;
 // How long one that is held still keeps its place among those that the service plays at once.
 const HELD_MS = 30_000;
+// Who clicks through seeds or policies starts a process for the last one alone.
+const START_MS = 200;
 const REDUCED = matchMedia("(prefers-reduced-motion: reduce)");
 
 function seenOf(params) {
@@ -45,6 +47,7 @@ export function openPlay(main, route) {
   let isRunning = false;
   let isClosed = false;
   let holding = 0;
+  let starting = 0;
   const players = [];
 
   const what = el("p", { class: "quiet" }, el("a", { href: sweepAddress(name) }, name));
@@ -147,25 +150,27 @@ export function openPlay(main, route) {
 
   function changed() {
     if (isClosed) return;
-    if (isRunning && players.length && players.every((player) => player.isOver || player.state === "failed")) {
-      isRunning = false;
-      speak(players.map((player) => player.ending.textContent).join(" "));
-    }
+    if (players.length && players.every((player) => player.isOver || player.state === "failed")) isRunning = false;
     showState();
   }
 
   // From the beginning; what moves by itself waits for those who asked their system for less of it.
   function restart(isWanted) {
-    clearTimeout(holding);
+    clearTimers();
     const wanted = policies();
     while (players.length > wanted.length) players.pop().close();
     while (players.length < wanted.length)
       players.push(new Player(stages, { sweep: name, onChange: changed, onRefused: refused }));
     stages.classList.toggle("two", players.length > 1);
-    isRunning = false;
     players.forEach((player, index) => player.load({ policy: wanted[index], seed: seen.seed, speed: seen.speed }));
-    if (isWanted || !REDUCED.matches) play();
-    else showState();
+    isRunning = isWanted || !REDUCED.matches;
+    if (isRunning) starting = setTimeout(play, START_MS);
+    showState();
+  }
+
+  function clearTimers() {
+    clearTimeout(holding);
+    clearTimeout(starting);
   }
 
   function press() {
@@ -174,7 +179,7 @@ export function openPlay(main, route) {
   }
 
   function play() {
-    clearTimeout(holding);
+    clearTimers();
     isRunning = true;
     for (const player of players) player.resume();
     const waiting = players.filter((player) => !player.isOver && !player.isStreaming);
@@ -184,6 +189,7 @@ export function openPlay(main, route) {
   }
 
   function pause() {
+    clearTimers();
     isRunning = false;
     for (const player of players) player.pause();
     holding = setTimeout(() => players.forEach((player) => player.halt()), HELD_MS);
@@ -243,7 +249,7 @@ export function openPlay(main, route) {
     },
     close() {
       isClosed = true;
-      clearTimeout(holding);
+      clearTimers();
       document.removeEventListener("visibilitychange", looked);
       removeEventListener("pagehide", halt);
       removeEventListener("pageshow", shown);

@@ -13,6 +13,8 @@ import { actionText, Scores } from "./play_scores.js";
 const LINE_MS = 100;
 // How far behind its time a picture may be before the time is let go.
 const MOST_BEHIND = 5;
+const MOST_TRIES = 5;
+const TRY_AGAIN_MS = 500;
 const STATES = {
   idle: ["not begun", ""],
   starting: ["starting", "wait"],
@@ -114,7 +116,7 @@ export class Player {
     const query = { ...queryOf(this.policy), seed: this.seed, speed: this.speed, start };
     try {
       let hasEnded = false;
-      for await (const [kind, data] of eventsOf(ofSweep(this.sweep, "/play"), { query, signal: stream.signal })) {
+      for await (const [kind, data] of this.events(query, stream.signal)) {
         if (!isOurs()) return;
         if (kind === "info") {
           this.begin(data);
@@ -143,6 +145,19 @@ export class Player {
       if (isOurs()) {
         this.stream = null;
         this.onChange();
+      }
+    }
+  }
+
+  // Those that were closed a moment ago may still count among the episodes that are played at once.
+  async *events(query, signal) {
+    for (let left = MOST_TRIES; ; left -= 1) {
+      try {
+        yield* eventsOf(ofSweep(this.sweep, "/play"), { query, signal });
+        return;
+      } catch (error) {
+        if (error.status !== 429 || left <= 1) throw error;
+        await new Promise((resolve) => setTimeout(resolve, TRY_AGAIN_MS));
       }
     }
   }
