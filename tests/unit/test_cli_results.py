@@ -23,7 +23,8 @@ COMMANDS: list[tuple[str, Call]] = [
         "compare mine/t0003 other --objective area --html page.html --storage s",
         ("compare", (["mine/t0003", "other"],), {**COMPARED, "objective": "area", "html": "page.html", "storage": "s"}),
     ),
-    ("export mine", ("export", (["mine"], "csv"), EXPORTED)),
+    ("export mine", ("export", (["mine"], None), EXPORTED)),
+    ("export mine --format sweep", ("export", (["mine"], "sweep"), EXPORTED)),
     (
         "export mine --format latex --top 4 --out table.tex --storage s",
         ("export", (["mine"], "latex"), {"output": "table.tex", "top": 4, "storage": "s"}),

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 
 # Not imported from where they are declared, as help would then wait for NumPy; a test compares them.
 OBJECTIVES = ("final", "area", "best", "steps_to_threshold")
-FORMATS = ("csv", "parquet", "latex", "optuna", "pdf", "svg", "png")
+FORMATS = ("csv", "parquet", "latex", "optuna", "pdf", "svg", "png", "sweep")
 
 
 @click.command()
 @sweeps_argument
-@click.option("--format", "kind", type=click.Choice(FORMATS), default="csv", show_default=True, help="What to write.")
+@click.option(
+    "--format", "kind", type=click.Choice(FORMATS), help="What to write.  [default: as PATH's suffix says, else csv]"
+)
 @click.option(
     "--out", "output", metavar="PATH", help="Folder (csv, parquet) or file.  [default: SWEEP's name, in this folder]"
 )
@@ -37,13 +39,19 @@ FORMATS = ("csv", "parquet", "latex", "optuna", "pdf", "svg", "png")
 @storage_option
 @json_option
 def export(
-    *, sweeps: tuple[str, ...], kind: Format, output: str | None, top: int | None, storage: str | None, as_json: bool
+    *,
+    sweeps: tuple[str, ...],
+    kind: Format | None,
+    output: str | None,
+    top: int | None,
+    storage: str | None,
+    as_json: bool,
 ) -> None:
-    """Write a sweep as tables, as a LaTeX table, as an Optuna study, or as a figure for a paper.
+    """Write a sweep as tables, a LaTeX table, an Optuna study, a figure for a paper, or one file to send to somebody.
 
     csv and parquet are folders of tables: trials, iterations, evaluations, settings. latex is a table of the leading
-    settings. optuna is a SQLite file. pdf, svg and png are learning curves with bands over training seeds, also of
-    several sweeps of one environment.
+    settings. sweep is one file (.tunejobs), which the page of any service shows. optuna is a SQLite file. pdf, svg and
+    png are learning curves with bands over training seeds, also of several sweeps of one environment.
     """
     from tune_jobs.cli import output as cli_output
     from tune_jobs.sweeps import verbs

@@ -82,6 +82,18 @@ class Derived:
         found: SideBySide = self._get_of(names, "comparison", side_by_side.side_by_side)
         return found
 
+    def sweep_file(self, name: str) -> bytes:
+        """Return a sweep as one file, as of a while ago if it runs.
+
+        Raises:
+            NotFoundError: There is no such sweep, or it is damaged.
+            SpecError: There is more of it than a reader takes.
+        """
+        from tune_jobs.sweeps.sweep_file import sweep_file
+
+        content: bytes = self._get(name, "file", sweep_file)
+        return content
+
     def _get(self, name: str, what: str, make: Callable[[Sweep], Any]) -> Any:
         return self._get_of((name,), what, lambda sweeps: make(*sweeps))
 

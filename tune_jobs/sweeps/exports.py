@@ -1,4 +1,4 @@
-"""A sweep in other forms: data frames, CSV and Parquet files, a LaTeX table, an Optuna study, a figure for a paper."""
+"""A sweep in other forms: tables, a LaTeX table, an Optuna study, a figure for a paper, one file to send on."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from analysis.exports.frames import ROWS, Rows, SweepData
-from analysis.records import BestRecord
 from policies.arguments import Inches, PositiveInt, checked
-from policies.errors import CannotRunError, NotFoundError, SpecError
+from policies.errors import CannotRunError, SpecError
+from tune_jobs.sweeps.gathered import spec_of, sweep_data
 from tune_jobs.sweeps.storage import expanded
 
 if TYPE_CHECKING:
@@ -18,14 +18,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from analysis.exports.paper import Returns
-    from tune_jobs.spec.sweep_spec import SweepSpec
     from tune_jobs.store.contract import Sweep
 
-Format = Literal["csv", "parquet", "latex", "optuna", "pdf", "svg", "png"]
-"""What `export` writes: a folder of tables, a LaTeX file, a SQLite file, or a figure."""
+Format = Literal["csv", "parquet", "latex", "optuna", "pdf", "svg", "png", "sweep"]
+"""What `export` writes: a folder of tables, a LaTeX file, a SQLite file, a figure, or one file of the whole sweep."""
 FORMATS: tuple[Format, ...] = get_args(Format)
 FIGURES = ("pdf", "svg", "png")
-_SUFFIXES = {"latex": ".tex", "optuna": ".db", "pdf": ".pdf", "svg": ".svg", "png": ".png"}
+_SUFFIXES: dict[Format, str] = {
+    "latex": ".tex", "optuna": ".db", "pdf": ".pdf", "svg": ".svg", "png": ".png", "sweep": ".tunejobs",
+}  # fmt: skip
+_FORMATS_BY_SUFFIX = {suffix: kind for kind, suffix in _SUFFIXES.items()}
 
 
 @checked
@@ -70,7 +72,7 @@ def study(sweep: str | Path, *, storage: str | Path | None = None) -> optuna.Stu
     from tune_jobs.sweeps.conclude import find_sweep
 
     store = find_sweep(sweep, storage)
-    return make_study(_spec_of(store), sweep_data(store), store.name)
+    return make_study(spec_of(store), sweep_data(store), store.name)
 
 
 @checked
@@ -107,7 +109,7 @@ def figure(
 @checked
 def export(
     sweeps: str | Path | Sequence[str | Path],
-    format: Literal["csv", "parquet", "latex", "optuna", "pdf", "svg", "png"],  # noqa: A002
+    format: Literal["csv", "parquet", "latex", "optuna", "pdf", "svg", "png", "sweep"] | None = None,  # noqa: A002
     *,
     output: str | Path | None = None,
     top: PositiveInt | None = None,
@@ -119,9 +121,10 @@ def export(
         sweeps: One sweep; for a figure also several.
         format: `csv` and `parquet` write a folder with a table each of trials, iterations, evaluations and settings;
             `latex` a table of the leading settings (booktabs); `optuna` a study in a SQLite file; `pdf`, `svg` and
-            `png` the learning curves of the leading settings.
+            `png` the learning curves of the leading settings; `sweep` one file that the service's page shows whoever
+            opens it there. None: what the suffix of `output` says, such as `.tunejobs` or `.pdf`; else `csv`.
         output: The folder (csv, parquet) or file to write; None: `NAME-csv`, `NAME-parquet`, `NAME.tex`, `NAME.db`,
-            `NAME.pdf`, ... in the current folder.
+            `NAME.tunejobs`, `NAME.pdf`, ... in the current folder.
         top: How many settings the LaTeX table (10) or the figure (3 of each sweep) shows.
         storage: Folder for sweeps.
 
@@ -136,55 +139,37 @@ def export(
     from tune_jobs.sweeps.conclude import find_sweep
 
     names = [sweeps] if isinstance(sweeps, str | Path) else list(sweeps)
-    if not names or (len(names) > 1 and format not in FIGURES):
+    kind = format or _format_of(output)
+    if not names or (len(names) > 1 and kind not in FIGURES):
         raise SpecError(
-            f"{len(names)} sweeps were given; {format} is of one.",
+            f"{len(names)} sweeps were given; {kind} is of one.",
             f"Export them one by one; several go into one figure ({', '.join(FIGURES)}).",
         )
     store = find_sweep(names[0], storage)
-    suffix = _SUFFIXES.get(format, f"-{format}")
+    suffix = _SUFFIXES.get(kind, f"-{kind}")
     path = Path(f"{store.name}{suffix}") if output is None else expanded(output)
-    if format in _SUFFIXES and path.suffix.lower() != suffix:
+    if kind in _SUFFIXES and path.suffix.lower() != suffix:
         path = path.with_name(f"{path.name}{suffix}")
-    if format in FIGURES:
+    if kind in FIGURES:
         from analysis.exports.paper import COLUMN_WIDTH, save_figure
 
         drawn = _figure(names, storage, top=top or 3, returns="evaluation", size=COLUMN_WIDTH)
         return {"figure": save_figure(drawn, path)}
-    if format == "optuna":
+    if kind == "optuna":
         from tune_jobs.search.study import make_study
 
-        make_study(_spec_of(store), sweep_data(store), store.name, path)
+        make_study(spec_of(store), sweep_data(store), store.name, path)
         return {"study": path}
-    if format == "latex":
+    if kind == "latex":
         return {"table": _write_latex(store, path, top)}
-    return _write_tables(sweep_data(store), path, format)
+    if kind == "sweep":
+        return {"sweep": _write_whole(store, path)}
+    return _write_tables(sweep_data(store), path, kind)
 
 
-def sweep_data(store: Sweep) -> SweepData:
-    """Return what the tables and figures of a sweep are made of.
-
-    Raises:
-        CheckpointError: The record of the sweep or of a trial is damaged.
-    """
-    from analysis.report_data import goal_of
-    from tune_jobs.store.candidates import read_results, read_trials
-
-    best: BestRecord | None = None
-    try:
-        best = store.read_best()
-    except NotFoundError:
-        # No winner was chosen yet, or it can't be read: then the env's own threshold counts.
-        best = None
-    spec = _spec_of(store)
-    return SweepData(
-        trials=read_trials(store),
-        results=read_results(store),
-        objective=spec.objective.type,
-        num_env_steps=spec.stop.num_env_steps,
-        threshold=goal_of(store.read_record(), best),
-        has_settings=spec.scheduler.type != "pbt",
-    )
+def _format_of(output: str | Path | None) -> Format:
+    suffix = "" if output is None else Path(output).suffix.lower()
+    return _FORMATS_BY_SUFFIX.get(suffix, "csv")
 
 
 def trials_csv(store: Sweep) -> str:
@@ -197,12 +182,6 @@ def trials_csv(store: Sweep) -> str:
     from analysis.tables import csv_text
 
     return csv_text(make_frame(sweep_data(store), "trials"))
-
-
-def _spec_of(store: Sweep) -> SweepSpec:
-    from tune_jobs.spec.file import stored_spec
-
-    return stored_spec(store.read_record())
 
 
 def _figure(
@@ -219,7 +198,7 @@ def _figure(
     if not names:
         raise SpecError("No sweep was given to draw.", "Give one sweep, or several of one environment.")
     stores = [find_sweep(name, storage) for name in names]
-    envs = {store.name: _spec_of(store).env for store in stores}
+    envs = {store.name: spec_of(store).env for store in stores}
     first = stores[0].name
     for name, env in envs.items():
         if (env.id, env.args) != (envs[first].id, envs[first].args):
@@ -241,8 +220,16 @@ def _write_latex(store: Sweep, path: Path, top: int | None) -> Path:
             f"Sweep {store.name} is one of population based training, whose trials have no settings to list.",
             "Export it as csv or parquet.",
         )
-    text = latex_table(data, name=store.name, env_id=_spec_of(store).env.id, top=top or NUM_LISTED)
+    text = latex_table(data, name=store.name, env_id=spec_of(store).env.id, top=top or NUM_LISTED)
     write_atomic(path, text)
+    return path
+
+
+def _write_whole(store: Sweep, path: Path) -> Path:
+    from policies.files import write_atomic
+    from tune_jobs.sweeps.sweep_file import sweep_file
+
+    write_atomic(path, sweep_file(store))
     return path
 
 

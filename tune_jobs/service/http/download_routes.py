@@ -127,6 +127,13 @@ def trials_csv(name: str, service: TheService) -> Response:
     return Response(service.derived.trials_csv(name), media_type="text/csv; charset=utf-8", headers=headers)
 
 
+@router.get("/file", responses={200: {"content": {"application/gzip": {}}}}, response_class=Response)
+def sweep_file(name: str, service: TheService) -> Response:
+    """Download the sweep as one file, which the page of any service shows; of a running sweep as of a while ago."""
+    headers = {"Content-Disposition": f'attachment; filename="{name}.tunejobs"'}
+    return Response(service.derived.sweep_file(name), media_type="application/gzip", headers=headers)
+
+
 @router.get("/best")
 def best(name: str, service: TheService) -> dict[str, Any]:
     """Return the policy to deploy and the setting to train with, as `tune-jobs best --json` prints them."""

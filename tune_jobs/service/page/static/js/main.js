@@ -2,6 +2,8 @@
 import { ask } from "./api.js";
 import { openCompare } from "./compare_view.js";
 import { el, setText, speak } from "./dom.js";
+import { takeFiles } from "./file_drop.js";
+import { openFile } from "./file_view.js";
 import { counted } from "./format.js";
 import { read } from "./route.js";
 import { openLogin } from "./login.js";
@@ -11,19 +13,31 @@ import { openSweep } from "./sweep_view.js";
 import { openSweeps } from "./sweeps_view.js";
 import { me } from "./who.js";
 
-const VIEWS = { sweeps: openSweeps, sweep: openSweep, play: openPlay, new: openNew, compare: openCompare };
+const VIEWS = {
+  sweeps: openSweeps,
+  sweep: openSweep,
+  play: openPlay,
+  new: openNew,
+  compare: openCompare,
+  file: openFile,
+};
 const main = document.getElementById("main");
 let open = null;
 let isSigningIn = false;
 
 function heading(route) {
   const { name, view } = route;
-  return { sweeps: "Sweeps", new: "New sweep", compare: "Compare", sweep: name, play: `Watch ${name}` }[view];
+  const named = { sweep: name, play: `Watch ${name}` };
+  return { sweeps: "Sweeps", new: "New sweep", compare: "Compare", file: "Sweep file", ...named }[view];
 }
 
 function show() {
   const route = read();
-  if (isSigningIn) return;
+  // A file is the reader's own: nobody is asked for it.
+  if (isSigningIn && route.view !== "file") {
+    signIn();
+    return;
+  }
   const isSame = open && open.route.view === route.view && open.route.name === route.name;
   if (isSame && open.view.follow) {
     open.view.follow(route.params);
@@ -34,7 +48,7 @@ function show() {
   main.replaceChildren();
   document.title = `${heading(route)} · tune-jobs`;
   for (const link of document.querySelectorAll(".bar nav a")) {
-    const isHere = link.dataset.view === (route.view === "new" ? "new" : "sweeps");
+    const isHere = link.dataset.view === (["new", "file"].includes(route.view) ? route.view : "sweeps");
     if (isHere) link.setAttribute("aria-current", route.view === link.dataset.view ? "page" : "true");
     else link.removeAttribute("aria-current");
   }
@@ -55,11 +69,16 @@ function tellWho(found) {
 }
 
 async function begin() {
+  if (open === null && read().view === "file") show();
   try {
     Object.assign(me, await ask("me"));
     tellWho(me);
   } catch (error) {
     if (error.status === 401) return;
+    setTimeout(begin, 3000);
+    if (open?.route.view === "file") return;
+    open?.view.close();
+    open = null;
     main.replaceChildren(
       el(
         "div",
@@ -68,24 +87,27 @@ async function begin() {
         el("p", { class: "quiet" }, error.hint ?? ""),
       ),
     );
-    setTimeout(begin, 3000);
     return;
   }
   show();
 }
 
-addEventListener("sign-in-needed", () => {
-  if (isSigningIn) return;
-  isSigningIn = true;
+function signIn() {
   open?.view.close();
   open = null;
-  document.body.classList.add("signing-in");
   openLogin(main, () => {
     isSigningIn = false;
     document.body.classList.remove("signing-in");
     main.replaceChildren();
     begin();
   });
+}
+
+addEventListener("sign-in-needed", () => {
+  if (isSigningIn) return;
+  isSigningIn = true;
+  document.body.classList.add("signing-in");
+  show();
 });
 addEventListener("hashchange", show);
 document.getElementById("log-out").addEventListener("click", async () => {
@@ -97,4 +119,5 @@ document.getElementById("skip").addEventListener("click", (event) => {
   event.preventDefault();
   main.focus();
 });
+takeFiles();
 begin();

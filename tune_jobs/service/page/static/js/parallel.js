@@ -111,7 +111,8 @@ export class Parallel {
   }
 
   endsOf(axis) {
-    const range = this.ranges[axis.name];
+    // A name may be one that all objects have.
+    const range = Object.hasOwn(this.ranges, axis.name) ? this.ranges[axis.name] : null;
     return (range && axis.ends(range)) || [0, 1];
   }
 
@@ -124,7 +125,7 @@ export class Parallel {
       const axis = this.axisOf(group.dataset.axis);
       const isDragged = this.drag?.name === axis.name;
       const ends = isDragged && this.drag.ends ? this.drag.ends : this.endsOf(axis);
-      showRange(group, axis, ends, isDragged || axis.name in this.ranges);
+      showRange(group, axis, ends, isDragged || Object.hasOwn(this.ranges, axis.name));
     }
   }
 
@@ -204,7 +205,7 @@ export class Parallel {
     if (!axis || event.button !== 0) return;
     const { top } = this.spot(event);
     const ends = this.endsOf(axis);
-    const isSet = axis.name in this.ranges;
+    const isSet = Object.hasOwn(this.ranges, axis.name);
     // The nearer end is moved; away from both, a new range begins.
     const near = isSet ? ends.findIndex((end) => Math.abs(topOf(end) - top) < 8) : -1;
     this.drag = { name: axis.name, start: near >= 0 ? ends[1 - near] : placeAt(top), from: top, ends: null };
@@ -257,7 +258,7 @@ export class Parallel {
       Home: -1,
       End: 1,
     };
-    if (event.key === "Escape" && axis.name in this.ranges) this.act.onRange(axis.name, null);
+    if (event.key === "Escape" && Object.hasOwn(this.ranges, axis.name)) this.act.onRange(axis.name, null);
     else if (event.key in moves) {
       const limits = index === 0 ? [0, ends[1]] : [ends[0], 1];
       ends[index] = Math.max(limits[0], Math.min(limits[1], ends[index] + moves[event.key]));

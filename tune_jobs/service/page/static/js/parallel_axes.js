@@ -112,8 +112,8 @@ function linearTicks(low, high) {
   const rough = (high - low) / NUM_TICKS;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough * 0.999);
-  const ticks = [];
-  for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-6; value += step)
-    ticks.push(Number(value.toPrecision(12)));
-  return ticks;
+  const first = Math.ceil(low / step);
+  // Counted before: a step that is too small beside its value would never arrive at the end.
+  const number = Math.min(3 * NUM_TICKS, Math.floor((high + step * 1e-6) / step) - first + 1) || 0;
+  return Array.from({ length: Math.max(0, number) }, (_, index) => Number(((first + index) * step).toPrecision(12)));
 }

@@ -85,7 +85,7 @@ export class Plot {
 
   // Show these ranges, unless the reader has zoomed in.
   setRange(range) {
-    this.range = range;
+    this.range = { x: drawable(range.x), y: drawable(range.y) };
     if (this.isZoomed) this.u.redraw(false, false);
     else this.apply();
   }
@@ -173,6 +173,16 @@ export class Plot {
     this.forgetTheme();
     this.u.destroy();
   }
+}
+
+// Ticks are looked for by adding: a range that is tiny beside its values, or beyond all numbers, would have no end of them.
+const MOST = 1e300;
+const LEAST_SHARE = 1e-9;
+
+function drawable(range) {
+  const [low, high] = range.map((value) => Math.max(-MOST, Math.min(MOST, value)));
+  const least = LEAST_SHARE * Math.max(Math.abs(low), Math.abs(high)) || Number.EPSILON;
+  return high - low > least ? [low, high] : [low - least, high + least];
 }
 
 // A range with some air, also around a single value.

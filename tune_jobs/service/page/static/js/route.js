@@ -6,6 +6,7 @@ export function read() {
   if (parts[0] === "compare") return { view: "compare", params };
   if (parts[0] === "new") return { view: "new", params };
   if (parts[0] === "sweeps" && parts[2] === "play") return { view: "play", name: parts[1], params };
+  if (parts[0] === "file") return { view: "file", params };
   if (parts[0] === "sweeps" && parts.length > 1) return { view: "sweep", name: parts[1], params };
   return { view: "sweeps", params };
 }

@@ -43,7 +43,7 @@ export class SweepHead {
         "div",
         { class: "title-row sweep-title" },
         el("div", {}, el("div", { class: "with-state" }, el("h1", {}, source.name), this.state), this.what, this.tags),
-        el("div", { class: "head-links" }, this.play, actions.node),
+        el("div", { class: "head-links" }, this.play, source.isFile ? null : saveLink(source), actions.node),
       ),
       alert.node,
       this.reason,
@@ -147,4 +147,9 @@ export class SweepHead {
       best ? [pointText(best.point), `at ${counted(best.num_env_steps, "env step")}`].filter(Boolean).join(" · ") : "",
     );
   }
+}
+
+function saveLink(source) {
+  const title = "Curves, trials and what mattered, to look at on any service's page";
+  return el("a", { class: "button", href: source.address("/file"), download: "", title }, "Save as a file");
 }
