@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import sqlite3
 from pathlib import Path
@@ -14,7 +15,7 @@ from alembic.script import ScriptDirectory
 from alembic.util.exc import CommandError
 from sqlalchemy import Engine, create_engine, event, inspect, text
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, OperationalError, SQLAlchemyError
 
 from policies.errors import CannotRunError
 from tune_jobs.service.logs import Redaction
@@ -71,6 +72,8 @@ def open_database(url: str) -> Engine:
         event.listen(engine, "begin", _begin_at_once)
     try:
         _migrate(engine, told)
+        if parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:"):
+            _hold_to_file(engine, Path(str(parsed.database)))
     except SQLAlchemyError as error:
         engine.dispose()
         raise CannotRunError(
@@ -97,6 +100,30 @@ def _set_pragmas(connection: Any, _record: Any) -> None:
         ("foreign_keys", "ON"),
     ):
         connection.execute(f"PRAGMA {name} = {value}")
+
+
+def _hold_to_file(engine: Engine, file: Path) -> None:
+    """Refuse an SQLite file that is another one by now, or none.
+
+    A connection goes on with a file that was deleted, and what is written there is lost with the process; a new one
+    would make an empty file, without tables.
+    """
+
+    def place() -> tuple[int, int]:
+        found = file.stat()
+        return found.st_dev, found.st_ino
+
+    known = place()
+
+    def check(*_: Any) -> None:
+        with contextlib.suppress(OSError):
+            if place() == known:
+                return
+        reason = f"the file {file} was deleted or replaced while it was in use; put it back, or restart the service"
+        raise OperationalError(None, None, sqlite3.OperationalError(reason))
+
+    event.listen(engine, "do_connect", check)
+    event.listen(engine, "checkout", check)
 
 
 def _begin_at_once(connection: Any) -> None:
