@@ -110,6 +110,8 @@ def test_the_queue_is_counted_by_state_and_verb_and_nobody_is_named(live: Live) 
         queue.begin(name, "drive", {}, owner=OWNER, num_cpus=1.5)
     queue.begin("c", "extend", {}, owner="bob", num_cpus=1.0)
     assert queue.claim(2.0) is not None
+    ended, _ = queue.begin("d", "retry", {}, owner="bob")
+    queue.end(ended.id, "stopped")
     found = scrape(live)
     assert {(s.labels["state"], s.labels["verb"]): s.value for s in found.of("jobs") if s.value} == {
         ("running", "drive"): 1, ("waiting", "drive"): 1, ("waiting", "extend"): 1,
@@ -217,6 +219,7 @@ def test_without_its_database_the_rest_is_told(live: Live, monkeypatch: pytest.M
     monkeypatch.setattr(live.service.queue, "load", away)
     found = scrape(live)
     assert found.value("database_up") == 0
+    assert "_created" not in found.text
     assert found.of("jobs") == []
     assert len(found.of("sweeps")) == 4
 

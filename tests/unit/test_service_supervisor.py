@@ -276,6 +276,7 @@ def test_what_is_kept_warm_ends_when_no_sweep_comes(place: Place) -> None:
     place.wait(lambda: service.spare() is not None, "no other one is kept")
     place.wait(lambda: (service.spare() or {}).get("warm"), "none became warm")
     assert (service.spare() or {})["memory_bytes"] > 10**6
+    assert service.spare_is_warm() is True
     service.close()
 
 

@@ -24,6 +24,8 @@ from tune_jobs.service.telling import Teller
 from tune_jobs.service.watching import Watching
 from tune_jobs.store.contract import Storage
 
+_MEMORY_FRESH_S = 60.0
+
 
 class StateCollector(Collector):
     """Looks when it is asked; of a sweep it takes what `Statuses` knows, and reads only what that would read.
@@ -50,6 +52,7 @@ class StateCollector(Collector):
         self._queue, self._storage, self._statuses = queue, storage, statuses
         self._supervisor, self._watching, self._teller = supervisor, watching, teller
         self._steps = EnvSteps()
+        self._memory = (float("-inf"), 0)
 
     def collect(self) -> Iterator[Metric]:
         """Return all of it; where the database is away, without what is in there."""
@@ -121,10 +124,18 @@ class StateCollector(Collector):
         yield _gauge(
             "tune_jobs_event_streams_limit", "How many clients may follow sweeps.", self._watching.max_watchers
         )
-        spare = self._supervisor.spare() or {"warm": False, "memory_bytes": None}
-        yield _gauge("tune_jobs_spare_warm", "Whether a process is kept warm for the next sweep.", spare["warm"])
-        memory = spare["memory_bytes"] or 0
+        is_warm = self._supervisor.spare_is_warm()
+        yield _gauge("tune_jobs_spare_warm", "Whether a process is kept warm for the next sweep.", is_warm or False)
+        memory = 0 if is_warm is None else self._spare_memory()
         yield _gauge("tune_jobs_spare_memory_bytes", "Memory of the process that is kept for the next sweep.", memory)
+
+    def _spare_memory(self) -> int:
+        """Return the bytes of the process that is kept; it takes tens of milliseconds, so that it may be a bit old."""
+        known_at, known = self._memory
+        if time.monotonic() - known_at >= _MEMORY_FRESH_S:
+            known = (self._supervisor.spare() or {}).get("memory_bytes") or 0
+            self._memory = time.monotonic(), known
+        return known
 
 
 @dataclass

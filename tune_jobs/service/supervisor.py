@@ -140,6 +140,11 @@ class Supervisor:
             return None
         return {"warm": spare.is_usable() and spare.is_warm(), "memory_bytes": memory_of_tree(spare.pid)}
 
+    def spare_is_warm(self) -> bool | None:
+        """Whether the process that is kept for the next sweep is warm; None: there is none."""
+        spare = self._spare
+        return None if spare is None else spare.is_usable() and spare.is_warm()
+
     def num_drivers(self) -> int:
         """Return how many processes drive sweeps now, as the locks of running jobs say."""
         return sum(self._files(job).is_run() for job in self._queue.jobs("running"))
