@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import httpx
+import httpx2
 import pytest
 
 from tune_jobs.service.config import Limits, ServiceConfig
@@ -33,8 +33,8 @@ class Live:
     def storage(self) -> Path:
         return self.service.config.storage
 
-    def get(self, path: str, **options: Any) -> httpx.Response:
-        return httpx.get(f"{self.url}/api/v1{path}", timeout=30, **options)
+    def get(self, path: str, **options: Any) -> httpx2.Response:
+        return httpx2.get(f"{self.url}/api/v1{path}", timeout=30, **options)
 
     def events(self, path: str, last_id: str | None = None) -> "EventReader":
         return EventReader(f"{self.url}/api/v1{path}", last_id)
@@ -101,11 +101,11 @@ class EventReader:
         self.error: Exception | None = None
         self.last_id = last_id
         self.has_begun, self.has_ended = threading.Event(), threading.Event()
-        self._client = httpx.Client(timeout=httpx.Timeout(30, read=60))
+        self._client = httpx2.Client(timeout=httpx2.Timeout(30, read=60))
         headers = {} if last_id is None else {"Last-Event-ID": last_id}
         self._request = self._client.build_request("GET", url, headers=headers)
         self._thread = threading.Thread(target=self._read, daemon=True)
-        self._answer: httpx.Response | None = None
+        self._answer: httpx2.Response | None = None
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -139,7 +139,7 @@ class EventReader:
                     if "data" in fields:
                         self.events.append(Event(fields["event"], json.loads(fields["data"]), self.last_id or ""))
                     fields = {}
-        except (httpx.HTTPError, OSError) as error:
+        except (httpx2.HTTPError, OSError) as error:
             self.error = error
         finally:
             self.has_begun.set()

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from fake_sweeps import RunCommand
 from service_access import bearer, place, problem, shared  # noqa: F401 (fixture)
@@ -74,14 +74,14 @@ def test_a_body_that_ends_half_way_makes_nothing(shared: Service) -> None:
     with listening(shared) as (_, port):
         for _ in range(20):
             say(port, post(port, "Content-Length: 100") + b'{"preset": "cartpole-ppo"}').close()
-        assert httpx.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
+        assert httpx2.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
     assert shared.queue.jobs() == []
 
 
 def test_bodies_that_stay_away_are_given_up_and_hold_nobody_back(shared: Service) -> None:
     with listening(shared, limits=Limits(body_s=1.0)) as (_, port):
         slow = [say(port, post(port, "Content-Length: 100") + b'{"preset"') for _ in range(100)]
-        assert httpx.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
+        assert httpx2.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
         for connection in slow:
             assert heard(connection).startswith(b"HTTP/1.1 408 ")
     assert shared.queue.jobs() == []
@@ -113,7 +113,7 @@ def test_heads_that_are_none(shared: Service, head: str) -> None:
     with listening(shared) as (_, port):
         request = head.replace("PORT", str(port)) + "\r\nConnection: close\r\n\r\n"
         assert heard(say(port, request.encode())).split()[1] == b"400"
-        assert httpx.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
+        assert httpx2.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
 
 
 # -- proxies
@@ -123,19 +123,19 @@ def test_a_server_believes_no_proxy_by_itself(shared: Service) -> None:
     headers = {"X-Forwarded-For": "198.51.100.7", "X-Forwarded-Proto": "https"}
     with listening(shared) as (service, port):
         url = f"http://127.0.0.1:{port}"
-        problem(httpx.get(url + ME, headers=headers), 401)
-        httpx.post(f"{url}/api/v1/login", json={"token": "x"}, headers=headers)
+        problem(httpx2.get(url + ME, headers=headers), 401)
+        httpx2.post(f"{url}/api/v1/login", json={"token": "x"}, headers=headers)
         assert service.gate.audit.page(limit=1)[0][0].client == "127.0.0.1"
         # Were the scheme believed, the own page would be another site's.
         secret = service.gate.tokens.make("ann", "viewer")[1]
-        assert httpx.get(url + ME, headers=headers | bearer(secret) | {"Origin": url}).status_code == 200
+        assert httpx2.get(url + ME, headers=headers | bearer(secret) | {"Origin": url}).status_code == 200
 
 
 def test_the_announced_proxy_is_believed(shared: Service) -> None:
     headers = {"X-Forwarded-For": "198.51.100.7", "X-Forwarded-Proto": "https", "Host": "tune.example.org"}
     with listening(shared, behind_proxy="loopback", public_names=("tune.example.org",)) as (service, port):
         secret = service.gate.tokens.make("ann", "viewer")[1]
-        answer = httpx.post(f"http://127.0.0.1:{port}/api/v1/login", json={"token": secret}, headers=headers)
+        answer = httpx2.post(f"http://127.0.0.1:{port}/api/v1/login", json={"token": secret}, headers=headers)
         assert answer.headers["set-cookie"].startswith("__Host-tune-jobs-443=")
         assert service.gate.audit.page(limit=1)[0][0].client == "198.51.100.7"
 
@@ -169,14 +169,14 @@ def test_a_service_with_a_certificate(shared: Service, certificates: Path) -> No
     with listening(shared, **files) as (service, port):
         trusting = ssl.create_default_context(cafile=str(files["tls_certificate"]))
         url = f"https://127.0.0.1:{port}"
-        with httpx.Client(verify=trusting, headers={"Origin": url}) as client:
+        with httpx2.Client(verify=trusting, headers={"Origin": url}) as client:
             secret = service.gate.tokens.make("vera", "viewer")[1]
             cookie = client.post(f"{url}/api/v1/login", json={"token": secret}).headers["set-cookie"]
             assert cookie.startswith(f"__Host-tune-jobs-{port}=")
             assert "Secure" in cookie
             assert client.get(url + ME).json()["name"] == "vera"
-        with pytest.raises(httpx.HTTPError):
-            httpx.get(f"http://127.0.0.1:{port}{ME}")
+        with pytest.raises(httpx2.HTTPError):
+            httpx2.get(f"http://127.0.0.1:{port}{ME}")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from fake_sweeps import run  # noqa: F401 (a fixture)
 from live_service import Live, live, serving  # noqa: F401 (a fixture)
@@ -24,7 +24,7 @@ from tune_jobs.sweeps import side_by_side as module
 
 
 def compared(live: Live, *names: str, status: int = 200, **options: Any) -> Any:
-    answer: httpx.Response = live.get("/comparisons", params={"sweeps": ",".join(names)}, **options)
+    answer: httpx2.Response = live.get("/comparisons", params={"sweeps": ",".join(names)}, **options)
     assert answer.status_code == status, answer.text
     return answer.json()
 

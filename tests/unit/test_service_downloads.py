@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from fake_sweeps import run  # noqa: F401 (a fixture)
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
@@ -64,11 +64,11 @@ def store_of(live: Live) -> SweepStore:
     return SweepStore(live.storage / "mine")
 
 
-def get(live: Live, path: str, **headers: str) -> httpx.Response:
+def get(live: Live, path: str, **headers: str) -> httpx2.Response:
     return live.get(f"/sweeps/mine{path}", headers=headers)
 
 
-def problem(answer: httpx.Response, status: int) -> str:
+def problem(answer: httpx2.Response, status: int) -> str:
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     return str(answer.json()["detail"])
@@ -206,7 +206,7 @@ def test_a_part_that_is_not_there_is_a_problem(site: Live) -> None:
 
 
 def test_a_download_that_was_cut_is_continued_if_the_file_is_the_same(live: Live, store: SweepStore) -> None:
-    with httpx.stream("GET", f"{live.url}/api/v1/sweeps/mine/films/after_mp4") as answer:
+    with httpx2.stream("GET", f"{live.url}/api/v1/sweeps/mine/films/after_mp4") as answer:
         begun = next(answer.iter_bytes(1_000))
         tag = answer.headers["etag"]
     rest = {"Range": f"bytes={len(begun)}-", "If-Range": tag}
@@ -236,7 +236,7 @@ def test_a_file_that_a_client_has_is_not_sent_again(site: Live) -> None:
 
 def test_heads_are_answered_as_downloads_are(site: Live) -> None:
     for path in ("report/index.html", "films/after_mp4", "policy/policy.json"):
-        answer = httpx.head(f"{site.url}/api/v1/sweeps/mine/{path}")
+        answer = httpx2.head(f"{site.url}/api/v1/sweeps/mine/{path}")
         assert (answer.status_code, answer.content) == (200, b"")
         assert int(answer.headers["content-length"]) > 0
 
@@ -251,7 +251,7 @@ def test_half_read_downloads_hold_nothing(live: Live, store: SweepStore) -> None
     before = num_descriptors()
     for what in ("films/after_mp4", "policy", "trials/t0000/checkpoints/6"):
         for _ in range(5):
-            with httpx.stream("GET", f"{live.url}/api/v1/sweeps/mine/{what}") as answer:
+            with httpx2.stream("GET", f"{live.url}/api/v1/sweeps/mine/{what}") as answer:
                 next(answer.iter_bytes(100))
     wait_until(lambda: num_descriptors() <= before)
     assert get(live, "/films/after_mp4", Range="bytes=-1").status_code == 206
@@ -260,7 +260,7 @@ def test_half_read_downloads_hold_nothing(live: Live, store: SweepStore) -> None
 # -- archives
 
 
-def unpacked(answer: httpx.Response, folder: Path) -> Path:
+def unpacked(answer: httpx2.Response, folder: Path) -> Path:
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "application/zip"
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from live_service import EventReader, Live, live, serving, wait_until  # noqa: F401 (a fixture)
 from sweep_folders import make_sweep_folder
@@ -208,7 +208,7 @@ def test_who_comes_back_gets_what_came_meanwhile(live: Live, store: SweepStore) 
 @pytest.mark.parametrize("last_id", ["", "x", "x-1", "-5", "{start}-0", "{start}-99999999999999999999", "{start}-²"])
 def test_an_id_that_means_nothing_gives_a_reset(live: Live, store: SweepStore, last_id: str) -> None:
     start = live.get("/sweeps/mine/curves").json()["last_event_id"].partition("-")[0]
-    query = httpx.QueryParams({"last_event_id": last_id.format(start=start)})
+    query = httpx2.QueryParams({"last_event_id": last_id.format(start=start)})
     with live.events(f"/sweeps/mine/events?{query}") as reader:
         reader.wait_for(lambda: reader.events)
         assert reader.events[0].kind == ("status" if not last_id else "reset")
@@ -352,7 +352,7 @@ def test_a_sweep_that_is_deleted_is_the_end(live: Live) -> None:
     make_sweep_folder(live.storage / "mine")
     with live.events("/sweeps/mine/events") as reader:
         reader.wait_for(lambda: reader.of("status"))
-        assert httpx.delete(f"{live.url}/api/v1/sweeps/mine").status_code == 204
+        assert httpx2.delete(f"{live.url}/api/v1/sweeps/mine").status_code == 204
         assert reader.has_ended.wait(10)
         assert reader.events[-1].kind == "deleted"
     answer = live.get("/sweeps/mine/events")
@@ -387,7 +387,7 @@ def test_the_list_of_sweeps_is_followed(live: Live) -> None:
         live.service.labels.change("a", tags=["x"])
         reader.wait_for(lambda: reader.of("sweeps")[-1].data["sweeps"][0]["tags"] == ["x"])
         assert [item["name"] for item in reader.of("sweeps")[-1].data["sweeps"]] == ["a"]
-        assert httpx.delete(f"{live.url}/api/v1/sweeps/a").status_code == 204
+        assert httpx2.delete(f"{live.url}/api/v1/sweeps/a").status_code == 204
         reader.wait_for(lambda: reader.of("deleted"))
         assert reader.of("deleted")[0].data == {"names": ["a"]}
     with live.events("/events", reader.last_id) as again:

@@ -202,7 +202,9 @@ def test_lists_have_pages(client: TestClient, service: Service) -> None:
         make_sweep_folder(service.config.storage / f"s{index}")
     names, cursor = [], None
     while True:
-        query = {"sort": "name", "order": "asc", "limit": 2} | ({} if cursor is None else {"cursor": cursor})
+        query: dict[str, Any] = {"sort": "name", "order": "asc", "limit": 2} | (
+            {} if cursor is None else {"cursor": cursor}
+        )
         page = client.get("/api/v1/sweeps", params=query).json()
         names.append([item["name"] for item in page["sweeps"]])
         cursor = page["next_cursor"]

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from fastapi.testclient import TestClient
 from live_service import Live, live, wait_until  # noqa: F401 (fixture)
@@ -85,7 +85,7 @@ def test_a_request_is_a_line_with_its_route_status_duration_and_caller(live: Liv
     secret = live.service.gate.tokens.make("ann", "viewer")[1]
     with logged("json") as handler:
         live.get("/sweeps/done/trials/t0001", headers=bearer(secret))
-        httpx.post(f"{live.url}/api/v1/sweeps/done/stop", headers=bearer(secret))
+        httpx2.post(f"{live.url}/api/v1/sweeps/done/stop", headers=bearer(secret))
         live.get("/nowhere")
         wait_until(lambda: len(handler.requests()) == 3)
     seen, refused, missing = handler.requests()
@@ -105,7 +105,7 @@ def test_a_request_is_a_line_with_its_route_status_duration_and_caller(live: Liv
 def test_the_id_of_a_request_is_taken_if_it_is_sane_else_made(live: Live, given: str | None) -> None:
     headers = {} if given is None else {b"X-Request-ID": given.encode("latin-1")}
     with logged("json") as handler:
-        answer = httpx.get(f"{live.url}/healthz", headers=headers)
+        answer = httpx2.get(f"{live.url}/healthz", headers=headers)
         wait_until(handler.requests)
     told = answer.headers["x-request-id"]
     if given in ("7f2c", "a" * 128, "01J9Z:edge/7+x="):
@@ -116,7 +116,7 @@ def test_the_id_of_a_request_is_taken_if_it_is_sane_else_made(live: Live, given:
 
 
 def test_an_id_that_comes_twice_is_none(live: Live) -> None:
-    answer = httpx.get(f"{live.url}/healthz", headers=[("X-Request-ID", "a"), ("X-Request-ID", "b")])
+    answer = httpx2.get(f"{live.url}/healthz", headers=[("X-Request-ID", "a"), ("X-Request-ID", "b")])
     assert answer.headers["x-request-id"] not in ("a", "b", "a, b")
 
 
@@ -274,11 +274,11 @@ def test_a_server_logs_in_its_format_from_its_begin_to_its_end(tmp_path: Path, l
     try:
         secret = make_token(server.storage, "ann", "admin")
         headers = bearer(secret) | {"X-Request-ID": "7f2c"}
-        assert httpx.get(f"{server.url}/api/v1/me", headers=headers).headers["x-request-id"] == "7f2c"
-        assert httpx.get(f"{server.url}/api/v1/me", headers=bearer(secret[:-1] + "!")).status_code == 401
-        assert httpx.post(f"{server.url}/api/v1/login", json={"token": secret}).status_code == 200
+        assert httpx2.get(f"{server.url}/api/v1/me", headers=headers).headers["x-request-id"] == "7f2c"
+        assert httpx2.get(f"{server.url}/api/v1/me", headers=bearer(secret[:-1] + "!")).status_code == 401
+        assert httpx2.post(f"{server.url}/api/v1/login", json={"token": secret}).status_code == 200
         spec = FAKE | {"stop": {"num_env_steps": 512}, "engine": "nothing"}
-        httpx.post(f"{server.url}/api/v1/sweeps", json={"spec": spec}, headers=headers)
+        httpx2.post(f"{server.url}/api/v1/sweeps", json={"spec": spec}, headers=headers)
     finally:
         said = server.end()
     for hidden in (secret, secret[-20:-1], "XyZzY-hush", "webhook-hush"):

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
+import httpx2
 import pytest
 from fastapi.testclient import TestClient
 from live_service import Live, live, serving, wait_until  # noqa: F401 (fixture)
@@ -53,7 +53,7 @@ class Scrape:
 
 
 def scrape(at: Live) -> Scrape:
-    answer = httpx.get(f"{at.url}/metrics", timeout=30)
+    answer = httpx2.get(f"{at.url}/metrics", timeout=30)
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
     return Scrape(answer.text)
@@ -165,8 +165,8 @@ def test_requests_are_timed_by_the_path_as_it_is_declared(live: Live) -> None:
     live.get("/sweeps/secretive/trials/t0000")
     live.get("/sweeps/missing")
     live.get("/nowhere/secretive")
-    httpx.get(f"{live.url}/api/v1/me", headers={"Host": "evil.example"})
-    httpx.request("BREW", f"{live.url}/api/v1/me")
+    httpx2.get(f"{live.url}/api/v1/me", headers={"Host": "evil.example"})
+    httpx2.request("BREW", f"{live.url}/api/v1/me")
     found = scrape(live)
     count = "http_request_duration_seconds_count"
     assert found.value(count, route="/api/v1/sweeps/{name}", status="2xx", method="GET") == 1
@@ -196,8 +196,8 @@ def test_a_token_is_needed_where_one_is_and_a_viewers_is_enough(tmp_path: Path) 
     storage = tmp_path / "sweeps"
     secret = make_token(storage, "prometheus", "viewer")
     with serving(storage, require_token=True) as at:
-        assert httpx.get(f"{at.url}/metrics").status_code == 401
-        answer = httpx.get(f"{at.url}/metrics", headers=bearer(secret))
+        assert httpx2.get(f"{at.url}/metrics").status_code == 401
+        answer = httpx2.get(f"{at.url}/metrics", headers=bearer(secret))
         found = Scrape(answer.text)
         assert found.value("http_request_duration_seconds_count", route="none", status="4xx") == 1
         assert "prometheus" not in {value for sample in found.samples for value in sample.labels.values()}
@@ -206,7 +206,7 @@ def test_a_token_is_needed_where_one_is_and_a_viewers_is_enough(tmp_path: Path) 
 def test_openmetrics_is_told_to_who_asks_for_it(live: Live) -> None:
     # As Prometheus 3 asks.
     accept = "application/openmetrics-text;version=1.0.0;q=0.5,text/plain;version=0.0.4;q=0.3,*/*;q=0.1"
-    answer = httpx.get(f"{live.url}/metrics", headers={"Accept": accept})
+    answer = httpx2.get(f"{live.url}/metrics", headers={"Accept": accept})
     assert answer.headers["content-type"].startswith("application/openmetrics-text")
     families: Any = openmetrics.text_string_to_metric_families(answer.text)  # type: ignore[no-untyped-call]
     assert "tune_jobs_sweeps" in {family.name for family in families}

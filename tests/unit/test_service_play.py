@@ -54,7 +54,7 @@ def test_an_episode_from_its_beginning_to_its_end(client: TestClient) -> None:
 
 
 def test_an_episode_goes_on_from_a_step(client: TestClient) -> None:
-    query = {"trial": "t0003", "seed": 5, "speed": 10}
+    query: dict[str, Any] = {"trial": "t0003", "seed": 5, "speed": 10}
     _, *whole = events(client.get("/api/v1/sweeps/done/play", params=query).text)
     (first, info), *rest = events(client.get("/api/v1/sweeps/done/play", params=query | {"start": 4}).text)
     assert (first, info["actions"]["names"]) == ("info", ["push left", "push right"])
