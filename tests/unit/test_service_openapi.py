@@ -36,7 +36,7 @@ CHECKS = (
 EXAMPLES = 8
 KNOWN = {
     "name": SWEEP, "trial_id": "t0003", "iteration": 6, "film": "after_mp4", "file": "policy.json",
-    "path": "index.html",
+    "path": "index.html", "number": 1,
 }  # fmt: skip
 RIGHT = {
     "/api/v1/plans": {"spec": FAKE, "overrides": ["num_samples=2"]},
@@ -222,7 +222,10 @@ def ask(operation: Operation, strategy: st.SearchStrategy[Case]) -> tuple[Counte
         answer = case.call(base_url=URL)
         statuses[int(answer.status_code)] += 1
         try:
-            case.validate_response(answer, checks=chosen)
+            # Too large a body is refused before anybody reads what is wrong in it; schemathesis does not know that.
+            is_unread = answer.status_code == 413
+            fitting = [check for check in chosen if not is_unread or check is not checks.negative_data_rejection]
+            case.validate_response(answer, checks=fitting)
             if answer.status_code >= 400 and operation.path != "/readyz":
                 told = answer.json()
                 assert told["status"] == answer.status_code, told

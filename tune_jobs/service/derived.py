@@ -14,6 +14,7 @@ from tune_jobs.sweeps.status import SweepStatus
 
 if TYPE_CHECKING:
     from analysis.importance import WhatMattered
+    from analysis.records import TrialRecord
     from tune_jobs.sweeps.side_by_side import SideBySide
 
 _SHARE = 0.1
@@ -93,6 +94,17 @@ class Derived:
 
         content: bytes = self._get(name, "file", sweep_file)
         return content
+
+    def records(self, name: str) -> list[TrialRecord]:
+        """Return the records of a sweep's trials with the checkpoints that may be chosen, as of a while ago if it runs.
+
+        Raises:
+            NotFoundError: There is no such sweep, or it is damaged.
+        """
+        from tune_jobs.store.candidates import read_trials
+
+        found: list[TrialRecord] = self._get(name, "records", read_trials)
+        return found
 
     def _get(self, name: str, what: str, make: Callable[[Sweep], Any]) -> Any:
         return self._get_of((name,), what, lambda sweeps: make(*sweeps))

@@ -32,6 +32,7 @@ class Problem(BaseModel):
     status: int = Field(description="The HTTP status.")
     detail: str = Field(description="What is wrong, as a sentence.")
     hint: str = Field("", description="What to do about it.")
+    error: str = Field("", description="The kind of error in Python, such as SpecError.")
     problems: list[PartOfProblem] = Field(default_factory=list, description="What is wrong, place by place.")
 
 

@@ -34,6 +34,8 @@ class Submission:
     """The content of one."""
     overrides: Sequence[str] = ()
     name: str | None = None
+    default_name: str | None = None
+    """Name if the sweep file has none; with a number if it is taken."""
     priority: int = 0
     note: str = ""
     tags: Sequence[str] = field(default_factory=tuple)
@@ -41,10 +43,12 @@ class Submission:
     @property
     def digest(self) -> str:
         """SHA-256 of the request, by which a second one with the same idempotency key is known to be the same."""
-        data = {
+        data: dict[str, Any] = {
             "preset": self.preset, "text": self.text, "spec": self.spec, "overrides": list(self.overrides),
             "name": self.name, "priority": self.priority, "note": self.note, "tags": list(self.tags),
         }  # fmt: skip
+        if self.default_name is not None:
+            data["default_name"] = self.default_name
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -148,7 +152,7 @@ class Submitter:
         wanted = _wanted(submission, spec)
         if wanted is not None:
             return self._storage.new_sweep(check_sweep_name(wanted)).name
-        stem, number = submission.preset or "sweep", 1
+        stem, number = check_sweep_name(submission.default_name or submission.preset or "sweep"), 1
         while self._storage.is_taken(stem if number == 1 else f"{stem}-{number}"):
             number += 1
         return stem if number == 1 else f"{stem}-{number}"

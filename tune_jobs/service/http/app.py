@@ -19,6 +19,7 @@ from tune_jobs.service.http import (
     meta_routes,
     metrics_routes,
     play_routes,
+    record_routes,
     sweep_routes,
 )
 from tune_jobs.service.http.openapi import complete
@@ -70,6 +71,7 @@ def make_app(service: Service) -> FastAPI:
         meta_routes,
         metrics_routes,
         sweep_routes,
+        record_routes,
         action_routes,
         event_routes,
         comparison_routes,

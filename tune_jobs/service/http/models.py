@@ -31,6 +31,7 @@ class NewSweep(_Request):
     spec: dict[str, Any] | None = Field(None, description="The content of a sweep file.")
     overrides: list[str] = Field(default_factory=list, max_length=100, description="`a.b=value`, as for --set.")
     name: Name | None = Field(None, description="Name of the sweep; null: the file's, or one that is free.")
+    default_name: Name | None = Field(None, description="Name if the file has none, with a number if it is taken.")
     priority: Priority = 0
     note: Note = ""
     tags: Tags = Field(default_factory=list)

@@ -73,7 +73,9 @@ async def _told(_: Request, error: TuneJobsError) -> JSONResponse:
     if status == HTTPStatus.SERVICE_UNAVAILABLE and is_full(error):
         return full_disk_problem(error.message)
     problems = [item._asdict() for item in error.problems] if isinstance(error, WrongSpecError) else []
-    return problem(status, error.message, hint=error.hint, problems=problems)
+    # Of the words of the command line, which ends with the exit code of this kind of error.
+    kind = next(item.__name__ for item in type(error).__mro__ if item.__module__ == TuneJobsError.__module__)
+    return problem(status, error.message, hint=error.hint, error=kind, problems=problems)
 
 
 async def _refused(_: Request, error: RefusedError) -> JSONResponse:

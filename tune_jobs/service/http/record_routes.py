@@ -1,0 +1,71 @@
+"""Sweeps and trials as records, whole: what a command of another machine needs to print what it prints on this one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+from fastapi import Path as PathParameter
+from pydantic_core import to_json
+
+from tune_jobs.service.http.caller import TheService
+from tune_jobs.service.http.pages import page_of
+from tune_jobs.service.jobs import Job
+from tune_jobs.service.problem_documents import problems
+from tune_jobs.sweeps.status import SweepStatus
+
+router = APIRouter(prefix="/api/v1", tags=["records"])
+
+
+def _json(kind: str, what: str) -> dict[int | str, dict[str, Any]]:
+    return {200: {"content": {"application/json": {"schema": {"type": kind}}}, "description": what}}
+
+
+@router.get("/sweeps/{name}/status", responses=_json("object", "The status."), response_class=Response)
+def status(name: str, service: TheService) -> Response:
+    """Return the status of a sweep with its whole record; numbers that JSON lacks are texts, as in its files."""
+    return _answer(_plain(service.statuses.see(name).status))
+
+
+@router.get("/statuses", responses=_json("object", "A page of them."), response_class=Response)
+def statuses(
+    service: TheService,
+    *,
+    limit: Annotated[int, Query(ge=1, le=1_000, description="The most items of a page.")] = 100,
+    cursor: Annotated[str | None, Query(max_length=2_000, description="`next_cursor` of the page before.")] = None,
+) -> Response:
+    """Return the status of each sweep, by name, as `status` does of one."""
+    page, following = page_of(
+        service.statuses.all(),
+        key=lambda seen: seen.name,
+        identity=lambda seen: seen.name,
+        descending=False,
+        cursor=cursor,
+        limit=limit,
+    )
+    return _answer({"statuses": [_plain(seen.status) for seen in page], "next_cursor": following})
+
+
+@router.get("/sweeps/{name}/records", responses=_json("array", "The records, by index."), response_class=Response)
+def records(name: str, service: TheService) -> Response:
+    """Return the records of all trials with the checkpoints that may be chosen; of a running sweep as a while ago."""
+    found = service.derived.records(name)
+    body = b",".join(record.model_dump_json().encode() for record in found)
+    return Response(b"[%s]" % body, media_type="application/json")
+
+
+@router.get("/jobs/{number}", responses=problems({404: "There is no such job."}))
+def job(number: Annotated[int, PathParameter(ge=1, le=2**53, description="Its id.")], service: TheService) -> Job:
+    """Return one job."""
+    return service.queue.job(number)
+
+
+def _plain(status: SweepStatus) -> dict[str, Any]:
+    found = {field.name: getattr(status, field.name) for field in fields(status)}
+    return {**found, "sweep": json.loads(status.sweep.model_dump_json())}
+
+
+def _answer(content: Any) -> Response:
+    return Response(to_json(content, inf_nan_mode="strings"), media_type="application/json")
