@@ -22,6 +22,10 @@ def modules_after(code: str) -> set[str]:
     [
         # Help, validation and dry runs are instant.
         ("import tune_jobs.cli.commands", HEAVY | {"numpy", "pydantic", "sqlalchemy", "fastapi", "starlette"}),
+        (
+            "from tune_jobs.client import Client; Client('http://127.0.0.1:1')",
+            HEAVY | {"fastapi", "sqlalchemy", "uvicorn"},
+        ),
         # What the guard's child begins with, beside its parent, which imports the rest.
         ("import policies.packed.envs.make", HEAVY | {"pydantic", "PIL"}),
         ("from tune_jobs.spec.file import load_spec; load_spec('cartpole-ppo')", HEAVY),

@@ -204,7 +204,7 @@ def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     if isinstance(source, Mapping):
         label, data = "sweep", source
     else:
-        label, text = _read_text(source)
+        label, text = read_sweep_file(source)
         data = parse_yaml(text, label)
     if not isinstance(data, Mapping):
         kind = "is empty" if data is None else f"holds a {type(data).__name__}"
@@ -213,7 +213,12 @@ def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     return label, plain
 
 
-def _read_text(source: str | Path) -> tuple[str, str]:
+def read_sweep_file(source: str | Path) -> tuple[str, str]:
+    """Return the name, for messages, and the text of a sweep file or preset.
+
+    Raises:
+        SpecError: There is no such file or preset, or it can't be read.
+    """
     path = Path(source)
     if not path.is_file():
         presets = _preset_files()

@@ -1,0 +1,419 @@
+"""The client over real HTTP: each route, what is refused and in which words, lost connections."""
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cutting_proxy import cutting_proxy
+from fake_sweeps import RunCommand
+from live_service import Live, live, serving  # noqa: F401 (a fixture)
+from services import FAKE
+from sweep_folders import make_sweep_folder
+from test_service_downloads import FILM, make_finished
+
+from policies.errors import CannotRunError, CheckpointError, EnvError, NotFoundError, SpecError
+from tests.narrowing import present
+from tune_jobs.client import Client, ConflictError, LostConnectionError, NoServiceError, answers
+from tune_jobs.client import connection as connection_module
+from tune_jobs.service.http import models
+from tune_jobs.service.jobs import Job
+from tune_jobs.service.summaries import SweepSummary
+from tune_jobs.sweeps import verbs
+
+# ruff: noqa: F811 - fixtures are named as arguments
+
+YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\n"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    """A service with a sweep that has ended, for tests that only look."""
+    with serving(tmp_path_factory.mktemp("client") / "sweeps") as made:
+        make_finished(made.storage / "mine")
+        yield made
+
+
+@pytest.fixture
+def looking(site: Live) -> Iterator[Client]:
+    with Client(site.url) as made:
+        yield made
+
+
+@pytest.fixture
+def client(live: Live) -> Iterator[Client]:
+    with Client(live.url) as made:
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection_module, "_WAITS_S", (0.01, 0.01, 0.01, 0.01))
+    for name in ("TUNE_JOBS_TOKEN", "HTTP_PROXY", "http_proxy"):
+        monkeypatch.delenv(name, raising=False)
+
+
+# -- looking
+
+
+def test_what_is_told_of_a_sweep_is_what_its_folder_says(site: Live, looking: Client) -> None:
+    folder = site.storage / "mine"
+    assert looking.status("mine") == verbs.status(folder)
+    assert looking.list_sweeps() == verbs.list_sweeps(site.storage)
+    assert looking.records("mine") == verbs.trials(folder)
+    assert looking.best("mine").checkpoint.trial_id == "t0003"
+    assert looking.spec("mine") == verbs.status(folder).sweep.spec
+    assert looking.sweep("mine").counts == {"completed": 4}
+    assert [sweep.name for sweep in looking.sweeps(state="completed")] == ["mine"]
+    assert list(looking.sweeps(state="running")) == []
+
+
+def test_what_is_told_of_a_trial_is_what_its_folder_says(site: Live, looking: Client) -> None:
+    folder = site.storage / "mine"
+    by_score = [trial.score for trial in looking.trials("mine")]
+    assert by_score == sorted(by_score, key=lambda score: -present(score))
+    trial = looking.trial("mine", "t0002")
+    assert trial.point == verbs.trials(folder)[2].point
+    assert [item.iteration for item in looking.iterations("mine", "t0002", after=4)] == [5, 6]
+    assert isinstance(looking.log("mine", "t0002", lines=5), str)
+    curve = looking.curves("mine", points=3).trials["t0002"]
+    assert (curve.iteration[0], curve.iteration[-1]) == (1, 6)
+    assert "hyperparams" in looking.importance("mine")
+
+
+def test_lists_are_read_to_their_last_page(looking: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tune_jobs.client.asking._PAGE", 1)
+    assert len(list(looking.trials("mine", sort="index", order="asc"))) == 4
+    assert len(looking.list_sweeps()) == 1
+
+
+def test_who_asks_and_what_the_service_is_are_said(looking: Client) -> None:
+    me = looking.me()
+    assert (me.name, me.role) == ("local", "admin")
+    assert present(me.num_cpus) >= 1
+    assert looking.jobs() == looking.jobs("running", "waiting") == []
+    with pytest.raises(NotFoundError, match="no job 7"):
+        looking.job(7)
+
+
+def test_models_have_the_fields_of_the_services() -> None:
+    pairs: list[tuple[Any, Any]] = [
+        (answers.Job, Job), (answers.Summary, SweepSummary), (answers.Curve, models.Curve),
+        (answers.Curves, models.CurvesOfSweep), (answers.FileOfSweep, models.FileOfSweep),
+        (answers.Submitted, models.Submitted), (answers.Planned, models.Planned),
+    ]  # fmt: skip
+    for own, theirs in pairs:
+        assert own.model_fields.keys() == theirs.model_fields.keys()
+
+
+# -- changing
+
+
+def test_a_sweep_is_submitted_from_a_mapping_a_file_and_a_preset(client: Client, live: Live, tmp_path: Path) -> None:
+    made = client.submit(FAKE, name="mine", note="why", tags=["x"], priority=3)
+    assert (made.sweep, made.job.state, made.job.priority) == ("mine", "waiting", 3)
+    file = tmp_path / "some name.yaml"
+    file.write_text(YAML)
+    with pytest.raises(SpecError, match="'some name'"):
+        client.submit(file)
+    file = file.rename(tmp_path / "poles.yaml")
+    assert [client.submit(file).sweep for _ in range(2)] == ["poles", "poles-2"]
+    assert client.submit("cartpole-ppo", overrides=["num_samples=2"]).sweep == "cartpole-ppo"
+    assert client.spec("cartpole-ppo")["num_samples"] == 2
+    assert client.plan(file, overrides=["num_samples=5"]).plan["num_points"] == 5
+    with pytest.raises(SpecError, match="no preset of that name"):
+        client.submit("cartpole-pppo")
+
+
+def test_a_sweep_is_changed_stopped_resumed_and_deleted(client: Client, live: Live) -> None:
+    client.submit(FAKE, name="mine")
+    assert client.change("mine", note="a", tags=["b"], priority=7).note == "a"
+    assert client.job(1).priority == 7
+    assert [job.outcome for job in client.stop("mine")] == ["cancelled"]
+    with pytest.raises(ConflictError, match="neither waits nor runs"):
+        client.stop("mine")
+    assert client.resume("mine").verb == "drive"
+    with pytest.raises(ConflictError, match="waits or runs"):
+        client.delete("mine", force=True)
+    client.stop("mine")
+    client.delete("mine", force=True)
+    assert list(client.sweeps()) == []
+
+
+def test_a_finished_sweep_is_extended_and_replicated(client: Client, live: Live) -> None:
+    make_sweep_folder(live.storage / "done")
+    assert client.extend("done", 3).arguments == {"to_num_samples": 5}
+    assert client.inject("done", {"lr": 0.5}).arguments == {"point": {"lr": 0.5}}
+    with pytest.raises(SpecError, match="gamma"):
+        client.inject("done", {"gamma": 0.5})
+    assert client.replicate("done", top=2, seeds=1).arguments == {"top": 2, "seeds": 1}
+    with pytest.raises(ConflictError, match="no failed trial"):
+        client.retry("done")
+
+
+# -- files
+
+
+def test_files_are_downloaded_whole_or_not_at_all(looking: Client, tmp_path: Path) -> None:
+    paths = {file.path for file in looking.files("mine")}
+    assert {"report/index.html", "films/after_mp4", "policy/policy.json"} <= paths
+    to = looking.download("mine", "films/after_mp4", tmp_path / "new" / "film.mp4")
+    assert to.read_bytes() == FILM
+    for path in ("policy", "trials.csv", "trials/t0003/checkpoints/6"):
+        assert looking.download("mine", path, tmp_path / "x").stat().st_size > 100
+    with pytest.raises(NotFoundError, match="no file"):
+        looking.download("mine", "report/none.html", tmp_path / "y")
+    assert not list(tmp_path.glob("y*"))
+    assert not list(tmp_path.glob(".*"))
+    with pytest.raises(CannotRunError, match="is a folder"):
+        looking.download("mine", "policy", tmp_path)
+
+
+def test_a_download_goes_on_where_the_connection_was_lost(site: Live, tmp_path: Path) -> None:
+    with cutting_proxy(site.url) as proxy, Client(proxy.url) as client:
+        proxy.cuts = [300_000, 0, 200_000]
+        assert client.download("mine", "films/after_mp4", tmp_path / "film").read_bytes() == FILM
+        parts = [request.partition(b"Range: bytes=")[2].partition(b"-")[0] for request in proxy.requests]
+        assert parts[0] == b""
+        assert 0 < int(parts[1]) == int(parts[2]) < int(parts[3]) < len(FILM)
+
+
+def test_a_download_that_changes_meanwhile_begins_anew(live: Live, tmp_path: Path) -> None:
+    film = make_finished(live.storage / "mine").films()["after_mp4"]
+    with cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
+        proxy.cuts = [300_000]
+        real = connection_module.Connection.stream
+
+        def stream(*args: Any, **options: Any) -> Any:
+            if len(proxy.requests) == 1:
+                film.write_bytes(b"b" * len(FILM))
+            return real(*args, **options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(connection_module.Connection, "stream", stream)
+            assert client.download("mine", "films/after_mp4", tmp_path / "film").read_bytes() == b"b" * len(FILM)
+
+
+# -- lost connections
+
+
+def test_what_only_looks_is_asked_again(site: Live) -> None:
+    with cutting_proxy(site.url) as proxy, Client(proxy.url) as client:
+        proxy.cuts = [0, 20, 500]
+        assert client.status("mine").sweep.name == "mine"
+        assert len(proxy.requests) == 4
+
+
+def test_a_submission_whose_answer_is_lost_makes_one_sweep(live: Live) -> None:
+    with cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
+        proxy.cuts = [0, 10]
+        assert client.submit(FAKE, name="mine").sweep == "mine"
+        keys = {request.partition(b"Idempotency-Key: ")[2].partition(b"\r\n")[0].lower() for request in proxy.requests}
+        assert (len(keys), len(proxy.requests)) == (1, 3)
+    assert [job.sweep for job in live.service.queue.jobs()] == ["mine"]
+
+
+def test_what_changes_something_is_not_asked_twice(live: Live) -> None:
+    make_sweep_folder(live.storage / "done")
+    with cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
+        proxy.cuts = [0]
+        with pytest.raises(LostConnectionError, match="POST /api/v1/sweeps/done/extend") as caught:
+            client.extend("done", 1)
+        assert "not known whether it was done" in caught.value.hint
+        assert len(proxy.requests) == 1
+
+
+def test_a_connection_that_is_lost_again_and_again_is_told(site: Live) -> None:
+    with cutting_proxy(site.url) as proxy, Client(proxy.url) as client:
+        proxy.cuts = [0] * 20
+        with pytest.raises(LostConnectionError, match=proxy.url):
+            client.me()
+
+
+# -- what is no service, or lets nobody in
+
+
+@contextlib.contextmanager
+def answering(status: int, body: str, media_type: str, **headers: str) -> Iterator[str]:
+    """The address of a server that answers everything alike."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            for name, value in {"Content-Type": media_type, "Content-Length": str(len(body)), **headers}.items():
+                self.send_header(name.replace("_", "-"), value)
+            self.end_headers()
+            self.wfile.write(body.encode())
+
+        do_POST = do_GET  # noqa: N815
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(30)
+
+
+JSON, PROBLEM = "application/json", "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "media_type", "words"),
+    [
+        (200, "<!DOCTYPE html><title>Jenkins</title>", "text/html; charset=x", ("no service", "Jenkins", "text/html")),
+        (404, "<html>nothing here</html>", "text/html", ("no service", "status 404")),
+        (404, '{"detail":"Not Found"}', JSON, ("no service", "Not Found")),
+        (200, "{]", JSON, ("no service",)),
+        (200, "[1]", JSON, ("does not know",)),
+        (200, '{"name": 3}', JSON, ("does not know", "name")),
+        (502, "<h1>Bad Gateway</h1>", "text/html", ("proxy", "502")),
+        (401, '{"detail": "A token is needed."}', PROBLEM, ("token", "A token is needed.")),
+        (404, '{"detail": "Not Found"}', PROBLEM, ("does not know GET /api/v1/me",)),
+        (404, '{"detail": "There is nothing at this path."}', PROBLEM, ("does not know GET /api/v1/me",)),
+        (405, '{"detail": "This path takes no GET."}', PROBLEM, ("does not know GET /api/v1/me",)),
+        (507, '{"detail": "The disk is full."}', PROBLEM, ("The disk is full.",)),
+        (429, '{"detail": "Too many."}', PROBLEM, ("Too many.",)),
+        (200, "", "", ("no service",)),
+    ],
+)  # fmt: skip
+def test_what_answers_and_is_no_service_is_told(status: int, body: str, media_type: str, words: Any) -> None:
+    with answering(status, body, media_type) as url, Client(url) as client:
+        with pytest.raises(CannotRunError) as caught:
+            client.me()
+        for word in words:
+            assert word in caught.value.message
+        assert url in caught.value.message or status in (429, 507)
+        assert caught.value.hint or status == 507
+
+
+def test_a_token_is_not_carried_to_another_address() -> None:
+    to = "http://user:pass@elsewhere.example/x?token=1"
+    with (
+        answering(302, "", "", Location=to) as url,
+        Client(url, "abc") as client,
+        pytest.raises(NoServiceError) as caught,
+    ):
+        client.me()
+    assert "http://elsewhere.example " in caught.value.message
+    assert "pass" not in str(caught.value)
+
+
+def test_an_address_at_which_nobody_answers_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "sleep", lambda _: pytest.fail("it waited"))
+    with Client("http://127.0.0.1:1") as client:
+        with pytest.raises(NoServiceError, match=r"http://127\.0\.0\.1:1 can't be reached"):
+            client.me()
+        with pytest.raises(NoServiceError):
+            next(client.events("mine"))
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("127.0.0.1:8470", "http://"), ("ftp://x", "http://"), ("", "http://"), ("http://", "http://"),
+        ("http://me:s3cret@x:1", "password"), ("https://s3cret@x", "password"), ("http://x:99999", "port"),
+        ("http://x?token=s3cret", "query"), ("http://x/#s3cret", "query"), ("http://a b", "http://"),
+    ],
+)  # fmt: skip
+def test_addresses_that_are_none_are_refused_and_show_no_secret(url: str, words: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        Client(url)
+    assert words in caught.value.message
+    assert "s3cret" not in str(caught.value)
+
+
+# -- tokens
+
+
+def test_a_token_lets_in_and_a_wrong_one_is_told(tmp_path: Path, run: RunCommand) -> None:
+    make = ("token", "make", "--json", "--storage", tmp_path / "sweeps")
+    viewer, ann = (
+        json.loads(run(*make, name, "--role", role).stdout)["token"]
+        for name, role in (("eve", "viewer"), ("ann", "submitter"))
+    )
+    with serving(tmp_path / "sweeps", require_token=True) as made:
+        make_sweep_folder(made.storage / "done")
+        file = tmp_path / "token"
+        file.write_text(f"{ann}\n")
+        with Client(made.url, token_file=file) as client:
+            assert client.me().name == "ann"
+            assert client.submit(FAKE, name="mine").job.owner == "ann"
+            with pytest.raises(CannotRunError, match="belongs to nobody"):
+                client.delete("done")
+        with Client(made.url, f" {viewer}\n") as client:
+            assert client.me().role == "viewer"
+            with pytest.raises(CannotRunError, match="viewer"):
+                client.submit(FAKE)
+            assert next(client.events("done")).kind == "status"
+        wrong = "tune-jobs_00000000_" + "A" * 43
+        for token in (None, wrong):
+            with Client(made.url, token) as client:
+                with pytest.raises(CannotRunError, match="valid token") as caught:
+                    client.status("done")
+                assert wrong not in str(caught.value)
+                assert "TUNE_JOBS_TOKEN" in caught.value.hint
+                assert wrong not in repr(client)
+
+
+def test_tokens_that_are_none_are_refused_and_not_shown(tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    for content in ("", "two s3crets", "s3cret\ns3cret", "s3crét"):
+        file.write_text(content)
+        with pytest.raises(SpecError) as caught:
+            Client("http://x", token_file=file)
+        assert "s3cr" not in str(caught.value)
+    with pytest.raises(SpecError, match="can't be read"):
+        Client("http://x", token_file=tmp_path / "none")
+    with pytest.raises(SpecError, match="one of them"):
+        Client("http://x", "abc", token_file=file)
+    with pytest.raises(SpecError, match="certificates in"):
+        Client("https://x", ca_file=tmp_path / "none")
+
+
+# -- refusals are the errors of this machine
+
+
+def test_refusals_are_the_errors_of_this_machine(client: Client, live: Live) -> None:
+    with pytest.raises(NotFoundError, match="no sweep 'none'") as missing:
+        client.status("none")
+    assert "tune-jobs list" in missing.value.hint
+    with pytest.raises(SpecError, match="hiden_sizes") as wrong:
+        client.submit(FAKE | {"space": {"hiden_sizes": [[1]]}})
+    assert "tune-jobs schema" in wrong.value.hint
+    with pytest.raises(EnvError, match="NoSuchEnv-v0"):
+        client.plan(FAKE | {"env": "NoSuchEnv-v0"})
+    with pytest.raises(SpecError, match="is no name of a sweep"):
+        client.status("a/b")
+    with pytest.raises(SpecError, match="is no id of a trial"):
+        client.trial("a", "../b")
+    (make_sweep_folder(live.storage / "bad").folder / "sweep.json").write_text("{")
+    with pytest.raises(CheckpointError, match=r"sweep\.json"):
+        client.status("bad")
+
+
+def test_a_route_that_an_older_service_lacks_is_told(client: Client) -> None:
+    with pytest.raises(CannotRunError, match=r"does not know GET /api/v1/sweeps/x/newer") as caught:
+        client._ask("GET", "/sweeps/x/newer")
+    assert "update the older one" in caught.value.hint
+
+
+def test_numbers_that_json_lacks_arrive(client: Client, live: Live) -> None:
+    store = make_sweep_folder(live.storage / "odd")
+    record = store.trial("t0001").read_record()
+    store.trial("t0001").write_record(record.model_copy(update={"time_s": float("nan")}))
+    store.write_record(store.read_record().model_copy(update={"run_time_s": float("inf")}))
+    assert client.status("odd").sweep.run_time_s == float("inf")
+    assert repr(client.records("odd")[1].time_s) == "nan"
+    assert json.loads(live.get("/sweeps/odd/records").text)[1]["time_s"] == "NaN"

@@ -1,0 +1,33 @@
+"""What a sweep is made from, as a service takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+Source = str | Path | Mapping[str, Any]
+"""Path of a sweep file, name of a preset, or the content of a sweep file."""
+
+
+def request_of(source: Source, overrides: Sequence[str], name: str | None) -> dict[str, Any]:
+    """Return a request for a sweep.
+
+    Args:
+        source: What it is made from; a file is read here, a preset is the service's.
+        overrides: `a.b=value` assignments.
+        name: The sweep's name; None: the file's, else one after the file or preset.
+
+    Raises:
+        SpecError: There is no such file or preset, or it can't be read.
+    """
+    from tune_jobs.spec.file import preset_names, read_sweep_file
+    from tune_jobs.spec.plain_data import to_plain
+
+    request: dict[str, Any] = {"overrides": list(overrides), "name": name}
+    if isinstance(source, Mapping):
+        return request | {"spec": to_plain(source, "sweep")}
+    if not Path(source).is_file() and str(source) in preset_names():
+        return request | {"preset": str(source)}
+    _, text = read_sweep_file(source)
+    return request | {"text": text, "default_name": Path(source).stem}
