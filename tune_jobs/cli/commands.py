@@ -19,10 +19,8 @@ from tune_jobs.cli.base import (
     allow_module_option,
     env_option,
     json_option,
-    losing_what_nobody_reads,
     num_episodes_option,
     print_version,
-    result_of,
     run_options,
     set_option,
     source_argument,
@@ -33,7 +31,9 @@ from tune_jobs.cli.base import (
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
 from tune_jobs.cli.inject_command import inject
 from tune_jobs.cli.result_commands import compare, export, importance, reproduce
+from tune_jobs.cli.running import run_verb
 from tune_jobs.cli.serve_command import serve
+from tune_jobs.cli.server import here_only, program, remember_server, server_of, server_options, verbs
 from tune_jobs.cli.token_commands import token
 
 
@@ -47,8 +47,9 @@ from tune_jobs.cli.token_commands import token
     callback=print_version,
     help="Print the version.",
 )
+@server_options
 @click.pass_context
-def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's signature
+def cli(ctx: click.Context, /, *, debug: bool, server: str | None, token_file: str | None, ca_file: str | None) -> None:
     """Hyperparameter search for reinforcement learning: from one sweep file to the best policy on video.
 
     SPEC is a sweep file or a preset; SWEEP is a sweep's name or folder.
@@ -58,6 +59,7 @@ def cli(ctx: click.Context, debug: bool) -> None:  # noqa: FBT001 - click's sign
     sweep, trial or checkpoint, 5 cannot run here, 130 interrupted.
     """
     ctx.meta[DEBUG] = debug
+    remember_server(ctx, server, token_file, ca_file)
 
 
 @cli.command()
@@ -82,26 +84,24 @@ def launch(
     **options: Any,
 ) -> None:
     """Run a sweep: all trials, then the best policy, its video and a report."""
-    from policies.guard.guard import guarding
+    if server_of() is None:
+        from policies.guard.guard import guarding
 
-    # The guard's child starts while this process still imports its own modules.
-    ctx.with_resource(guarding(start=True))
+        # The guard's child starts while this process still imports its own modules.
+        ctx.with_resource(guarding(start=True))
     if dry_run:
         from tune_jobs.cli import plan_view as cli_plan
-        from tune_jobs.sweeps.dry_run import planned
 
         with stdout_for(as_json=as_json):
-            loaded, plan = planned(spec, overrides, name=name, storage=storage, address=options["address"])
+            if server_of() is None:
+                from tune_jobs.sweeps.dry_run import planned
+
+                loaded, plan = planned(spec, overrides, name=name, storage=storage, address=options["address"])
+            else:
+                loaded, plan = verbs().planned(spec, overrides, name=name)
         cli_plan.show_plan(loaded, plan, as_json=as_json)
         return
-    from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
-
-    with stdout_for(as_json=as_json):
-        result = result_of(sweeps.launch, spec, overrides=overrides, name=name, storage=storage, **options)
-    with losing_what_nobody_reads(result.interrupted):
-        cli_output.show_result(result, storage=storage, as_json=as_json)
-    ctx.exit(result.exit_code)
+    run_verb(ctx, "launch", spec, overrides=overrides, name=name, storage=storage, as_json=as_json, **options)
 
 
 @cli.command(name="list")
@@ -110,8 +110,8 @@ def launch(
 def list_command(*, storage: str | None, as_json: bool) -> None:
     """List the sweeps of a storage folder."""
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
 
+    sweeps = verbs()
     with stdout_for(as_json=as_json):
         statuses = sweeps.list_sweeps(storage)
     cli_output.show_sweeps(statuses, as_json=as_json)
@@ -124,11 +124,11 @@ def list_command(*, storage: str | None, as_json: bool) -> None:
 def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Say how far a sweep is: its env steps, the best so far, and the time that is left."""
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
 
+    sweeps = verbs()
     with stdout_for(as_json=as_json):
         state = sweeps.status(sweep, storage=storage)
-    cli_output.show_status(state, storage=storage, as_json=as_json)
+    cli_output.show_status(state, storage=storage, program=program(), as_json=as_json)
 
 
 @cli.command()
@@ -143,7 +143,8 @@ def trials(*, sweep: str, sort: str | None, top: int | None, storage: str | None
     On a terminal, columns that don't fit are left out, the least important ones first.
     """
     from tune_jobs.cli import trials_table
-    from tune_jobs.sweeps import verbs as sweeps
+
+    sweeps = verbs()
 
     with stdout_for(as_json=as_json):
         records = sweeps.trials(sweep, storage=storage)
@@ -161,14 +162,7 @@ def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: b
     Such a trial begins new episodes there, and DQN fills its replay memory anew: its numbers differ from those of a
     trial that nothing has interrupted.
     """
-    from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
-
-    with stdout_for(as_json=as_json):
-        result = result_of(sweeps.resume, sweep, storage=storage, **options)
-    with losing_what_nobody_reads(result.interrupted):
-        cli_output.show_result(result, storage=storage, as_json=as_json)
-    ctx.exit(result.exit_code)
+    run_verb(ctx, "resume", sweep, storage=storage, as_json=as_json, **options)
 
 
 @cli.command()
@@ -180,14 +174,7 @@ def extend(
     ctx: click.Context, /, *, sweep: str, num_samples: int, storage: str | None, as_json: bool, **options: Any
 ) -> None:
     """Add trials to a sweep: more samples of its space, the earlier points stay as they are."""
-    from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
-
-    with stdout_for(as_json=as_json):
-        result = result_of(sweeps.extend, sweep, num_samples, storage=storage, **options)
-    with losing_what_nobody_reads(result.interrupted):
-        cli_output.show_result(result, storage=storage, as_json=as_json)
-    ctx.exit(result.exit_code)
+    run_verb(ctx, "extend", sweep, num_samples, storage=storage, as_json=as_json, **options)
 
 
 @cli.command()
@@ -202,14 +189,7 @@ def replicate(
     ctx: click.Context, /, *, sweep: str, top: int, seeds: int, storage: str | None, as_json: bool, **options: Any
 ) -> None:
     """Train the leading settings of a sweep again, with fresh seeds, to see which is the best."""
-    from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
-
-    with stdout_for(as_json=as_json):
-        result = result_of(sweeps.replicate, sweep, top=top, seeds=seeds, storage=storage, **options)
-    with losing_what_nobody_reads(result.interrupted):
-        cli_output.show_result(result, storage=storage, as_json=as_json)
-    ctx.exit(result.exit_code)
+    run_verb(ctx, "replicate", sweep, top=top, seeds=seeds, storage=storage, as_json=as_json, **options)
 
 
 @cli.command()
@@ -219,11 +199,11 @@ def replicate(
 def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Ask a running sweep to stop; it can be resumed."""
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
 
+    sweeps = verbs()
     with stdout_for(as_json=as_json):
         was_running = sweeps.stop(sweep, storage=storage)
-    cli_output.show_stop(sweep, was_running=was_running, as_json=as_json)
+    cli_output.show_stop(sweep, was_running=was_running, program=program(), as_json=as_json)
 
 
 @cli.command()
@@ -235,8 +215,8 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
 def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -> None:
     """Choose the best checkpoint, confirm it on fresh seeds and export its policy."""
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
 
+    sweeps = verbs()
     with stdout_for(as_json=as_json):
         record = sweeps.best(sweep, storage=storage, num_episodes=num_episodes)
     cli_output.show_best(record, as_json=as_json)
@@ -269,6 +249,7 @@ def evaluate(
     from tune_jobs.cli import output as cli_output
     from tune_jobs.sweeps import verbs as sweeps
 
+    here_only()
     _check_baseline(source, env_id)
     with stdout_for(as_json=as_json):
         policy, random = sweeps.evaluate(
@@ -279,7 +260,7 @@ def evaluate(
 
 @cli.command()
 @source_argument
-@click.option("--output", metavar="PATH", help="File to write, as .mp4 and .gif; or a folder, ending with /.")
+@click.option("-o", "--output", metavar="PATH", help="File to write, as .mp4 and .gif; or a folder, ending with /.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
 @action_option
@@ -301,8 +282,8 @@ def video(
     SOURCE is as for evaluate.
     """
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
 
+    sweeps = verbs()
     _check_baseline(source, env_id)
     with stdout_for(as_json=as_json):
         paths = sweeps.video(source, storage=storage, output=output, seed=seed, env_id=env_id, action=action)
@@ -316,16 +297,20 @@ def _check_baseline(source: str, env_id: str | None) -> None:
 
 @cli.command()
 @sweep_argument
+@click.option("-o", "--output", metavar="PATH", help="With --server: file, or folder with /, to download the page to.")
 @allow_module_option
 @storage_option
 @json_option
-def report(*, sweep: str, storage: str | None, as_json: bool) -> None:
+def report(*, sweep: str, output: str | None, storage: str | None, as_json: bool) -> None:
     """Write the report of a sweep: one HTML page, tables and figures."""
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
 
+    if output is not None and server_of() is None:
+        raise SpecError("--output goes with --server alone: a report lies in its sweep's folder.", "Leave it out.")
+    sweeps = verbs()
+    to = {} if output is None else {"output": output}
     with stdout_for(as_json=as_json):
-        path = sweeps.report(sweep, storage=storage)
+        path = sweeps.report(sweep, storage=storage, **to)
     cli_output.show_paths({"report": path}, as_json=as_json)
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import click
 
 from policies.errors import SpecError
-from tune_jobs.cli.base import losing_what_nobody_reads, result_of, run_options, stdout_for, sweep_argument
+from tune_jobs.cli.base import run_options, sweep_argument
 from tune_jobs.cli.completion import complete_searched
+from tune_jobs.cli.running import run_verb
 
 _SHOWN = 80
 
@@ -28,14 +29,7 @@ def inject(
 
     tune-jobs inject mine lr=3e-4 "hidden_sizes=[64, 64]"
     """
-    from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs as sweeps
-
-    with stdout_for(as_json=as_json):
-        result = result_of(sweeps.inject, sweep, _point_of(values), storage=storage, **options)
-    with losing_what_nobody_reads(result.interrupted):
-        cli_output.show_result(result, storage=storage, as_json=as_json)
-    ctx.exit(result.exit_code)
+    run_verb(ctx, "inject", sweep, _point_of(values), storage=storage, as_json=as_json, **options)
 
 
 def _point_of(assignments: Sequence[str]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from analysis.records import BestRecord, EvaluationRecord, SettingsRecord, TrialRecord, TrialStatus
+    from analysis.records import BestRecord, EvaluationRecord, SettingsRecord, SweepRecord, TrialRecord, TrialStatus
     from tune_jobs.spec.file import Preset
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
@@ -48,26 +48,47 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
     if as_json:
         print_json({**to_json(result), "exit_code": result.exit_code})
     else:
-        console = make_console()
-        _print_trial_counts(console, result.trials)
-        if result.sweep.replications:
-            from analysis.answers import replicas_text
-
-            console.print(replicas_text(result.sweep, result.trials))
-        if result.best is not None:
-            _print_best(console, result.best)
-        elif result.why_no_best is not None:
-            console.print(f"no best policy: {result.why_no_best}", style="yellow")
         from analysis.wording import shown_path
 
-        paths = {"sweep": result.folder, **result.artifacts}
-        print_facts(console, {name.replace("_", " "): shown_path(path) for name, path in paths.items()})
-        for note in result.notes:
-            console.print(f"note: {note}", style="yellow")
+        paths = {name: shown_path(path) for name, path in {"sweep": result.folder, **result.artifacts}.items()}
+        print_outcome(
+            result.sweep, result.trials, best=result.best, why_no_best=result.why_no_best, paths=paths,
+            notes=result.notes,
+        )  # fmt: skip
     if result.interrupted:
-        done = result.sweep.state == "completed"
-        kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Continue with"
-        click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
+        say_interrupted(result.sweep, how_to_resume)
+
+
+def print_outcome(
+    sweep: SweepRecord,
+    trials: Sequence[TrialRecord],
+    *,
+    best: BestRecord | None,
+    why_no_best: str | None,
+    paths: Mapping[str, str],
+    notes: Sequence[str],
+) -> None:
+    """Print what came of a sweep's trials, and where its files are."""
+    console = make_console()
+    _print_trial_counts(console, trials)
+    if sweep.replications:
+        from analysis.answers import replicas_text
+
+        console.print(replicas_text(sweep, trials))
+    if best is not None:
+        _print_best(console, best)
+    elif why_no_best is not None:
+        console.print(f"no best policy: {why_no_best}", style="yellow")
+    print_facts(console, {name.replace("_", " "): path for name, path in paths.items()})
+    for note in notes:
+        console.print(f"note: {note}", style="yellow")
+
+
+def say_interrupted(sweep: SweepRecord, how_to_resume: str) -> None:
+    """Say on standard error that a sweep was interrupted, and the command that continues it."""
+    done = sweep.state == "completed"
+    kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Continue with"
+    click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
 
 
 def _storage_option(storage: str | None) -> str:
@@ -117,12 +138,12 @@ def local_time(unix_time: float) -> str:
         return PLAIN_NONE
 
 
-def show_status(status: SweepStatus, *, storage: str | None = None, as_json: bool) -> None:
+def show_status(status: SweepStatus, *, storage: str | None = None, program: str = "tune-jobs", as_json: bool) -> None:
     """Print how far a sweep is, what is best so far, and how long it will take."""
     if as_json:
         print_json(status)
         return
-    print_facts(make_console(), status.facts(_storage_option(storage)))
+    print_facts(make_console(), status.facts(_storage_option(storage), program))
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:
@@ -233,12 +254,12 @@ def show_paths(paths: Mapping[str, Path], *, as_json: bool) -> None:
         print_facts(make_console(), {name: shown_path(path) for name, path in paths.items()})
 
 
-def show_stop(sweep: str, *, was_running: bool, as_json: bool) -> None:
+def show_stop(sweep: str, *, was_running: bool, program: str = "tune-jobs", as_json: bool) -> None:
     """Print whether there was something to stop."""
     if as_json:
         print_json({"sweep": sweep, "was_running": was_running})
     elif was_running:
-        click.echo(f"{sweep} stops after the iterations now running; `tune-jobs resume {sweep}` continues it.")
+        click.echo(f"{sweep} stops after the iterations now running; `{program} resume {sweep}` continues it.")
     else:
         click.echo(f"{sweep} is not running.")
 

@@ -16,6 +16,7 @@ from tune_jobs.cli.base import (
     sweep_argument,
     sweeps_argument,
 )
+from tune_jobs.cli.server import here_only
 
 if TYPE_CHECKING:
     from analysis.records import Objective
@@ -56,6 +57,7 @@ def export(
     from tune_jobs.cli import output as cli_output
     from tune_jobs.sweeps import verbs
 
+    here_only()
     with stdout_for(as_json=as_json):
         paths = verbs.export(list(sweeps), kind, output=output, top=top, storage=storage)
     cli_output.show_paths(paths, as_json=as_json)
@@ -89,6 +91,7 @@ def compare(
     from tune_jobs.cli import comparison_view
     from tune_jobs.sweeps import verbs
 
+    here_only()
     with stdout_for(as_json=as_json):
         found = verbs.compare(list(sources), objective=objective, top=top, html=html, storage=storage)
     comparison_view.show_comparison(found, html=html, as_json=as_json)
@@ -103,6 +106,7 @@ def importance(*, sweep: str, storage: str | None, as_json: bool) -> None:
     from tune_jobs.cli import importance_view
     from tune_jobs.sweeps import verbs
 
+    here_only()
     with stdout_for(as_json=as_json):
         found = verbs.importance(sweep, storage=storage)
     importance_view.show_importance(found, as_json=as_json)
@@ -134,6 +138,7 @@ def reproduce(
     from tune_jobs.cli import comparison_view
     from tune_jobs.sweeps import verbs
 
+    here_only()
     with stdout_for(as_json=as_json):
         found = verbs.reproduce(source, output=output, progress=progress, storage=storage)
     comparison_view.show_repetition(found, as_json=as_json)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tune_jobs.cli.base import json_option, storage_option
+from tune_jobs.cli.server import here_only
 
 if TYPE_CHECKING:
     from tune_jobs.service.logs import LogFormat
@@ -90,6 +91,7 @@ def serve(
     from tune_jobs.service.serve import serve as run
     from tune_jobs.sweeps.storage import storage_folder
 
+    here_only()
     config = ServiceConfig(
         storage=storage_folder(storage), host=host, port=port, address=address, database=database,
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,

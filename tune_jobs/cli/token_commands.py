@@ -9,6 +9,7 @@ import click
 
 from tune_jobs.cli.base import json_option, storage_option
 from tune_jobs.cli.serve_command import database_option
+from tune_jobs.cli.server import here_only
 
 if TYPE_CHECKING:
     from tune_jobs.service.access.callers import Role
@@ -77,4 +78,5 @@ def _gate(database: str | None, storage: str | None) -> AbstractContextManager[G
     from tune_jobs.service.config import ServiceConfig
     from tune_jobs.sweeps.storage import storage_folder
 
+    here_only()
     return opened_gate(ServiceConfig(storage=storage_folder(storage), database=database))

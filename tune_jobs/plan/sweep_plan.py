@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
 
-from pydantic import ValidationError
+import gymnasium as gym
+from pydantic import TypeAdapter, ValidationError
 
 from analysis.numbering import planned_places
 from analysis.records import FINISHED, ChosenPointRecord, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
 from policies.envs.make import EnvInfo
-from policies.errors import SpecError
+from policies.errors import MALFORMED, CannotRunError, SpecError, said_by
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
@@ -91,6 +92,39 @@ class SweepPlan:
             "engines": self.engines,
             "packs": None if self.packs is None else asdict(self.packs),
         }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the plan that such data was made of; what it leaves out of the environment is not known any more.
+
+        Raises:
+            CannotRunError: It is no such data, or another version's.
+        """
+        simple = ("num_points", "cpus_per_trial", "gpus_per_trial", "max_concurrent", "max_env_steps", "max_disk_bytes")
+        unknown: gym.Space[Any] = gym.Space()
+        try:
+            env, packs = data["env"], data["packs"]
+            return cls(
+                trials=tuple(TrialPlan.model_validate(trial) for trial in data["trials"]),
+                evaluation_seeds=tuple(data["evaluation_seeds"]),
+                confirmation_seeds=tuple(data["confirmation_seeds"]),
+                env=EnvInfo(
+                    env["id"], env["args"], unknown, unknown, env["threshold"], None, has_vector_entry_point=False
+                ),
+                machine=TypeAdapter(Machine).validate_python(data["machine"]),
+                notes=tuple(data["notes"]),
+                packs=None if packs is None else _stored_packs(packs),
+                **{name: data[name] for name in simple},
+            )
+        except MALFORMED as error:
+            raise CannotRunError(
+                f"This is no plan that this tune-jobs knows: {said_by(error)[:200]}.", "Is it of another version?"
+            ) from error
+
+
+def _stored_packs(data: Mapping[str, Any]) -> PackPlan:
+    known: dict[str, Any] = {field.name: data[field.name] for field in fields(PackPlan) if field.name in data}
+    return PackPlan(**known | {name: tuple(known[name]) for name in ("trial_ids", "notes")})
 
 
 def trial_id(index: int) -> str:

@@ -67,11 +67,12 @@ class SweepStatus:
         """The number of trials by status, as text."""
         return ", ".join(f"{number:,} {name}" for name, number in self.counts.items() if number) or "none"
 
-    def facts(self, option: str = "") -> dict[str, str]:
+    def facts(self, option: str = "", program: str = "tune-jobs") -> dict[str, str]:
         """Return what is known, each with its name, for a reader.
 
         Args:
             option: What a command needs besides the sweep's name to find it.
+            program: How a command begins.
         """
         facts = {
             "sweep": self.sweep.name,
@@ -80,7 +81,7 @@ class SweepStatus:
             "trials": f"{self.sweep.num_trials:,}: {self.told_counts}",
             "best so far": _best_text(self.best),
             "speed": "" if self.env_steps_per_s is None else f"{self.env_steps_per_s:,.0f} env steps/s",
-            "time left": self._time_left(option),
+            "time left": self._time_left(option, program),
             "run time": self._run_time(),
         }
         return {name: text for name, text in facts.items() if text}
@@ -94,12 +95,12 @@ class SweepStatus:
         share = 100 * self.num_env_steps // self.max_env_steps
         return f"{share} %: {self.num_env_steps:,} of at most {counted(self.max_env_steps, 'env step')}"
 
-    def _time_left(self, option: str) -> str:
+    def _time_left(self, option: str, program: str) -> str:
         if not self.alive:
             if self.sweep.state == "completed":
                 return ""
             verb = "starts" if self.sweep.state == "created" else "continues"
-            return f"nothing runs; `tune-jobs resume {shlex.quote(self.sweep.name)}{option}` {verb} it"
+            return f"nothing runs; `{program} resume {shlex.quote(self.sweep.name)}{option}` {verb} it"
         if self.sweep.state == "completed":
             return "the trials are done; the best is being confirmed and filmed, and the report written"
         if self.time_left_s is None:

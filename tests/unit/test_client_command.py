@@ -1,0 +1,363 @@
+"""The command line with --server: what is printed is what is printed on the service's machine; what is refused."""
+
+import json
+import re
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from cutting_proxy import cutting_proxy
+from fake_sweeps import RunCommand
+from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
+from sweep_folders import make_sweep_folder
+from test_service_downloads import FILM, PAGE, make_finished
+
+from tune_jobs.cli import remote_runs
+from tune_jobs.cli.commands import cli
+from tune_jobs.cli.server import THERE
+from tune_jobs.client import event_stream
+from tune_jobs.service.views import SweepView
+from tune_jobs.store.sweep_store import SweepStore
+
+# ruff: noqa: F811 - fixtures are named as arguments
+
+YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\nconfirm: none\n"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    """A service with sweeps that have ended, failed, and were interrupted, for tests that only look."""
+    with serving(tmp_path_factory.mktemp("commands") / "sweeps") as made:
+        make_finished(made.storage / "mine")
+        failed = make_sweep_folder(
+            made.storage / "failed", space={"lr": {"uniform": [0.1, 0.2]}, "gamma": {"grid": [0.9, 0.99]}}
+        )
+        trial = failed.trial("t0001")
+        changes = {"status": "failed", "error": "ValueError: [bold]é\u2028 broke", "time_s": float("nan")}
+        trial.write_record(trial.read_record().model_copy(update=changes))
+        stopped = make_sweep_folder(made.storage / "stopped")
+        trial = stopped.trial("t0003")
+        trial.write_record(trial.read_record().model_copy(update={"status": "paused", "num_env_steps": 3}))
+        stopped.write_record(stopped.read_record().model_copy(update={"state": "interrupted", "run_time_s": 71.5}))
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("TUNE_JOBS_SERVER", "TUNE_JOBS_TOKEN", "TUNE_JOBS_TOKEN_FILE", "HTTP_PROXY", "http_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(event_stream, "_WAIT_S", 0.02)
+    monkeypatch.setattr(SweepView, "interval_s", 0.05)
+
+
+# -- the same output
+
+
+@pytest.mark.parametrize("json_option", [(), ("--json",)], ids=["text", "json"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "list", "status mine", "status failed", "status stopped", "trials mine", "trials failed", "trials stopped",
+        "trials mine --sort lr", "trials failed --top 2", "trials mine --sort none", "best mine", "best none",
+        "status none", "trials none", "stop mine",
+    ],
+)  # fmt: skip
+def test_what_is_printed_is_what_is_printed_there(
+    run: RunCommand, site: Live, arguments: str, json_option: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (*arguments.split(), *json_option)
+    if "best mine" in arguments:
+        # It would evaluate there, and has been evaluated.
+        best = SweepStore(site.storage / "mine").read_best()
+        monkeypatch.setattr("tune_jobs.sweeps.verbs.best", lambda *_, **__: best)
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", str(site.storage))
+    here = run(*words)
+    monkeypatch.delenv("TUNE_JOBS_STORAGE")
+    monkeypatch.setenv("TUNE_JOBS_SERVER", site.url)
+    there = run(*words)
+    assert there.exit_code == here.exit_code
+    if arguments.endswith(" none") and "sort" not in arguments:
+        # There is another sentence about where it was looked for.
+        assert "none" in there.stderr
+        assert here.stderr.splitlines()[-1] == there.stderr.splitlines()[-1] or here.exit_code == 4
+    else:
+        assert there.stdout == here.stdout
+        assert there.stderr == here.stderr
+    monkeypatch.delenv("TUNE_JOBS_SERVER")
+    # Longer commands in hints make wider columns.
+    by_option = run("--server", site.url, *words).stdout.replace(f" --server {site.url}", "")
+    assert re.sub(" +\n", "\n", by_option) == re.sub(" +\n", "\n", there.stdout)
+
+
+def test_commands_in_hints_go_to_the_same_service(run: RunCommand, site: Live) -> None:
+    printed = run("--server", site.url, "status", "stopped").stdout
+    assert f"`tune-jobs --server {site.url} resume stopped` continues it" in printed
+
+
+def test_a_plan_is_the_services(run: RunCommand, site: Live, tmp_path: Path) -> None:
+    (tmp_path / "poles.yaml").write_text(YAML)
+    here = run("launch", "poles.yaml", "--dry-run", "--set", "num_samples=2", "--name", "x")
+    there = run("--server", site.url, "launch", "poles.yaml", "--dry-run", "--set", "num_samples=2", "--name", "x")
+    assert here.exit_code == there.exit_code == 0, there.stderr
+
+    def plain(text: str) -> str:
+        # Env steps take another time at each measurement, and the machine is told otherwise.
+        return re.sub(r"[\d.]+ us per step|this machine|the service's machine|[─ -]+\n", "", text)
+
+    assert plain(there.stdout) == plain(here.stdout)
+    assert "the service's machine has" in there.stdout
+    document = json.loads(run("--server", site.url, "launch", "poles.yaml", "--dry-run", "--json").stdout)
+    assert document["plan"]["num_trials"] == 3
+    wrong = run("--server", site.url, "launch", "poles.yaml", "--dry-run", "--set", "space.hiden_sizes=[[1]]")
+    assert wrong.exit_code == 2
+    assert "poles.yaml: 2 problems" in wrong.stderr
+    assert "(from --set)" in wrong.stderr
+
+
+# -- files
+
+
+def test_report_and_films_are_downloaded(run: RunCommand, site: Live, tmp_path: Path) -> None:
+    assert "mine-report.html" in run("--server", site.url, "report", "mine").stdout
+    assert (tmp_path / "mine-report.html").read_text() == PAGE
+    run("--server", site.url, "report", "mine", "-o", "new/")
+    assert (tmp_path / "new" / "mine-report.html").read_text() == PAGE
+    run("--server", site.url, "report", "mine", "-o", "page.html")
+    assert (tmp_path / "page.html").read_text() == PAGE
+    printed = json.loads(run("--server", site.url, "video", "mine", "--json").stdout)
+    assert printed.keys() == {"before_mp4", "after_mp4", "after_gif", "before_after_mp4"}
+    assert (tmp_path / "mine-before_after.mp4").read_bytes() == FILM
+    assert json.loads(run("--server", site.url, "video", "mine", "-o", "my/film.mp4", "--json").stdout) == {
+        "mp4": "my/film.mp4", "gif": "my/film.gif",
+    }  # fmt: skip
+    for words, code in (("report failed", 4), ("video failed", 4), ("video mine/t0001", 2)):
+        assert run("--server", site.url, *words.split()).exit_code == code
+
+
+# -- what is refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("launch x.yaml --address auto", "--address"), ("launch x.yaml --no-finish", "--no-finish"),
+        ("resume mine --storage s", "--storage"), ("extend mine --num-samples 2 --allow-module m", "--allow-module"),
+        ("launch x.yaml --dry-run --address auto", "--address"), ("status mine --storage s", "--storage"),
+        ("best mine --num-episodes 7", "--num-episodes"), ("video mine --seed 3", "--seed"),
+        ("evaluate mine", "`tune-jobs evaluate`"), ("compare mine other", "`tune-jobs compare`"),
+        ("export mine", "`tune-jobs export`"), ("importance mine", "`tune-jobs importance`"),
+        ("reproduce mine/t0001", "`tune-jobs reproduce`"), ("serve", "`tune-jobs serve`"),
+        ("token list", "`tune-jobs token list`"), ("launch none.yaml", "none.yaml"),
+        ("status a/b", "is no name of a sweep"),
+    ],
+)  # fmt: skip
+def test_what_goes_with_no_service_is_refused(run: RunCommand, site: Live, arguments: str, words: str) -> None:
+    result = run("--server", site.url, *arguments.split())
+    assert result.exit_code == 2, result.output
+    assert words in result.stderr
+    assert "error: " in result.stderr
+
+
+def test_all_commands_are_done_there_or_refused_or_about_nothing_there() -> None:
+    about_neither = {"presets", "hyperparams", "schema"}
+    refused = {"evaluate", "compare", "export", "importance", "reproduce", "serve", "token"}
+    assert {*THERE, *about_neither, *refused} == cli.commands.keys()
+    assert "--output" in {name for item in cli.commands["report"].params for name in item.opts}
+    assert isinstance(cli, click.Group)
+
+
+def test_what_is_about_no_sweep_needs_no_service(run: RunCommand) -> None:
+    for words in ("presets", "hyperparams ppo", "schema", "--version"):
+        assert run("--server", "http://127.0.0.1:1", *words.split()).exit_code == 0
+    # An empty one is none.
+    assert "no sweeps" in run("--server", "", "list").stdout
+    assert run("report", "mine", "-o", "x").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("url", "code", "words"),
+    [
+        ("http://127.0.0.1:1", 5, "can't be reached"), ("127.0.0.1:8470", 2, "http://"),
+        ("http://ann:s3cret@127.0.0.1:1", 2, "password"),
+    ],
+)  # fmt: skip
+def test_addresses_are_checked(run: RunCommand, url: str, code: int, words: str) -> None:
+    result = run("--server", url, "list", "--json")
+    assert result.exit_code == code
+    assert words in result.stderr
+    assert words in json.loads(result.stdout)["error"]
+    assert "s3cret" not in result.output
+
+
+def test_a_token_comes_from_the_environment_or_a_file(
+    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = tmp_path / "kept"
+    secret = run("token", "make", "ann", "--role", "viewer", "--storage", storage).stdout.strip()
+    with serving(storage, require_token=True) as made:
+        asked = ("--server", made.url, "list")
+        assert run(*asked).exit_code == 5
+        assert "TUNE_JOBS_TOKEN" in run(*asked).stderr
+        monkeypatch.setenv("TUNE_JOBS_TOKEN", secret)
+        assert run(*asked).exit_code == 0
+        monkeypatch.setenv("TUNE_JOBS_TOKEN", "wrong")
+        (tmp_path / "token").write_text(secret)
+        assert run("--token-file", "token", *asked).exit_code == 0
+
+
+# -- runs that are followed
+
+
+class Queue:
+    """Does what the processes of a service do, while a command follows."""
+
+    def __init__(self, live: Live) -> None:
+        self.live = live
+        self.jobs = live.service.queue
+
+    def wait_for_job(self) -> int:
+        wait_until(lambda: self.jobs.jobs("waiting"))
+        return self.jobs.jobs("waiting")[0].id
+
+    def watched(self) -> None:
+        wait_until(lambda: self.live.service.watching.num_watchers > 0)
+
+    def finish(
+        self, name: str, outcome: Any = "completed", message: str | None = None, until: Any = lambda: True
+    ) -> None:
+        number = self.wait_for_job()
+        self.watched()
+        assert self.jobs.claim(8.0) is not None
+        wait_until(until)
+        store = SweepStore(self.live.storage / name)
+        if outcome == "completed" and not store.has_best():
+            record = store.read_record()
+            store.write_record(record.model_copy(update={"state": "completed"}))
+        self.jobs.end(number, outcome, message)
+
+
+def during(what: Any) -> threading.Thread:
+    thread = threading.Thread(target=what, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_launch_is_followed_to_its_end(
+    run: RunCommand, live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote_runs, "_LINE_INTERVAL_S", 0.0)
+    (tmp_path / "poles.yaml").write_text(YAML)
+    queue = Queue(live)
+    said: list[str] = []
+    follow = remote_runs._followed
+
+    def followed(client: Any, job: Any, say: Any) -> Any:
+        def say_both(line: str) -> None:
+            said.append(line)
+            say(line)
+
+        return follow(client, job, say_both)
+
+    monkeypatch.setattr(remote_runs, "_followed", followed)
+    worker = during(lambda: queue.finish("poles", message="It can't be drawn.", until=lambda: "poles: runs" in said))
+    result = run("--server", live.url, "launch", "poles.yaml", "--set", "num_samples=2")
+    worker.join(30)
+    assert result.exit_code == 3, result.output
+    lines = result.stderr.splitlines()
+    assert lines[0] == "poles: waits for its turn"
+    assert "poles: runs" in lines
+    assert said == lines
+    assert "0 %, 0 env steps" in lines[-1]
+    assert "no best policy: It can't be drawn." in result.stdout
+    assert f"{live.url}/#/sweeps/poles" in result.stdout
+    assert live.service.storage.sweep("poles").read_record().spec["num_samples"] == 2
+
+
+def test_a_resumed_sweep_ends_with_the_result_of_one_that_runs_here(run: RunCommand, live: Live) -> None:
+    make_finished(live.storage / "mine")
+    worker = during(lambda: Queue(live).finish("mine"))
+    result = run("--server", live.url, "resume", "mine", "--json", "--progress", "none")
+    worker.join(30)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    document = json.loads(result.stdout)
+    assert document.keys() == {
+        "folder", "sweep", "trials", "best", "why_no_best", "artifacts", "interrupted", "notes", "finish_failed",
+        "exit_code",
+    }  # fmt: skip
+    assert document["best"]["checkpoint"]["trial_id"] == "t0003"
+    assert document["artifacts"]["report"] == f"{live.url}/api/v1/sweeps/mine/report/"
+    assert live.get("/sweeps/mine/films/after_gif").status_code == 200
+    assert document["artifacts"].keys() == {
+        "policy", "before_mp4", "after_mp4", "after_gif", "before_after_mp4", "report",
+    }  # fmt: skip
+
+
+def test_what_stops_a_sweep_there_ends_its_command_here(run: RunCommand, live: Live) -> None:
+    make_sweep_folder(live.storage / "mine")
+    queue = Queue(live)
+    worker = during(lambda: queue.finish("mine", "stopped"))
+    result = run("--server", live.url, "extend", "mine", "--num-samples", "2")
+    worker.join(30)
+    assert result.exit_code == 130
+    assert result.stderr.splitlines()[-1].endswith(f"tune-jobs --server {live.url} resume mine")
+    worker = during(lambda: queue.finish("mine", "failed", "ValueError: no CPU is left"))
+    result = run("--server", live.url, "replicate", "mine", "--json")
+    worker.join(30)
+    assert result.exit_code == 1
+    assert "no CPU is left" in json.loads(result.stdout)["error"]
+
+
+def test_failed_trials_are_retried_if_there_are_any(run: RunCommand, live: Live) -> None:
+    store = make_sweep_folder(live.storage / "mine")
+    queue = Queue(live)
+    for status, verb in (("completed", "drive"), ("failed", "retry")):
+        trial = store.trial("t0000")
+        trial.write_record(trial.read_record().model_copy(update={"status": status, "error": "it broke"}))
+        # A sweep whose record is the same has not changed, for a service.
+        store.write_record(store.read_record())
+        worker = during(lambda: queue.finish("mine"))
+        result = run("--server", live.url, "resume", "mine", "--retry-failed")
+        worker.join(30)
+        assert result.exit_code == 3, result.output
+        assert live.service.queue.jobs()[-1].verb == verb
+
+
+def test_ctrl_c_stops_following_and_not_the_sweep(
+    run: RunCommand, live: Live, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "poles.yaml").write_text(YAML)
+
+    def interrupted(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(remote_runs, "_followed", interrupted)
+    result = run("--server", live.url, "launch", "poles.yaml", "--json")
+    assert result.exit_code == 130
+    assert f"Stop it with: tune-jobs --server {live.url} stop poles" in result.stderr
+    assert json.loads(result.stdout)["exit_code"] == 130
+    assert [job.state for job in live.service.queue.jobs()] == ["waiting"]
+    assert "stops after" in run("--server", live.url, "stop", "poles").stdout
+    assert "not running" in run("--server", live.url, "stop", "poles").stdout
+
+
+def test_following_goes_on_where_the_connection_was_lost(run: RunCommand, live: Live) -> None:
+    make_sweep_folder(live.storage / "mine")
+    with cutting_proxy(live.url) as proxy:
+        queue = Queue(live)
+
+        def work() -> None:
+            queue.wait_for_job()
+            queue.watched()
+            proxy.cut_all()
+            queue.finish("mine")
+
+        worker = during(work)
+        result = run("--server", proxy.url, "resume", "mine")
+        worker.join(30)
+        assert result.exit_code == 3, result.output
+        assert result.stderr.startswith("mine: waits for its turn\n")
+        assert len([request for request in proxy.requests if b"/events " in request]) <= 2

@@ -1,0 +1,123 @@
+"""The verbs of the command line as a service does them: with the arguments and results of `tune_jobs.sweeps.verbs`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from policies.errors import NotFoundError, SpecError
+from tune_jobs.client import Client, ConflictError
+
+if TYPE_CHECKING:
+    from analysis.records import BestRecord, TrialRecord
+    from tune_jobs.plan.sweep_plan import SweepPlan
+    from tune_jobs.spec.sweep_spec import SweepSpec
+    from tune_jobs.sweeps.status import SweepStatus
+
+_FILMS = "films/"
+
+
+class RemoteVerbs:
+    """What commands do, done by a service; `storage` is its own.
+
+    Args:
+        client: The service.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def status(self, sweep: str, *, storage: None = None) -> SweepStatus:  # noqa: ARG002
+        """Return the status of a sweep."""
+        return self._client.status(sweep)
+
+    def list_sweeps(self, storage: None = None) -> list[SweepStatus]:  # noqa: ARG002
+        """Return the status of every sweep, by name."""
+        return self._client.list_sweeps()
+
+    def trials(self, sweep: str, *, storage: None = None) -> list[TrialRecord]:  # noqa: ARG002
+        """Return the records of a sweep's trials, by index."""
+        return self._client.records(sweep)
+
+    def stop(self, sweep: str, *, storage: None = None) -> bool:  # noqa: ARG002
+        """Ask a sweep to stop; return whether it ran or waited."""
+        try:
+            self._client.stop(sweep)
+        except ConflictError:
+            return False
+        return True
+
+    def best(self, sweep: str, *, storage: None = None, num_episodes: int = 0) -> BestRecord:  # noqa: ARG002
+        """Return the policy that was chosen when the sweep ended."""
+        return self._client.best(sweep)
+
+    def report(self, sweep: str, *, storage: None = None, output: str | None = None) -> Path:  # noqa: ARG002
+        """Download the page of a sweep's report, and return its path."""
+        default = f"{sweep}-report.html"
+        to = Path(default) if output is None else Path(output) / default if _is_folder(output) else Path(output)
+        return self._client.download(sweep, "report/", to)
+
+    def video(self, source: str, *, output: str | None = None, **_: Any) -> dict[str, Path]:
+        """Download the films of a sweep's best policy, and return their paths.
+
+        Args:
+            source: The sweep.
+            output: A folder for all of them; or a file for that of the trained policy, as .mp4 and .gif.
+
+        Raises:
+            NotFoundError: It has none.
+        """
+        if "/" in source or source in ("random", "constant"):
+            raise SpecError(
+                f"A service has films of sweeps' best policies; {source!r} is no sweep.", "Name a sweep, by its name."
+            )
+        known = [file.path.removeprefix(_FILMS) for file in self._client.files(source) if file.path.startswith(_FILMS)]
+        if output is None or _is_folder(output):
+            wanted = {film: Path(output or ".") / f"{source}-{'.'.join(film.rsplit('_', 1))}" for film in known}
+            names = {film: film for film in known}
+        else:
+            names = {film: film.removeprefix("after_") for film in ("after_mp4", "after_gif") if film in known}
+            wanted = {film: Path(output).with_suffix(f".{suffix}") for film, suffix in names.items()}
+        if not wanted:
+            raise NotFoundError(
+                f"Sweep {source} has no film of its best policy.", "They are made when the sweep has ended."
+            )
+        return {names[film]: self._client.download(source, _FILMS + film, to) for film, to in wanted.items()}
+
+    def planned(self, source: str, overrides: Sequence[str], *, name: str | None = None) -> tuple[SweepSpec, SweepPlan]:
+        """Return the sweep and the plan that the service would run.
+
+        Raises:
+            SpecError: The sweep is wrong, or not allowed there.
+            CannotRunError: It cannot run there.
+        """
+        from tune_jobs.plan.machine import Machine
+        from tune_jobs.plan.sweep_plan import SweepPlan
+        from tune_jobs.spec.sweep_spec import SweepSpec
+
+        try:
+            found = self._client.plan(source, overrides=overrides, name=name)
+        except SpecError as error:
+            raise told_here(error, source, overrides) from error
+        spec, plan = SweepSpec.model_validate(found.spec), SweepPlan.from_json(found.plan)
+        if plan.machine.source == Machine(1).source:
+            plan = dataclasses.replace(plan, machine=dataclasses.replace(plan.machine, source="the service's machine"))
+        return spec if name is None else spec.model_copy(update={"name": name}), plan
+
+
+def told_here(error: SpecError, source: str, overrides: Sequence[str]) -> SpecError:
+    """Return a service's error about a sweep in the words of this machine, which knows the file's name, if it can."""
+    from tune_jobs.spec.file import load_spec
+
+    try:
+        load_spec(source, overrides)
+    except SpecError as here:
+        return here
+    # It is about more than the file, such as its environment, or what is allowed there.
+    return error
+
+
+def _is_folder(output: str) -> bool:
+    return output.endswith("/") or Path(output).is_dir()

@@ -1,0 +1,206 @@
+"""What runs trials, done by a service: asked for, followed line by line to its end, and its result."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import quote
+
+import click
+
+from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
+from policies.errors import NotFoundError, SpecError, TuneJobsError
+from tune_jobs.cli.base import losing_what_nobody_reads, stdout_for
+from tune_jobs.cli.remote import told_here
+from tune_jobs.cli.server import Server
+from tune_jobs.client.answers import Job, Summary
+
+if TYPE_CHECKING:
+    from tune_jobs.client import Client
+
+_LINE_INTERVAL_S = 10.0
+"""As of a sweep that runs here without a terminal."""
+_INTERRUPTED = 130
+_MOST_POINT = 60
+_STATES = {"creating": "is being written", "waiting": "waits for its turn", "running": "runs", "ended": "has ended"}
+_ARTIFACTS = {
+    "policy": "policy", "before_mp4": "films/before_mp4", "after_mp4": "films/after_mp4",
+    "after_gif": "films/after_gif", "before_after_mp4": "films/before_after_mp4", "report": "report/",
+}  # fmt: skip
+"""What a result names, and where it is had: it is there if a file's path begins so."""
+
+
+def run_there(
+    server: Server, verb: str, arguments: Sequence[Any], *, as_json: bool, progress: str = "auto", **options: Any
+) -> int:
+    """Have a service do it, follow it until its end, and print the result.
+
+    Args:
+        server: The service.
+        verb: launch, resume, extend, inject or replicate.
+        arguments: Those of the verb that have no names.
+        as_json: Whether to print one JSON document.
+        progress: `none`: no lines while it runs.
+        options: Further arguments of the verb.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        TuneJobsError: The service refuses, or it failed there.
+    """
+
+    def say(line: str) -> None:
+        if progress != "none":
+            with losing_what_nobody_reads(False):  # noqa: FBT003
+                click.echo(line, err=True)
+
+    with server.client() as client, stdout_for(as_json=as_json):
+        found = _done(server, client, verb, arguments, options, say)
+    return _say_left(found, as_json=as_json) if isinstance(found, _Left) else _show(found, server, as_json=as_json)
+
+
+class _Left(NamedTuple):
+    """Why a sweep is no longer followed, and what to do now."""
+
+    message: str
+    hint: str
+
+
+def _done(  # noqa: PLR0917 (all of them are one request)
+    server: Server,
+    client: Client,
+    verb: str,
+    arguments: Sequence[Any],
+    options: dict[str, Any],
+    say: Callable[[str], None],
+) -> dict[str, Any] | _Left:
+    try:
+        job = _begun(client, verb, arguments, options)
+    except KeyboardInterrupt:
+        return _Left("Interrupted while it was being asked for.", f"See whether it is there: {server.program} list")
+    name = shlex.quote(job.sweep)
+    try:
+        job = _followed(client, job, say)
+    except KeyboardInterrupt:
+        message = f"No longer followed; {job.sweep} goes on at {client.url}."
+        return _Left(message, f"Stop it with: {server.program} stop {name}")
+    if job.outcome == "failed":
+        raise TuneJobsError(
+            f"Sweep {job.sweep} failed at {client.url}: {job.message or 'nothing is known of why'}",
+            f"Continue with: {server.program} resume {name}",
+        )
+    return _result(client, job)
+
+
+def _say_left(left: _Left, *, as_json: bool) -> int:
+    with losing_what_nobody_reads(True):  # noqa: FBT003
+        click.echo(" ".join(left), err=True)
+        if as_json:
+            from tune_jobs.cli.output import print_json
+
+            print_json({"error": left.message, "hint": left.hint, "exit_code": _INTERRUPTED})
+    return _INTERRUPTED
+
+
+def _begun(client: Client, verb: str, arguments: Sequence[Any], options: dict[str, Any]) -> Job:
+    name = arguments[0]
+    match verb:
+        case "launch":
+            try:
+                return client.submit(name, overrides=options["overrides"], name=options["name"]).job
+            except SpecError as error:
+                raise told_here(error, name, options["overrides"]) from error
+        case "extend":
+            return client.extend(name, arguments[1])
+        case "inject":
+            return client.inject(name, arguments[1])
+        case "replicate":
+            return client.replicate(name, top=options["top"], seeds=options["seeds"])
+        case _:
+            # As here: without a failed trial there is nothing to retry, and whatever else is missing is run.
+            has_failed = options["retry_failed"] and client.status(name).counts.get("failed")
+            return client.retry(name) if has_failed else client.resume(name)
+
+
+def _followed(client: Client, job: Job, say: Callable[[str], None]) -> Job:
+    """Say how far a job is until it has ended, and return it."""
+    began = told_at = time.monotonic()
+    state, seen = job.state, None
+    say(f"{job.sweep}: {_STATES.get(state, state)}")
+    for event, now in client.job_events(job):
+        job = now
+        if event.kind == "status":
+            seen = Summary.model_validate(event.data)
+        if job.state != state:
+            state = job.state
+            say(f"{job.sweep}: {_STATES.get(state, state)}")
+        elif state == "running" and seen is not None and time.monotonic() - told_at >= _LINE_INTERVAL_S:
+            told_at = time.monotonic()
+            say(_line(seen, told_at - began))
+    if job.outcome in ("completed", "stopped"):
+        say(_line(client.sweep(job.sweep), time.monotonic() - began))
+    return job
+
+
+def _line(seen: Summary, elapsed_s: float) -> str:
+    """Describe the state of a sweep in one line, as one that runs here is."""
+    words = [f"{seen.name}: {duration(elapsed_s, tenths=False)}"]
+    steps = counted(seen.num_env_steps, "env step")
+    words.append(f"{100 * seen.num_env_steps // seen.max_env_steps} %, {steps}" if seen.max_env_steps else steps)
+    words.append(", ".join(f"{count} {status}" for status, count in sorted(seen.counts.items()) if count))
+    if seen.best is not None:
+        point = ", ".join(f"{name} {short_text(value)}" for name, value in seen.best["point"].items())
+        point = point if len(point) <= _MOST_POINT else f"{point[:_MOST_POINT]} ..."
+        score, trial = return_text(seen.best["score"]), seen.best["trial_id"]
+        words.append(f"best {score} ({trial}: {point or 'no searched values'})")
+    if seen.time_left_s:
+        words.append(f"about {duration(seen.time_left_s, tenths=False, none=PLAIN_NONE)} left")
+    return "; ".join(words)
+
+
+def _result(client: Client, job: Job) -> dict[str, Any]:
+    """Return what a launch on this machine returns, its paths as addresses."""
+    name, is_whole = job.sweep, job.outcome == "completed"
+    best, trials = None, client.records(name)
+    if is_whole:
+        try:
+            best = client.best(name)
+        except NotFoundError:
+            best = None
+    files = {file.path for file in client.files(name)} if is_whole else set()
+    at = f"{client.url}/api/v1/sweeps/{quote(name)}"
+    has_failed = any(trial.status == "failed" for trial in trials)
+    return {
+        "folder": f"{client.url}/#/sweeps/{quote(name)}",
+        "sweep": client.status(name).sweep,
+        "trials": trials,
+        "best": best,
+        "why_no_best": (job.message or "the service does not say why") if is_whole and best is None else None,
+        "artifacts": {
+            what: f"{at}/{path}" for what, path in _ARTIFACTS.items() if any(file.startswith(path) for file in files)
+        },
+        "interrupted": not is_whole,
+        "notes": [job.message] if is_whole and best is not None and job.message else [],
+        "finish_failed": is_whole and best is None,
+        "exit_code": _INTERRUPTED if not is_whole else 3 if has_failed or best is None else 0,
+    }
+
+
+def _show(result: dict[str, Any], server: Server, *, as_json: bool) -> int:
+    from tune_jobs.cli import output
+
+    with losing_what_nobody_reads(result["interrupted"]):
+        if as_json:
+            output.print_json(result)
+        else:
+            output.print_outcome(
+                result["sweep"], result["trials"], best=result["best"], why_no_best=result["why_no_best"],
+                paths={"sweep": result["folder"], **result["artifacts"]}, notes=result["notes"],
+            )  # fmt: skip
+        if result["interrupted"]:
+            output.say_interrupted(result["sweep"], f"{server.program} resume {shlex.quote(result['sweep'].name)}")
+    code: int = result["exit_code"]
+    return code

@@ -1,0 +1,39 @@
+"""The commands that run trials: here, or by a service that is followed until the end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from tune_jobs.cli.base import losing_what_nobody_reads, result_of, stdout_for
+from tune_jobs.cli.server import refuse_options, server_of
+
+
+def run_verb(
+    ctx: click.Context, verb: str, *arguments: Any, storage: str | None, as_json: bool, **options: Any
+) -> None:
+    """Do a launch, resume, extend, inject or replicate, print its result, and exit with its code.
+
+    Args:
+        ctx: The command.
+        verb: The name of the function in `tune_jobs.sweeps.verbs`.
+        arguments: Those of the function that have no names.
+        storage: Folder for sweeps.
+        as_json: Whether to print one JSON document.
+        options: Further arguments of the function.
+    """
+    server = server_of()
+    if server is not None:
+        refuse_options()
+        from tune_jobs.cli.remote_runs import run_there
+
+        ctx.exit(run_there(server, verb, arguments, as_json=as_json, **options))
+    from tune_jobs.cli import output as cli_output
+    from tune_jobs.sweeps import verbs as sweeps
+
+    with stdout_for(as_json=as_json):
+        result = result_of(getattr(sweeps, verb), *arguments, storage=storage, **options)
+    with losing_what_nobody_reads(result.interrupted):
+        cli_output.show_result(result, storage=storage, as_json=as_json)
+    ctx.exit(result.exit_code)
