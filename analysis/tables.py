@@ -280,6 +280,10 @@ def write_csv(path: Path, frame: pd.DataFrame) -> None:
     write_atomic(path, csv_text(frame))
 
 
+# The wide forms of the signs, too, which spreadsheets for Chinese, Japanese and Korean take as the signs.
+_FORMULAS = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
+
+
 def csv_text(frame: pd.DataFrame) -> str:
     """Return a frame as CSV, without its index.
 
@@ -293,4 +297,4 @@ def csv_text(frame: pd.DataFrame) -> str:
 
 
 def _defuse(value: Any) -> Any:
-    return f"'{value}" if isinstance(value, str) and value[:1] in {"=", "+", "-", "@", "\t", "\r"} else value
+    return f"'{value}" if isinstance(value, str) and value[:1] in _FORMULAS else value

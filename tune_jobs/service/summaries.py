@@ -87,6 +87,20 @@ def trial_row(record: TrialRecord, score: float | None, fields: Sequence[str] | 
     return {name: score if name == "score" else to_json(getattr(record, name)) for name in fields}
 
 
+def check_sort(name: str, records: Sequence[TrialRecord]) -> None:
+    """Check that trials can be sorted by something.
+
+    Raises:
+        SpecError: It is no field of theirs, and no hyperparameter that is searched.
+    """
+    searched = {searched for record in records for searched in record.point}
+    if name not in {"score", *TrialRecord.model_fields} | searched:
+        raise SpecError(
+            f"sort: trials have no column {name[:80]!r}.",
+            f"They have {', '.join(['score', *sorted(searched), *sorted(TrialRecord.model_fields)])}.",
+        )
+
+
 def wanted_fields(text: str) -> list[str]:
     """Return the names of a trial's fields that a text lists, separated by commas.
 

@@ -8,7 +8,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 
 from tune_jobs.service.access.credentials import WRONG_TOKEN, set_cookie
 from tune_jobs.service.http.caller import AnAdmin, TheCaller, TheService
-from tune_jobs.service.http.models import AuditPage, LoggedIn, Login
+from tune_jobs.service.http.models import TEXT, AuditPage, LoggedIn, Login
 from tune_jobs.service.problem_documents import problems
 
 _LONGEST_S = 30 * 86_400
@@ -52,8 +52,10 @@ def audit(
     service: TheService,
     _: AnAdmin,
     *,
-    who: Annotated[str | None, Query(max_length=100, description="Only what this person did.")] = None,
-    target: Annotated[str | None, Query(max_length=200, description="Only what was done with this sweep.")] = None,
+    who: Annotated[str | None, Query(max_length=100, pattern=TEXT, description="Only what this person did.")] = None,
+    target: Annotated[
+        str | None, Query(max_length=200, pattern=TEXT, description="Only what was done with this sweep.")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=1_000, description="The most entries of a page.")] = 100,
     cursor: Annotated[str | None, Query(max_length=100, description="`next_cursor` of the page before.")] = None,
 ) -> AuditPage:

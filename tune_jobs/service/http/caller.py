@@ -35,7 +35,9 @@ def submitter_of(request: Request) -> Caller:
 def changer_of(request: Request, name: str) -> Caller:
     """Return who asks, who may change the sweep in the path."""
     caller = submitter_of(request)
-    label = service_of(request).labels.of(name)
+    service = service_of(request)
+    # What can be no name at all is nothing to ask a database for.
+    label = service.labels.of(service.storage.sweep(name).name)
     if not caller.may_change(label):
         raise HTTPException(403, f"Sweep {name} belongs to {label.owner or 'nobody'}; only they and admins change it.")
     return caller

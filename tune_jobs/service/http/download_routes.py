@@ -12,7 +12,7 @@ from fastapi import Path as PathParameter
 from policies.errors import NotFoundError
 from policies.portable.file import policy_files
 from tune_jobs.service.http.caller import TheService
-from tune_jobs.service.http.downloads import NO_SCRIPTS, SANDBOX, Archive, Download
+from tune_jobs.service.http.downloads import NO_SCRIPTS, SANDBOX, Archive, Download, attachment
 from tune_jobs.service.http.models import FileOfSweep
 from tune_jobs.service.service import Service
 from tune_jobs.store.contract import Sweep
@@ -123,14 +123,14 @@ def checkpoint(name: str, trial_id: str, iteration: Iteration, service: TheServi
 @router.get("/trials.csv", responses={200: {"content": {"text/csv": {}}}}, response_class=Response)
 def trials_csv(name: str, service: TheService) -> Response:
     """Download the table of trials, as `tune-jobs export` writes it; of a running sweep as of a while ago."""
-    headers = {"Content-Disposition": f'attachment; filename="{name}-trials.csv"'}
+    headers = {"Content-Disposition": attachment(f"{name}-trials.csv")}
     return Response(service.derived.trials_csv(name), media_type="text/csv; charset=utf-8", headers=headers)
 
 
 @router.get("/file", responses={200: {"content": {"application/gzip": {}}}}, response_class=Response)
 def sweep_file(name: str, service: TheService) -> Response:
     """Download the sweep as one file, which the page of any service shows; of a running sweep as of a while ago."""
-    headers = {"Content-Disposition": f'attachment; filename="{name}.tunejobs"'}
+    headers = {"Content-Disposition": attachment(f"{name}.tunejobs")}
     return Response(service.derived.sweep_file(name), media_type="application/gzip", headers=headers)
 
 

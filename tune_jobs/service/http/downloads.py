@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import quote
 
 from starlette.datastructures import Headers
 from starlette.responses import FileResponse, Response, StreamingResponse
@@ -18,6 +20,7 @@ from policies.errors import CheckpointError, NotFoundError
 from policies.files import open_regular, refuse_others
 from tune_jobs.service.problem_documents import problem
 
+_PLAIN_NAME = re.compile(r"[\w.-]+", re.ASCII)
 _CHUNK_BYTES = 256 * 1024
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 _ZIP64_BYTES = 2**31 - 1
@@ -95,6 +98,13 @@ def _matches(wanted: str, tag: str) -> bool:
     return wanted.strip() == "*" or tag in known
 
 
+def attachment(filename: str) -> str:
+    """Return the header Content-Disposition for a file that a browser keeps, whatever its name has in it (RFC 6266)."""
+    if _PLAIN_NAME.fullmatch(filename):
+        return f'attachment; filename="{filename}"'
+    return f"attachment; filename*=UTF-8''{quote(filename, safe='', errors='replace')}"
+
+
 class Archive(StreamingResponse):
     """Some files as one ZIP archive, which is made while it is sent.
 
@@ -116,7 +126,7 @@ class Archive(StreamingResponse):
         except OSError as error:
             self._opened.close()
             raise NotFoundError(f"{error.filename or filename} can't be read any more.", "Ask again.") from error
-        headers = {"Content-Disposition": f'attachment; filename="{filename}"', "Cache-Control": "private, no-cache"}
+        headers = {"Content-Disposition": attachment(filename), "Cache-Control": "private, no-cache"}
         super().__init__(_zipped(streams), headers=headers)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

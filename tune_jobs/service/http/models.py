@@ -12,10 +12,12 @@ from tune_jobs.service.jobs import MAX_PRIORITY, Job
 from tune_jobs.service.submitting import Submission
 from tune_jobs.service.summaries import SweepSummary
 
+TEXT = r"^[^\x00]*$"
+"""Any text but one with the character of code 0, which PostgreSQL takes in no column."""
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Priority = Annotated[int, Field(ge=-MAX_PRIORITY, le=MAX_PRIORITY, description="Higher ones go first.")]
-Tags = Annotated[list[Annotated[str, Field(min_length=1, max_length=50)]], Field(max_length=20)]
-Note = Annotated[str, Field(max_length=2_000, description="A text for people.")]
+Tags = Annotated[list[Annotated[str, Field(min_length=1, max_length=50, pattern=TEXT)]], Field(max_length=20)]
+Note = Annotated[str, Field(max_length=2_000, pattern=TEXT, description="A text for people.")]
 
 
 class _Request(BaseModel):

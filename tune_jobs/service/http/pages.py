@@ -22,16 +22,16 @@ def page_of(
     cursor: str | None,
     limit: int,
 ) -> tuple[list[Item], str | None]:
-    """Return a page and the cursor of the next one; items without a key come last, whichever way.
+    """Return a page and the cursor of the next one.
 
-    A cursor names the last item of its page by key and identity: items that come and go between two pages neither
-    repeat nor hide others.
+    Texts come after numbers, and items without a key last, whichever way. A cursor names the last item of its
+    page by key and identity: items that come and go between two pages neither repeat nor hide others.
 
     Raises:
         SpecError: The cursor is not one of this list.
     """
     with_key = [(key(item), identity(item), item) for item in items]
-    known = sorted((entry for entry in with_key if entry[0] is not None), key=lambda entry: entry[:2])
+    known = sorted((entry for entry in with_key if entry[0] is not None), key=lambda entry: _place(entry[:2]))
     if descending:
         known.reverse()
     none = sorted((entry for entry in with_key if entry[0] is None), key=lambda entry: entry[1])
@@ -49,10 +49,12 @@ def _is_after(entry: tuple[Any, str], last: tuple[Any, str], *, descending: bool
         return entry[0] is None and entry[1] > last[1]
     if entry[0] is None:
         return True
-    try:
-        return entry < last if descending else entry > last
-    except TypeError as error:
-        raise _wrong() from error
+    return _place(entry) < _place(last) if descending else _place(entry) > _place(last)
+
+
+def _place(entry: tuple[Any, str]) -> tuple[bool, Any, str]:
+    # A hyperparameter may have numbers and texts; numbers come first.
+    return isinstance(entry[0], str), *entry
 
 
 def _encoded(last: tuple[Any, str]) -> str:

@@ -23,7 +23,7 @@ from tune_jobs.service.http.problems import NotNowError, TooManyError
 from tune_jobs.service.labels import NOTHING
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
-from tune_jobs.service.summaries import SweepSummary, jobs_by_sweep, summary, trial_row, wanted_fields
+from tune_jobs.service.summaries import SweepSummary, check_sort, jobs_by_sweep, summary, trial_row, wanted_fields
 from tune_jobs.sweeps.plain import to_json
 
 router = APIRouter(prefix="/api/v1", tags=["sweeps"])
@@ -196,6 +196,7 @@ def trials(
     """List the trials of a sweep."""
     known = service.statuses.see(name).trials
     wanted = None if fields is None else wanted_fields(fields)
+    check_sort(sort, known.records)
 
     def key(record: TrialRecord) -> Any:
         if sort == "score":
@@ -261,5 +262,6 @@ def log(
 
 def summary_of(service: Service, name: str) -> SweepSummary:
     """Return one sweep as a list shows it."""
+    seen = service.statuses.see(name)
     job = jobs_by_sweep(service.queue.jobs(sweep=name)).get(name)
-    return summary(service.statuses.see(name), service.labels.of(name), job)
+    return summary(seen, service.labels.of(name), job)
