@@ -52,13 +52,14 @@ $(VENV)/installed-bench: $(VENV)/installed
 # reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
 # the environment says.
 RAY := tests/ray
+PYTEST := $(BIN)/python -m pytest --durations=15 --durations-min=5
 test unit: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
-	$(BIN)/python -m pytest $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
-	$(BIN)/python -m pytest $(RAY)/test_[p-s]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
-	$(BIN)/python -m pytest tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
-	$(BIN)/python -m pytest --ignore=$(RAY) --ignore=tests/unit; others=$$?; \
+	$(PYTEST) $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
+	$(PYTEST) $(RAY)/test_[p-s]*.py > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
+	$(PYTEST) tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
+	$(PYTEST) --ignore=$(RAY) --ignore=tests/unit; others=$$?; \
 	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \

@@ -1,20 +1,37 @@
 """`launch` trains its leading settings again by itself, once, and the same whatever interrupts it."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 from test_sweeps import launch, make_spec, snapshot
 
 from tests.narrowing import present
 from tune_jobs.store.names import SWEEP_RECORD
-from tune_jobs.sweeps import drive, stages
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import conclude, drive, stages
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.interrupted import SweepInterrupted
 from tune_jobs.sweeps.outcome import SweepResult
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
+
+
+@pytest.fixture(autouse=True)
+def short_report() -> Iterator[None]:
+    """A page without the figures, which take longer than the trials and are tested elsewhere."""
+
+    def write(store: SweepStore, _: object) -> Path:
+        page = store.report_folder / "index.html"
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text("a report")
+        return page
+
+    with mock.patch.object(conclude, "make_report", write):
+        yield
 
 
 def spec(**changes: Any) -> dict[str, Any]:
