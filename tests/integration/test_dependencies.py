@@ -18,6 +18,7 @@ OWN = {"policies", "analysis", "tune_jobs"}
 NOT_IMPORTED = {
     "psycopg": "SQLAlchemy loads it for PostgreSQL",
     "build": "the tests build the wheel by `python -m build`",
+    "optuna-dashboard": "a command, beside which the page is measured",
     "mkdocs-material": "the theme of the site",
     "mkdocstrings-python": "a plugin of MkDocs",
     "mypy": "a command",

@@ -33,7 +33,7 @@ def _done(request: Mapping[str, Any]) -> Any:
         store.write_record(record.model_copy(update={"state": "running"}))
         if how.get("exit"):
             os._exit(3)
-        until, interrupted = time.monotonic() + float(how["seconds"]), False
+        until, interrupted = time.monotonic() + float(how.get("seconds", 0.05)), False
         while time.monotonic() < until and not interrupted:
             time.sleep(0.01)
             interrupted = store.stop_requested()
