@@ -110,7 +110,7 @@ def test_the_queue_is_counted_by_state_and_verb_and_nobody_is_named(live: Live) 
         queue.begin(name, "drive", {}, owner=OWNER, num_cpus=1.5)
     queue.begin("c", "extend", {}, owner="bob", num_cpus=1.0)
     assert queue.claim(2.0) is not None
-    ended, _ = queue.begin("d", "retry", {}, owner="bob")
+    ended, _ = queue.begin("d", "retry", {}, owner="carl")
     queue.end(ended.id, "stopped")
     found = scrape(live)
     assert {(s.labels["state"], s.labels["verb"]): s.value for s in found.of("jobs") if s.value} == {
