@@ -137,6 +137,18 @@ def test_report_and_films_are_downloaded(run: RunCommand, site: Live, tmp_path: 
         assert run("--server", site.url, *words.split()).exit_code == code
 
 
+def test_a_sweep_is_downloaded_as_one_file(run: RunCommand, site: Live, tmp_path: Path) -> None:
+    here = run("export", "mine", "--format", "sweep", "--out", "here", "--storage", site.storage)
+    there = run("--server", site.url, "export", "mine", "--format", "sweep", "--out", "there")
+    assert (here.exit_code, there.exit_code) == (0, 0)
+    assert there.stdout.split() == here.stdout.replace("here", "there").split()
+    assert (
+        (tmp_path / "there.tunejobs").read_bytes()[:2] == (tmp_path / "here.tunejobs").read_bytes()[:2] == b"\x1f\x8b"
+    )
+    run("--server", site.url, "export", "mine", "--out", "new/x.tunejobs")
+    assert (tmp_path / "new" / "x.tunejobs").is_file()
+
+
 # -- what is refused
 
 
@@ -148,7 +160,8 @@ def test_report_and_films_are_downloaded(run: RunCommand, site: Live, tmp_path: 
         ("launch x.yaml --dry-run --address auto", "--address"), ("status mine --storage s", "--storage"),
         ("best mine --num-episodes 7", "--num-episodes"), ("video mine --seed 3", "--seed"),
         ("evaluate mine", "`tune-jobs evaluate`"), ("compare mine other", "`tune-jobs compare`"),
-        ("export mine", "`tune-jobs export`"), ("importance mine", "`tune-jobs importance`"),
+        ("export mine", "--format sweep"), ("export mine --format sweep --top 2", "--format sweep"),
+        ("export mine failed --format sweep", "--format sweep"), ("importance mine", "`tune-jobs importance`"),
         ("reproduce mine/t0001", "`tune-jobs reproduce`"), ("serve", "`tune-jobs serve`"),
         ("token list", "`tune-jobs token list`"), ("launch none.yaml", "none.yaml"),
         ("status a/b", "is no name of a sweep"),
@@ -163,7 +176,7 @@ def test_what_goes_with_no_service_is_refused(run: RunCommand, site: Live, argum
 
 def test_all_commands_are_done_there_or_refused_or_about_nothing_there() -> None:
     about_neither = {"presets", "hyperparams", "schema"}
-    refused = {"evaluate", "compare", "export", "importance", "reproduce", "serve", "token"}
+    refused = {"evaluate", "compare", "importance", "reproduce", "serve", "token"}
     assert {*THERE, *about_neither, *refused} == cli.commands.keys()
     assert "--output" in {name for item in cli.commands["report"].params for name in item.opts}
     assert isinstance(cli, click.Group)

@@ -95,14 +95,15 @@ def test_after_a_lost_connection_what_came_meanwhile_comes_once(live: Live) -> N
     with Client(live.url) as direct, cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
         listener = Listener(client.events("done"))
         listener.wait_for(lambda: listener.of("status"))
-        for number in range(4):
+        for number in range(2):
             proxy.is_away = True
             proxy.cut_all()
-            direct.change("done", note=f"note {number}")
-            time.sleep(0.7)
+            for text in (f"early {number}", f"note {number}"):
+                direct.change("done", note=text)
+                time.sleep(1.2)
             proxy.is_away = False
             listener.wait_for(lambda: listener.of("status")[-1]["note"] == f"note {number}")  # noqa: B023
-        assert [item["note"] for item in listener.of("status")] == ["", "note 0", "note 1", "note 2", "note 3"]
+        assert [item["note"] for item in listener.of("status")] == ["", "early 0", "note 0", "early 1", "note 1"]
         assert len({event.id for event in listener.found}) == len(listener.found)
         direct.delete("done")
         listener.thread.join(20)

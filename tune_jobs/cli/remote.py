@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sweep_spec import SweepSpec
     from tune_jobs.sweeps.status import SweepStatus
 
-_FILMS = "films/"
+_FILMS, _ONE_FILE = "films/", ".tunejobs"
 
 
 class RemoteVerbs:
@@ -85,6 +85,26 @@ class RemoteVerbs:
                 f"Sweep {source} has no film of its best policy.", "They are made when the sweep has ended."
             )
         return {names[film]: self._client.download(source, _FILMS + film, to) for film, to in wanted.items()}
+
+    def export(
+        self, sweeps: Sequence[str], kind: str | None, *, output: str | None = None, top: int | None = None, **_: Any
+    ) -> dict[str, Path]:
+        """Download a sweep as one file, and return its path.
+
+        Raises:
+            SpecError: Several sweeps or another form are asked for, which are made where the folder is.
+        """
+        wanted = kind or ("sweep" if output is not None and output.lower().endswith(_ONE_FILE) else "csv")
+        if wanted != "sweep" or len(sweeps) != 1 or top is not None:
+            raise SpecError(
+                "A service exports one sweep as one file; other forms are made on the machine of its folder.",
+                "Write `export SWEEP --format sweep`.",
+            )
+        default = f"{sweeps[0]}{_ONE_FILE}"
+        to = Path(default) if output is None else Path(output) / default if _is_folder(output) else Path(output)
+        if to.suffix.lower() != _ONE_FILE:
+            to = to.with_name(f"{to.name}{_ONE_FILE}")
+        return {"sweep": self._client.download(sweeps[0], "file", to)}
 
     def planned(self, source: str, overrides: Sequence[str], *, name: str | None = None) -> tuple[SweepSpec, SweepPlan]:
         """Return the sweep and the plan that the service would run.

@@ -17,6 +17,7 @@ from tune_jobs.cli.base import (
     sweeps_argument,
 )
 from tune_jobs.cli.server import here_only
+from tune_jobs.cli.server import verbs as verbs_of_command
 
 if TYPE_CHECKING:
     from analysis.records import Objective
@@ -55,11 +56,10 @@ def export(
     png are learning curves with bands over training seeds, also of several sweeps of one environment.
     """
     from tune_jobs.cli import output as cli_output
-    from tune_jobs.sweeps import verbs
 
-    here_only()
+    does = verbs_of_command()
     with stdout_for(as_json=as_json):
-        paths = verbs.export(list(sweeps), kind, output=output, top=top, storage=storage)
+        paths = does.export(list(sweeps), kind, output=output, top=top, storage=storage)
     cli_output.show_paths(paths, as_json=as_json)
 
 

@@ -26,6 +26,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 THERE = (
     "launch", "list", "status", "trials", "stop", "resume", "extend", "inject", "replicate", "best", "report", "video",
+    "export",
 )  # fmt: skip
 """The commands that a service does."""
 _ONLY_HERE = {
