@@ -333,6 +333,35 @@ def test_how_many_trials_an_extended_sweep_will_have_is_planned_not_guessed(serv
             assert "would have 33 trials; here a sweep may have at most 32" in answer.json()["detail"]
 
 
+@pytest.mark.parametrize(
+    ("action", "body", "num_trials"),
+    [
+        ("extend", {"num_samples": 3}, 10),
+        ("trials", {"point": {"lr": 0.005}}, 6),
+        # Two settings are all that there are.
+        ("replicate", {"top": 5, "seeds": 4}, 12),
+    ],
+)
+def test_what_is_added_stays_within_the_limits(
+    service: Service, finished: str, action: str, body: dict[str, Any], num_trials: int
+) -> None:
+    spec = service.statuses.see(finished).status.sweep.spec
+    each = spec["stop"]["num_env_steps"] - 1 + 2 * spec["hyperparams"].get("train_batch_size", 4_000)
+
+    def asked(**limits: int) -> Any:
+        limited = dataclasses.replace(service, config=dataclasses.replace(service.config, limits=Limits(**limits)))
+        with TestClient(make_app(limited), base_url="http://127.0.0.1:8265") as asking:
+            return asking.post(f"/api/v1/sweeps/{finished}/{action}", json=body)
+
+    told = problem(asked(trials=num_trials - 1), 422)["detail"]
+    assert f"would have {num_trials} trials" in told
+    told = problem(asked(env_steps=1), 422)["detail"]
+    most = int(told.split("might train ")[1].split()[0].replace(",", ""))
+    assert num_trials * spec["stop"]["num_env_steps"] <= most <= num_trials * each
+    problem(asked(env_steps=most - 1), 422)
+    assert asked(trials=num_trials, env_steps=most).status_code == 202
+
+
 def test_actions_that_cannot_be(client: TestClient, finished: str) -> None:
     problem(client.post("/api/v1/sweeps/done/retry"), 409)
     problem(client.post("/api/v1/sweeps/done/extend", json={"num_samples": 0}), 422)

@@ -7,10 +7,8 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from analysis.records import SweepRecord
-from policies.errors import SpecError
-from tune_jobs.plan.sweep_plan import num_trials_of
 from tune_jobs.service.access.callers import Caller
+from tune_jobs.service.growth import Addition, check_growth, num_samples_after
 from tune_jobs.service.http.caller import AChanger, TheService
 from tune_jobs.service.http.models import Extend, Inject, Replicate
 from tune_jobs.service.http.problems import NotNowError
@@ -19,7 +17,6 @@ from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
-from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.adding import new_point
 
 router = APIRouter(
@@ -62,13 +59,13 @@ def retry(name: str, service: TheService, caller: AChanger) -> Job:
 @router.post("/extend", status_code=202)
 def extend(name: str, more: Extend, service: TheService, caller: AChanger) -> Job:
     """Add points to a sweep, and run them."""
-    record = service.statuses.see(name).status.sweep
-    spec = stored_spec(record)
+    spec = stored_spec(service.statuses.see(name).status.sweep)
     check_extendable(spec)
+    jobs = _check_growth(service, name, Addition(num_samples=more.num_samples))
     # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
-    num_samples = _num_samples(service, name, spec) + more.num_samples
-    _check_limit(service, record, spec, num_samples=num_samples)
-    return _enqueue(service, caller, name, "extend", {"to_num_samples": num_samples})
+    return _enqueue(
+        service, caller, name, "extend", {"to_num_samples": num_samples_after(spec, jobs) + more.num_samples}
+    )
 
 
 @router.post("/trials", status_code=202)
@@ -79,7 +76,7 @@ def inject(name: str, chosen: Inject, service: TheService, caller: AChanger) -> 
     spec = stored_spec(record)
     # As the sweep writes it, so that a request that says the same in other words is known to be the same.
     point = new_point(record, spec, trials, chosen.point)
-    _check_limit(service, record, spec, num_samples=_num_samples(service, name, spec), num_more_points=1)
+    _check_growth(service, name, Addition(points=[point]))
     return _enqueue(service, caller, name, "inject", {"point": point})
 
 
@@ -87,33 +84,17 @@ def inject(name: str, chosen: Inject, service: TheService, caller: AChanger) -> 
 def replicate(name: str, race: Replicate, service: TheService, caller: AChanger) -> Job:
     """Train the leading settings again with fresh seeds."""
     check_replicable(stored_spec(service.statuses.see(name).status.sweep))
+    _check_growth(service, name, Addition(top=race.top, seeds=race.seeds))
     return _enqueue(service, caller, name, "replicate", race.model_dump())
 
 
-def _num_samples(service: Service, name: str, spec: SweepSpec) -> int:
-    """Return how many samples a sweep will have, once the jobs that extend it are done."""
-    return max(spec.num_samples, *(int(job.arguments["to_num_samples"]) for job in _to_do(service, name, "extend")), 0)
-
-
-def _to_do(service: Service, name: str, verb: Verb) -> list[Job]:
-    return [job for job in service.queue.jobs("waiting", "running", sweep=name) if job.verb == verb]
-
-
-def _check_limit(
-    service: Service, record: SweepRecord, spec: SweepSpec, *, num_samples: int, num_more_points: int = 0
-) -> None:
-    # Counted as they will be planned: those that there are now may be fewer than the sweep's spec says.
-    trials = num_trials_of(
-        spec.model_copy(update={"num_samples": num_samples}), record.replications, record.chosen_points
-    )
-    known = [item.point for item in record.chosen_points]
-    waiting = [job for job in _to_do(service, record.name, "inject") if job.arguments["point"] not in known]
-    trials += (len(waiting) + num_more_points) * spec.seeds_per_point
-    limit = service.config.limits.trials
-    if trials > limit:
-        raise SpecError(
-            f"The sweep would have {trials:,} trials; here a sweep may have at most {limit:,}.", "Add fewer."
-        )
+def _check_growth(service: Service, name: str, more: Addition) -> list[Job]:
+    """Check the limits; return the sweep's jobs that wait or run."""
+    seen = service.statuses.see(name)
+    record = seen.status.sweep
+    jobs = service.queue.jobs("waiting", "running", sweep=name)
+    check_growth(service.config.limits, record, stored_spec(record), seen.trials.records, jobs=jobs, more=more)
+    return jobs
 
 
 def _enqueue(service: Service, caller: Caller, name: str, verb: Verb, arguments: Mapping[str, Any]) -> Job:

@@ -1,0 +1,88 @@
+"""What may be added to a sweep: its limits hold for what it will have, once all that waits is done, too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.records import SweepRecord, TrialRecord
+from policies.errors import SpecError
+from policies.hyperparams import Hyperparams, make_hyperparams
+from tune_jobs.plan.estimates import max_env_steps
+from tune_jobs.plan.sweep_plan import num_points_of, num_trials_of
+from tune_jobs.service.config import Limits
+from tune_jobs.service.jobs import Job
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+@dataclass(frozen=True)
+class Addition:
+    """What somebody asks for."""
+
+    num_samples: int = 0
+    """More random draws for each combination of the grids."""
+    points: Sequence[dict[str, Any]] = ()
+    top: int = 0
+    """How many settings race."""
+    seeds: int = 0
+    """How many more seeds one of them gets at most."""
+
+
+def num_samples_after(spec: SweepSpec, jobs: Iterable[Job]) -> int:
+    """Return how many samples a sweep will have, once its jobs that wait or run are done."""
+    asked = [int(job.arguments["to_num_samples"]) for job in jobs if job.verb == "extend"]
+    return max([spec.num_samples, *asked])
+
+
+def check_growth(
+    limits: Limits,
+    record: SweepRecord,
+    spec: SweepSpec,
+    trials: Sequence[TrialRecord],
+    *,
+    jobs: Sequence[Job],
+    more: Addition,
+) -> None:
+    """Check that a sweep stays within the limits.
+
+    Args:
+        limits: The service's.
+        record: The sweep.
+        spec: Its spec.
+        trials: Its trials so far.
+        jobs: Its jobs that wait or run.
+        more: What is to be added.
+
+    Raises:
+        SpecError: It would have too many trials, or might train too many env steps.
+    """
+    wanted = spec.model_copy(update={"num_samples": num_samples_after(spec, jobs) + more.num_samples})
+    known = [item.point for item in record.chosen_points]
+    asked = [job.arguments["point"] for job in jobs if job.verb == "inject"]
+    points = [*(point for point in asked if point not in known), *more.points]
+    # Counted as they will be planned: those that there are now may be fewer than the sweep's spec says.
+    total = num_trials_of(wanted, record.replications, record.chosen_points) + len(points) * spec.seeds_per_point
+    races = [(int(job.arguments["top"]), int(job.arguments["seeds"])) for job in jobs if job.verb == "replicate"]
+    num_points = num_points_of(wanted, record.chosen_points) + len(points)
+    total += sum(min(top, num_points) * seeds for top, seeds in [*races, (more.top, more.seeds)])
+    if total > limits.trials:
+        raise SpecError(
+            f"The sweep would have {total:,} trials; here a sweep may have at most {limits.trials:,}.", "Add fewer."
+        )
+    if limits.env_steps is None:
+        return
+    steps = [max_env_steps(spec, values) for values in _hyperparams(spec, trials, points)]
+    # Of points that are not drawn yet, the largest known stands for all.
+    most = sum(steps[: len(trials)]) + max(0, total - len(trials)) * max(steps)
+    if most > limits.env_steps:
+        raise SpecError(
+            f"The sweep might train {most:,} env steps; here it may train at most {limits.env_steps:,}.", "Add fewer."
+        )
+
+
+def _hyperparams(spec: SweepSpec, trials: Sequence[TrialRecord], points: Sequence[dict[str, Any]]) -> list[Hyperparams]:
+    """Return those of trials and points; without any, the fixed values."""
+    own = [trial.hyperparams if trial.has_point else spec.hyperparams for trial in trials]
+    given = [*own, *({**spec.hyperparams, **point} for point in points)]
+    return [make_hyperparams(spec.algorithm, dict(values)) for values in given or [spec.hyperparams]]
