@@ -154,6 +154,8 @@ def test_a_sweep_that_does_not_fit_is_refused_for_good(
     found = problem(place(shared).client().post(f"/api/v1/{path}", json={"spec": spec}), 422)
     assert re.search(told, found["detail"]), found
     assert found["hint"]
+    # As on the command line, whose exit code it decides.
+    assert found["error"] == "CannotRunError"
     assert shared.queue.jobs() == []
     assert [sweep.name for sweep in shared.storage.sweeps()] == [SWEEP]
 

@@ -23,6 +23,10 @@ from tune_jobs.store.contract import Storage
 from tune_jobs.sweeps.drive import write_new
 
 
+class DoesNotFitError(CannotRunError):
+    """A sweep needs more than this machine has: to send it again is of no use."""
+
+
 @dataclass(frozen=True)
 class Submission:
     """What somebody sends: exactly one of preset, text and spec."""
@@ -70,7 +74,8 @@ class Submitter:
         """Validate a sweep, and return what would run; nothing is written.
 
         Raises:
-            SpecError: The sweep is wrong, not allowed here, or too large for this machine.
+            SpecError: The sweep is wrong, or not allowed here.
+            DoesNotFitError: It needs more than this machine has.
         """
         return self._planned(submission)
 
@@ -80,8 +85,8 @@ class Submitter:
         """Write a sweep and let it wait; return its job, and whether it is new.
 
         Raises:
-            SpecError: The sweep is wrong, not allowed here or too large for this machine, its name is taken, or the key
-                was used for another one.
+            SpecError: The sweep is wrong or not allowed here, its name is taken, or the key was used for another one.
+            DoesNotFitError: It needs more than this machine has.
             CannotRunError: It cannot be written.
         """
         keyed = None if key is None else (key, submission.digest)
@@ -127,8 +132,7 @@ class Submitter:
         try:
             plan = make_plan(spec, self._machine(spec))
         except CannotRunError as error:
-            # It is the sweep that is wrong here, and to send it again is of no use.
-            raise SpecError(error.message, error.hint) from error
+            raise DoesNotFitError(error.message, error.hint) from error
         limits = self._config.limits
         if len(plan.trials) > limits.trials:
             raise SpecError(

@@ -18,6 +18,7 @@ from policies.errors import CannotRunError, CheckpointError, EnvFailedError, Not
 from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.problem_documents import database_problem, full_disk_problem, is_full, problem
 from tune_jobs.service.queue import KeyUsedError
+from tune_jobs.service.submitting import DoesNotFitError
 from tune_jobs.spec.problems import WrongSpecError
 
 _log = logging.getLogger(__name__)
@@ -40,6 +41,7 @@ _STATUS: tuple[tuple[type[TuneJobsError], HTTPStatus], ...] = (
     (CheckpointError, HTTPStatus.INTERNAL_SERVER_ERROR),
     (NotFoundError, HTTPStatus.NOT_FOUND),
     (EnvFailedError, HTTPStatus.UNPROCESSABLE_ENTITY),
+    (DoesNotFitError, HTTPStatus.UNPROCESSABLE_ENTITY),
     (CannotRunError, HTTPStatus.SERVICE_UNAVAILABLE),
 )
 
