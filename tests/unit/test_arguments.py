@@ -76,7 +76,7 @@ TAKES = {
     "action": {"whole", "zero", "negative", "huge", "numbers", "empty list", "none"},
 }
 MORE = {(name, "source"): {"mapping", "empty mapping"} for name in ("create", "launch", "load_spec")}
-MORE[("export", "top")] = {"none"}
+MORE[("export", "top")] = MORE[("export", "format")] = {"none"}
 CASES = [
     (name, argument) for name, function in FUNCTIONS.items() for argument in inspect.signature(function).parameters
 ]
