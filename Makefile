@@ -1,5 +1,6 @@
 # make sweep   install into .venv, run the tutorial's sweep, show where its results lie
-# make test    install the test tools too, then lint, types and every test that can run here
+# make test    install the test tools too, then lint, types and every test that can run here, but for the slowest
+# make test-slow   those tests, which say that they were skipped in `make test`
 # make unit    the tests of tests/unit, which start next to nothing and take under a minute: while one works
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table;
@@ -15,7 +16,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test unit lint types learn kills bench bench-choice docs clean
+.PHONY: install sweep test test-slow unit lint types learn kills bench bench-choice docs clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -64,6 +65,9 @@ test: $(VENV)/installed-test lint
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \
 	exit $$((first || second || unit || others || types))
+
+test-slow: $(VENV)/installed-test
+	TUNE_JOBS_SLOW=only $(PYTEST)
 
 unit: $(VENV)/installed-test
 	$(BIN)/python -m pytest --quiet --numprocesses=2 tests/unit

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import slow
+
 PLUGIN = Path(__file__).parent / "ray" / "env_plugin"
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
@@ -17,6 +19,10 @@ if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, lambda *_: None)
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    slow.choose(config, items)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,0 +1,53 @@
+"""Tests that `make test` leaves out, and says so, as all of them take longer than the 25 minutes that it may take.
+
+Each takes at least half a minute on two cores beside the others, and another test, which is named, looks at most of
+the same. `make test-slow` runs them alone.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+VARIABLE = "TUNE_JOBS_SLOW"
+_LEARN = "`make learn` trains every preset over five seeds"
+
+SLOW = {
+    "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[rllib]": "the same, packed",
+    "tests/learning/test_learning.py::test_dqn_learns_cartpole": _LEARN,
+    "tests/learning/test_learning.py::test_ppo_learns_pendulum": _LEARN,
+    "tests/learning/test_packed_dqn_learning.py::test_a_pack_of_dqn_trials_solves_cartpole": _LEARN,
+    "tests/learning/test_packed_learning.py::test_a_pack_learns_as_rllib_does": "tests/ray/test_packed_ppo.py",
+    "tests/package/test_docker.py": "tests/package/test_docker_files.py, and test_wheel.py for what is installed",
+    "tests/ray/test_baseline_sweeps.py": "tests/integration/test_baseline_sweeps.py",
+    "tests/ray/test_chosen_points.py::test_it_is_chosen_if_it_is_the_best_and_confirmed": "the others of its file",
+    "tests/ray/test_confirming.py::test_an_interrupted_race_goes_on_as_it_would_have": "tests/ray/test_more_seeds.py",
+    "tests/ray/test_confirming.py::test_more_samples_are_confirmed_anew_and_old_sweeps_are_left_alone":
+        "tests/ray/test_more_seeds.py",
+    "tests/ray/test_ends_in_order.py::test_parts_of_ray_that_die_one_after_the_other": "tests/ray/test_ray_watch.py",
+    "tests/ray/test_faulty_envs.py::test_faulty_trials_fail_alone_and_the_sweep_is_read_retried_and_resumed[rllib]":
+        "the same, packed",
+    "tests/ray/test_folders_of_our_names.py": "tests/package/test_wheel.py",
+    "tests/ray/test_more_seeds.py::test_leading_settings_get_fresh_seeds_and_train_to_the_end[rllib-hyperband]":
+        "the same, packed",
+    "tests/ray/test_pack_interruption.py::test_members_go_on_from_their_checkpoints_after_a_kill_and_an_interruption":
+        "`make kills`, and tests/ray/test_interruption.py",
+    "tests/ray/test_repetitions.py::test_a_trial_comes_to_the_same_by_itself[rllib]": "the same, packed",
+    "tests/ray/test_resumed_rewards.py::test_the_statistics_of_a_resumed_trial_are_of_all_its_env_steps[rllib]":
+        "the same, packed",
+    "tests/ray/test_resumed_rewards.py::test_where_episodes_are_alike_a_pack_goes_on_as_if_it_had_not_been_interrupted":
+        "the other test of its file, packed",
+}  # fmt: skip
+"""By node id, or by file: what is looked at instead each time."""
+
+
+def choose(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip the slow tests; or leave them alone, if the variable says `only`."""
+    slow = [item for item in items if item.nodeid in SLOW or item.nodeid.partition("::")[0] in SLOW]
+    if os.environ.get(VARIABLE) == "only":
+        config.hook.pytest_deselected(items=[item for item in items if item not in slow])
+        items[:] = slow
+        return
+    for item in slow:
+        item.add_marker(pytest.mark.skip(reason="slow: `make test-slow` runs it"))
