@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import gc
 import shutil
 import socket
 import ssl
@@ -233,3 +234,13 @@ def test_options_that_cannot_be(run: RunCommand, tmp_path: Path, arguments: str,
 def test_a_proxy_is_one_address() -> None:
     with pytest.raises(SpecError, match=r"'10\.0\.0\.0/8' is no address"):
         ServiceConfig(storage=Path(), behind_proxy="10.0.0.0/8")
+
+
+def test_while_a_service_answers_old_objects_are_looked_through_rarely(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, during = gc.get_threshold(), []
+    monkeypatch.setattr(Server, "run", lambda *_, **__: during.append(gc.get_threshold()))
+    serve(ServiceConfig(storage=tmp_path, port=0, spare_idle_s=0))
+    assert during[0][2] >= 10 * before[2]
+    assert gc.get_threshold() == before
