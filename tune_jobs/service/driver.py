@@ -14,6 +14,7 @@ import os
 import signal
 import socket
 import sys
+import threading
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
@@ -83,27 +84,40 @@ def _do(request: Mapping[str, Any], lock: int, log: int) -> None:
 
 
 def warm_up(stack: contextlib.ExitStack, settings: Mapping[str, Any]) -> None:
-    """Import what driving a sweep needs, and start Ray if that is asked for.
+    """Import what driving a sweep needs, and start Ray and a process for environments if that is asked for.
 
     Args:
-        stack: Ends Ray when this process ends.
-        settings: The modules that sweeps may name, the folder to be in, and whether Ray is started.
+        stack: Ends them when this process ends.
+        settings: The modules that sweeps may name, the folder to be in, and whether they are started.
     """
     allow_modules(settings["modules"])
     os.chdir(settings["working_folder"])
+    if not settings["warm_ray"]:
+        _import_all()
+        return
+    from policies.guard.guard import guarding
+    from tune_jobs.plan.machine import local_machine
+    from tune_jobs.ray_tune.warm import warm_ray
+
+    # Only now, so that two threads never import the same part of Ray at once.
+    importing = threading.Thread(target=_import_all, name="imports")
+    importing.start()
+    try:
+        # The plan is made anew on the machine that runs it, and takes its environment to a process of its own.
+        stack.enter_context(guarding(start=True))
+        # Ray's processes take a second or two to start, in which this one would only wait.
+        stack.enter_context(warm_ray(local_machine()))
+    except CannotRunError as error:
+        # The sweep says so, in its own words.
+        _log.warning("What a sweep needs can't be started before there is one: %s", error)
+    finally:
+        importing.join()
+
+
+def _import_all() -> None:
     import tune_jobs.ray_tune.cluster
     import tune_jobs.ray_tune.run_trials
     import tune_jobs.sweeps.verbs  # noqa: F401
-
-    if settings["warm_ray"]:
-        from tune_jobs.plan.machine import local_machine
-        from tune_jobs.ray_tune.warm import warm_ray
-
-        # If Ray can't be started, the sweep says so, in its own words.
-        try:
-            stack.enter_context(warm_ray(local_machine()))
-        except CannotRunError as error:
-            _log.warning("Ray can't be started before there is a sweep: %s", error)
 
 
 def _ended(request: Mapping[str, Any]) -> Ended:
