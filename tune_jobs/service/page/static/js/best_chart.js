@@ -1,42 +1,31 @@
 // Best so far against what was spent.
-import { colour, el, setText } from "./dom.js";
+import { Chart, paintDot, paintStrong, valueUnder } from "./chart.js";
+import { setText } from "./dom.js";
 import { count, returnText } from "./format.js";
-import { bestSoFar, drawLine } from "./lines.js";
-import { Plot, withAir } from "./plot.js";
+import { bestSoFar } from "./lines.js";
+import { withAir } from "./plot.js";
 
-export class BestChart {
+export class BestChart extends Chart {
   constructor(host, { onOpen }) {
-    this.line = { x: [], y: [] };
-    this.steps = [];
-    this.goal = null;
-    this.caption = el("p", { class: "quiet small" });
-    this.none = el("p", { class: "missing quiet" });
-    this.body = el("div", { class: "plot-room" });
-    host.append(
-      el("div", { class: "card-head" }, el("h2", {}, "Best so far against what was spent")),
-      this.caption,
-      this.body,
-      this.none,
-    );
-    this.plot = new Plot(this.body, {
+    super(host, {
+      title: "Best so far against what was spent",
       label: "Best so far",
       xLabel: "env steps spent by all trials",
-      height: 300,
-      paint: (context, places) => this.paint(context, places),
-      find: (places, left) => this.find(places, left),
       onPick: onOpen,
     });
+    this.line = null;
+    this.steps = [];
   }
 
   show({ data }) {
     const { steps, spent, hasEvaluations } = bestSoFar(data.trials, data.curves, data.now());
     this.steps = steps;
-    this.body.hidden = steps.length === 0;
-    setText(this.none, steps.length ? "" : "No return has been shown yet.");
     setText(this.caption, `The best ${hasEvaluations ? "evaluation" : "training"} return that any trial had shown.`);
-    if (!steps.length) return;
+    if (!this.showEither(steps.length > 0, "No return has been shown yet.")) return;
     this.goal = data.goal;
     this.line = {
+      colour: "link",
+      isStepped: true,
       x: [...steps.map((step) => step.spent), spent],
       y: [...steps.map((step) => step.best), steps.at(-1).best],
     };
@@ -49,32 +38,14 @@ export class BestChart {
   }
 
   paint(context, places) {
-    const { ratio } = places;
-    if (this.goal !== null) {
-      context.strokeStyle = colour("accent");
-      context.lineWidth = ratio;
-      context.setLineDash([5 * ratio, 4 * ratio]);
-      context.beginPath();
-      context.moveTo(places.left, places.y(this.goal));
-      context.lineTo(places.left + places.width, places.y(this.goal));
-      context.stroke();
-      context.setLineDash([]);
-    }
-    context.strokeStyle = colour("link");
-    context.fillStyle = colour("link");
-    context.lineWidth = 2.25 * ratio;
-    context.beginPath();
-    drawLine(context, places, this.line, true);
-    context.stroke();
-    for (const step of this.steps) {
-      context.beginPath();
-      context.arc(places.x(step.spent), places.y(step.best), 2.5 * ratio, 0, 7);
-      context.fill();
-    }
+    this.paintGoal(context, places);
+    if (!this.line) return;
+    paintStrong(context, places, this.line, false);
+    for (const step of this.steps) paintDot(context, places, step.spent, step.best, 2.5);
   }
 
   find(places, left) {
-    const x = places.min + ((left - places.left) / places.width) * (places.max - places.min);
+    const x = valueUnder(places, left);
     const step = this.steps.findLast((item) => item.spent <= x) ?? null;
     if (step === null || x > this.line.x.at(-1)) return null;
     return {
@@ -86,9 +57,5 @@ export class BestChart {
         `after ${count(step.spent)} env steps of all`,
       ],
     };
-  }
-
-  close() {
-    this.plot.close();
   }
 }
