@@ -53,6 +53,12 @@ def place_of(index: int, seeds_per_point: int, replications: Sequence[Replicatio
     return Place(num_points + index // seeds_per_point, index % seeds_per_point)
 
 
+def first_index(point_index: int, seeds_per_point: int, replications: Sequence[ReplicationRecord]) -> int:
+    """Return the index of a point's first trial; the arguments are as for `place_of`."""
+    before = (item for item in replications if item.num_points <= point_index)
+    return point_index * seeds_per_point + sum(len(item.points) for item in before)
+
+
 def planned_places(num_points: int, seeds_per_point: int, replications: Sequence[ReplicationRecord]) -> list[Place]:
     """Return the places of all trials of a sweep with this many points, by index; as for `place_of`.
 

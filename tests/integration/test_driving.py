@@ -1,7 +1,6 @@
 """What a launch, resume or extend leaves when nothing is to be run, when it fails, and when a signal ends it."""
 
 import os
-import shutil
 import signal
 import sys
 from pathlib import Path
@@ -9,6 +8,7 @@ from signal import Signals
 from typing import Any, cast
 
 import pytest
+from sweep_folders import kept_before_each_write
 
 from policies.errors import CannotRunError
 from tests.narrowing import present
@@ -16,7 +16,6 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import load_spec
-from tune_jobs.store import sweep_store, trial_store
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
 from tune_jobs.sweeps import drive as driving
@@ -61,18 +60,8 @@ def test_finishing_anew_changes_no_times(store: SweepStore, monkeypatch: pytest.
 def test_an_extend_killed_between_any_two_files_leaves_a_sweep_that_goes_on_with_all_of_its_trials(
     store: SweepStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a kill leaves is what is there before each write."""
-    write = sweep_store.write_atomic  # type: ignore[attr-defined]
-    left: list[Path] = []
-
-    def watched(path: Path, data: str) -> None:
-        left.append(shutil.copytree(store.folder, tmp_path / f"killed-{len(left)}" / "mine"))
-        write(path, data)
-
     monkeypatch.setattr(resuming, "run_sweep", lambda store, *_, **__: [t.trial_id for t in store.read_trials()])
-    with monkeypatch.context() as patch:
-        for module in (sweep_store, trial_store):
-            patch.setattr(module, "write_atomic", watched)
+    with kept_before_each_write(store, tmp_path) as left:
         all_ids = cast("Any", sweeps.extend(store.folder, 2, progress="none"))
     assert all_ids == ["t0000", "t0001", "t0002", "t0003"]
     assert len(left) >= 3

@@ -1,16 +1,20 @@
 """A sweep folder as a run leaves it, in a second and without Ray: fakes for the training, the real files."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
 from policies.acting.evaluate import Evaluator
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store import sweep_store, trial_store
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.drive import write_new
 from tune_jobs.training.trial_loop import TrialLoop
@@ -45,6 +49,30 @@ def make_sweep_folder(folder: Path, iterations: int = 6, **spec: Any) -> SweepSt
     changes = {"state": "completed", "started_at": 1.0, "ended_at": 2.0, "created_at": 0.0, "git_commit": None}
     store.write_record(record.model_copy(update=changes))
     return store
+
+
+@contextlib.contextmanager
+def kept_before_each_write(store: SweepStore, into: Path) -> Iterator[list[Path]]:
+    """Copy a sweep's folder before each of its records is written: what a kill at that moment would leave.
+
+    Args:
+        store: The sweep.
+        into: A folder for the copies.
+
+    Yields:
+        The copies so far, each in a folder of its own, under the sweep's name.
+    """
+    write = sweep_store.write_atomic  # type: ignore[attr-defined]
+    left: list[Path] = []
+
+    def watched(path: Path, data: str) -> None:
+        left.append(shutil.copytree(store.folder, into / f"killed-{len(left)}" / store.name))
+        write(path, data)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (sweep_store, trial_store):
+            patch.setattr(module, "write_atomic", watched)
+        yield left
 
 
 def train(

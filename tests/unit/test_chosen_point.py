@@ -1,13 +1,12 @@
 """A point that somebody chooses: its number, its values, what is refused, and who learns from it."""
 
 import json
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from sweep_folders import make_sweep_folder, train
+from sweep_folders import kept_before_each_write, make_sweep_folder, train
 
 from analysis.numbering import drawn_index, with_chosen
 from analysis.records import ChosenPointRecord, ReplicationRecord, SweepRecord
@@ -19,7 +18,6 @@ from tune_jobs.search.points import planned_points
 from tune_jobs.service import driver
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
-from tune_jobs.store import sweep_store, trial_store
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import resume as resuming
 from tune_jobs.sweeps import verbs as sweeps
@@ -319,21 +317,11 @@ def test_a_record_whose_numbers_cannot_be_is_damaged(store: SweepStore) -> None:
 def test_one_that_is_killed_between_any_two_files_goes_on_and_a_repeated_job_adds_nothing_twice(
     store: SweepStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a kill leaves is what is there before each write."""
-    write = sweep_store.write_atomic  # type: ignore[attr-defined]
-    left: list[Path] = []
-
-    def watched(path: Path, data: str) -> None:
-        left.append(shutil.copytree(store.folder, tmp_path / f"killed-{len(left)}" / "mine"))
-        write(path, data)
-
     def do(folder: Path) -> list[Any]:
         request = {"sweep": str(folder), "verb": "inject", "arguments": {"point": {"lr": 5e-3}}, "address": None}
         return list(driver._done(request).trials)
 
-    with monkeypatch.context() as patch:
-        for module in (sweep_store, trial_store):
-            patch.setattr(module, "write_atomic", watched)
+    with kept_before_each_write(store, tmp_path) as left:
         whole = do(store.folder)
     assert [trial.trial_id for trial in whole] == [f"t{index:04d}" for index in range(6)]
     assert len(left) >= 3

@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.numbering import Place, place_of, planned_places
+from analysis.numbering import Place, first_index, place_of, planned_places
 from analysis.records import ReplicationRecord
 
 
@@ -35,6 +35,8 @@ def test_each_place_is_there_once_and_found_by_its_index() -> None:
     found = planned_places(9, 2, replications)
     assert len(set(found)) == len(found) == 9 * 2 + 7
     assert [place_of(index, 2, replications) for index in range(len(found))] == found
+    for point_index in range(9):
+        assert first_index(point_index, 2, replications) == found.index(Place(point_index, 0))
 
 
 @pytest.mark.parametrize(

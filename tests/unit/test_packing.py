@@ -8,6 +8,7 @@ import pytest
 from pack_plans import DQN, LR, TPE, fake_reasons, plan
 from spec_errors import MINIMAL, errors
 
+from analysis.records import ReplicationRecord
 from policies.errors import EnvError, SpecError
 from policies.guard import guarded
 from policies.hyperparams import Algorithm, make_hyperparams
@@ -106,6 +107,11 @@ def test_engines_are_chosen_trial_by_trial(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(SpecError) as caught:
         plan(**space, engine="packed", seeds_per_point=2)
     assert caught.value.message == "engine is packed, but point 1 (lr 0.2; first trial t0002) cannot be: its lr is odd."
+    # More seeds of point 0 came first, when the sweep had no other.
+    spec = load_spec({**MINIMAL, **space, "engine": "packed", "seeds_per_point": 2})
+    before = (ReplicationRecord(num_points=1, points=(0, 0, 0)),)
+    with pytest.raises(SpecError, match=r"point 1 \(lr 0.2; first trial t0005\) cannot be"):
+        make_plan(spec, Machine(2), replications=before)
     assert "engine to rllib" in caught.value.hint
     assert "auto" in caught.value.hint
 

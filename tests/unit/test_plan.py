@@ -12,7 +12,8 @@ from analysis.records import ReplicationRecord
 from policies.errors import CannotRunError, EnvError, SpecError
 from tune_jobs.plan import machine as machine_module
 from tune_jobs.plan.machine import Machine, local_machine
-from tune_jobs.plan.sweep_plan import SweepPlan, make_plan, trial_id
+from tune_jobs.plan.points import trial_id
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
 import gymnasium as gym
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from analysis.numbering import planned_places
 from analysis.records import FINISHED, ChosenPointRecord, ReplicationRecord, TrialPlan, TrialRecord
@@ -21,8 +21,7 @@ from policies.envs.make import EnvInfo
 from policies.errors import MALFORMED, CannotRunError, SpecError, said_by
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
-from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
-from policies.wrong_values import details_of, dotted, explain
+from policies.hyperparams import Hyperparams
 from tune_jobs.plan.concurrency import max_concurrent
 from tune_jobs.plan.engine_choice import PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
@@ -30,15 +29,15 @@ from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
 from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
+from tune_jobs.plan.points import num_points_of, num_trials_of, place_of_point, point_hyperparams, trial_id
 from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.chosen_point import outside_notes
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.tpe import check_installed
-from tune_jobs.spec.domains import num_points
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.hyperparam_problems import check_distinct
 from tune_jobs.spec.rules import idle_settings
-from tune_jobs.spec.seeds import SEEDS_PER_TRIAL, confirmation_seeds, evaluation_seeds, trial_seeds
+from tune_jobs.spec.seeds import confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 NUM_CONFIRMATION_EPISODES = 100
@@ -127,11 +126,6 @@ def _stored_packs(data: Mapping[str, Any]) -> PackPlan:
     return PackPlan(**known | {name: tuple(known[name]) for name in ("trial_ids", "notes")})
 
 
-def trial_id(index: int) -> str:
-    """Return the id of a trial, such as t0007; ids sort by index up to 10,000 trials."""
-    return f"t{index:04d}"
-
-
 @guarding()
 def make_plan(
     spec: SweepSpec,
@@ -167,7 +161,7 @@ def make_plan(
     env = check_env(spec.env.id, spec.env.wrapped_args, spec.algorithm, timeout_s=spec.iteration_timeout_s)
     check_rl_module(spec)
     concurrent = max_concurrent(spec, machine, _num_trials(spec, replications, chosen_points))
-    points = _points(spec, chosen_points)
+    points = _points(spec, chosen_points, replications)
     known = [values for _, values in points if values is not None]
     check_env_rules(spec, env, known)
     trials, engine_notes = _trials(spec, env, points, records, replications)
@@ -203,22 +197,6 @@ def make_plan(
     )
 
 
-def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = ()) -> int:
-    """Return the number of a sweep's points, those among them that somebody chose."""
-    drawn = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
-    return drawn + len(chosen_points)
-
-
-def num_trials_of(
-    spec: SweepSpec,
-    replications: Sequence[ReplicationRecord] = (),
-    chosen_points: Sequence[ChosenPointRecord] = (),
-) -> int:
-    """Return the number of a sweep's trials, those among them of chosen points and of more seeds of some points."""
-    searched = num_points_of(spec, chosen_points) * spec.seeds_per_point
-    return searched + sum(len(item.points) for item in replications)
-
-
 def _num_trials(
     spec: SweepSpec, replications: Sequence[ReplicationRecord], chosen_points: Sequence[ChosenPointRecord]
 ) -> int:
@@ -232,10 +210,12 @@ def _num_trials(
     return number
 
 
-def _points(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord]) -> list[_Point]:
+def _points(
+    spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord], replications: Sequence[ReplicationRecord]
+) -> list[_Point]:
     """Return each point with all its hyperparameters."""
     return [
-        (None, None) if point is None else (point, point_hyperparams(spec, point, index))
+        (None, None) if point is None else (point, point_hyperparams(spec, point, index, replications))
         for index, point in enumerate(planned_points(spec, chosen_points))
     ]
 
@@ -275,7 +255,9 @@ def _trials(
         env,
         [(trial.trial_id, points[trial.point_index][1]) for trial in trials],
         {record.trial_id: record.engine for record in records},
-        lambda index: _place(spec, points[trials[index].point_index][0], trials[index].point_index),
+        lambda index: place_of_point(
+            spec, points[trials[index].point_index][0], trials[index].point_index, replications
+        ),
     )
     planned = (
         trial.model_copy(update={"engine": engine}) for trial, engine in zip(trials, choice.engines, strict=True)
@@ -333,56 +315,6 @@ def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], in
         if id(values) not in known:
             known[id(values)] = max(map(measure, values))
     return [known[id(values)] for values in sizes]
-
-
-def point_hyperparams(spec: SweepSpec, point: Mapping[str, Any], point_index: int | None) -> Hyperparams:
-    """Return all hyperparameters of a point's trials, validated.
-
-    Args:
-        spec: The sweep.
-        point: The searched values.
-        point_index: The point's index; None: it is not one of the sweep's yet.
-
-    Raises:
-        SpecError: The values contradict each other.
-    """
-    place = _place(spec, point, point_index)
-    try:
-        values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **point})
-    except ValidationError as error:
-        problems = "; ".join(f"{dotted(detail['loc'])} {explain(detail)}".strip() for detail in details_of(error))
-        raise SpecError(
-            f"The values of {place} don't go together: {problems}",
-            "Give other values."
-            if point_index is None
-            else "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
-        ) from error
-    if isinstance(values, RandomHyperparams) and spec.resources.num_env_runners:
-        raise SpecError(
-            f"resources.num_env_runners is {spec.resources.num_env_runners}, but the baseline {spec.algorithm} plays "
-            "in one process.",
-            "Leave resources.num_env_runners out, or set num_envs to play in several sub-environments.",
-        )
-    num_streams = values.num_envs * max(1, spec.resources.num_env_runners)
-    if num_streams > SEEDS_PER_TRIAL:
-        raise SpecError(
-            f"The values of {place} make {num_streams} sub-environments (num_envs {values.num_envs}, "
-            f"resources.num_env_runners {spec.resources.num_env_runners}), more than the {SEEDS_PER_TRIAL} "
-            "that a trial has seeds for.",
-            "Lower num_envs or resources.num_env_runners.",
-        )
-    return values
-
-
-def _place(spec: SweepSpec, point: Mapping[str, Any] | None, point_index: int | None) -> str:
-    """Return what messages call a point."""
-    if point is None:
-        shown = f"chosen by {spec.search.type}"
-    else:
-        shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
-    if point_index is None:
-        return f"the new point ({shown})"
-    return f"point {point_index} ({shown}; first trial {trial_id(point_index * spec.seeds_per_point)})"
 
 
 def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:

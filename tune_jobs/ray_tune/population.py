@@ -22,7 +22,7 @@ from typing_extensions import override
 from analysis.records import ChangeRecord, TrialRecord
 from policies import random_streams
 from policies.errors import CheckpointError, SpecError
-from tune_jobs.plan.sweep_plan import point_hyperparams
+from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
 from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, name_of, standing_of
 from tune_jobs.search.mutation import mutate

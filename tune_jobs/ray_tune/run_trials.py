@@ -106,8 +106,8 @@ class _Run:
         self._store = self.store = store
         # The settings of every process: its sweep, its run, and the driver with which it ends.
         self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
-        record = store.read_record()
-        self._spec, self._chosen_points = stored_spec(record), record.chosen_points
+        self._record = store.read_record()
+        self._spec = stored_spec(self._record)
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
         self._scheduler: TrialScheduler = TuneScheduler(EveryoneGoesOn())
         self._chooser: PointChooser | None = None
@@ -120,7 +120,7 @@ class _Run:
         if searched:
             self._scheduler = self._build_scheduler()
             if spec.search.type == "tpe":
-                self._chooser = PointChooser(spec, self._chosen_points, self.keeper.all_records, self.keeper.change)
+                self._chooser = PointChooser(spec, self._record, self.keeper.all_records, self.keeper.change)
             self._stage(searched, "")
         if replicas and not (searched and self.store.stop_requested()):
             # They show what a setting gives when it is trained to the end: none of them is compared and ended.

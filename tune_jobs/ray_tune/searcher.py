@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ray.tune.search import Searcher
 
 from analysis.numbering import drawn_index
-from analysis.records import ChosenPointRecord, TrialRecord
-from tune_jobs.plan.sweep_plan import point_hyperparams
+from analysis.records import SweepRecord, TrialRecord
+from policies.hyperparams import Hyperparams
+from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.search.tpe import propose_point
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.transitions import begun, with_point
@@ -22,7 +23,7 @@ class PointChooser:
 
     Args:
         spec: The sweep.
-        chosen_points: Points of it that somebody chose, which are not drawn.
+        sweep: Its record, which has the points that somebody chose: they are not drawn.
         records: Returns the newest records of all trials.
         change: Changes a trial's record, on disk too.
     """
@@ -30,11 +31,11 @@ class PointChooser:
     def __init__(
         self,
         spec: SweepSpec,
-        chosen_points: Sequence[ChosenPointRecord],
+        sweep: SweepRecord,
         records: Callable[[], Sequence[TrialRecord]],
         change: Callable[[str, Callable[[TrialRecord], TrialRecord]], None],
     ) -> None:
-        self._spec, self._chosen_points = spec, chosen_points
+        self._spec, self._sweep = spec, sweep
         self._given: set[str] = set()
         self._records = records
         self._change = change
@@ -62,12 +63,15 @@ class PointChooser:
             # Another seed has a point already: the driver was killed before it could write it to this trial's record.
             self._write(point_index, records, known[0].point)
             return
-        drawn = drawn_index(point_index, self._chosen_points)
-        point = propose_point(spec, records, drawn, lambda point: point_hyperparams(spec, point, point_index))
+        drawn = drawn_index(point_index, self._sweep.chosen_points)
+        point = propose_point(spec, records, drawn, lambda point: self._hyperparams(point, point_index))
         self._write(point_index, records, point)
 
+    def _hyperparams(self, point: Mapping[str, Any], point_index: int) -> Hyperparams:
+        return point_hyperparams(self._spec, point, point_index, self._sweep.replications)
+
     def _write(self, point_index: int, records: Sequence[TrialRecord], point: dict[str, Any]) -> None:
-        hyperparams = point_hyperparams(self._spec, point, point_index).model_dump(mode="json")
+        hyperparams = self._hyperparams(point, point_index).model_dump(mode="json")
         for record in records:
             if record.point_index == point_index and not record.has_point:
                 self._change(record.trial_id, lambda known: with_point(known, point, hyperparams))

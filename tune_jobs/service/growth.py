@@ -10,7 +10,7 @@ from analysis.records import SweepRecord, TrialRecord
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, make_hyperparams
 from tune_jobs.plan.estimates import max_env_steps
-from tune_jobs.plan.sweep_plan import num_points_of, num_trials_of
+from tune_jobs.plan.points import num_points_of, num_trials_of
 from tune_jobs.service.config import Limits
 from tune_jobs.service.jobs import Job
 from tune_jobs.spec.sweep_spec import SweepSpec

@@ -10,7 +10,8 @@ from analysis.records import FINISHED, ChosenPointRecord, SweepRecord, TrialReco
 from policies.errors import CannotRunError, CheckpointError, SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Hyperparams
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import SweepPlan, make_plan, num_points_of, point_hyperparams
+from tune_jobs.plan.points import num_points_of, point_hyperparams
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.process.interruption import current
 from tune_jobs.search.chosen_point import checked_point, trial_of_point
 from tune_jobs.search.points import planned_points

@@ -1,0 +1,103 @@
+"""The points of a sweep: how many there are, what messages call them, and the hyperparameters of their trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from analysis.numbering import first_index
+from analysis.records import ChosenPointRecord, ReplicationRecord
+from policies.errors import SpecError
+from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
+from policies.wrong_values import details_of, dotted, explain
+from tune_jobs.spec.domains import num_points
+from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+def trial_id(index: int) -> str:
+    """Return the id of a trial, such as t0007; ids sort by index up to 10,000 trials."""
+    return f"t{index:04d}"
+
+
+def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = ()) -> int:
+    """Return the number of a sweep's points, those among them that somebody chose."""
+    drawn = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+    return drawn + len(chosen_points)
+
+
+def num_trials_of(
+    spec: SweepSpec,
+    replications: Sequence[ReplicationRecord] = (),
+    chosen_points: Sequence[ChosenPointRecord] = (),
+) -> int:
+    """Return the number of a sweep's trials, those among them of chosen points and of more seeds of some points."""
+    searched = num_points_of(spec, chosen_points) * spec.seeds_per_point
+    return searched + sum(len(item.points) for item in replications)
+
+
+def point_hyperparams(
+    spec: SweepSpec,
+    point: Mapping[str, Any],
+    point_index: int | None,
+    replications: Sequence[ReplicationRecord] = (),
+) -> Hyperparams:
+    """Return all hyperparameters of a point's trials, validated.
+
+    Args:
+        spec: The sweep.
+        point: The searched values.
+        point_index: The point's index; None: it is not one of the sweep's yet.
+        replications: More seeds of some points, oldest first; they decide which trial is a point's first.
+
+    Raises:
+        SpecError: The values contradict each other.
+    """
+    place = place_of_point(spec, point, point_index, replications)
+    try:
+        values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **point})
+    except ValidationError as error:
+        problems = "; ".join(f"{dotted(detail['loc'])} {explain(detail)}".strip() for detail in details_of(error))
+        raise SpecError(
+            f"The values of {place} don't go together: {problems}",
+            "Give other values."
+            if point_index is None
+            else "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
+        ) from error
+    if isinstance(values, RandomHyperparams) and spec.resources.num_env_runners:
+        raise SpecError(
+            f"resources.num_env_runners is {spec.resources.num_env_runners}, but the baseline {spec.algorithm} plays "
+            "in one process.",
+            "Leave resources.num_env_runners out, or set num_envs to play in several sub-environments.",
+        )
+    num_streams = values.num_envs * max(1, spec.resources.num_env_runners)
+    if num_streams > SEEDS_PER_TRIAL:
+        raise SpecError(
+            f"The values of {place} make {num_streams} sub-environments (num_envs {values.num_envs}, "
+            f"resources.num_env_runners {spec.resources.num_env_runners}), more than the {SEEDS_PER_TRIAL} "
+            "that a trial has seeds for.",
+            "Lower num_envs or resources.num_env_runners.",
+        )
+    return values
+
+
+def place_of_point(
+    spec: SweepSpec,
+    point: Mapping[str, Any] | None,
+    point_index: int | None,
+    replications: Sequence[ReplicationRecord] = (),
+) -> str:
+    """Return what messages call a point; its arguments are those of `point_hyperparams`.
+
+    A point of None is one that the search method has yet to choose.
+    """
+    if point is None:
+        shown = f"chosen by {spec.search.type}"
+    else:
+        shown = ", ".join(f"{name} {value}" for name, value in point.items()) or "no searched values"
+    if point_index is None:
+        return f"the new point ({shown})"
+    first = trial_id(first_index(point_index, spec.seeds_per_point, replications))
+    return f"point {point_index} ({shown}; first trial {first})"
