@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from typing import Any
 
 from policies.errors import TuneJobsError
 from tune_jobs.service.jobs import Job
+from tune_jobs.service.outages import Outages
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.telling import Event, Teller
@@ -20,7 +20,7 @@ LOOK_S = 5.0
 STUCK_S = 900.0
 """How long a running sweep may take no env step before it counts as stuck."""
 _EVENTS: dict[str, Event] = {"completed": "sweep.ended", "failed": "sweep.failed", "stopped": "sweep.stopped"}
-_log = logging.getLogger(__name__)
+_LOOKING = "Running sweeps can't be looked at"
 
 
 class Watch:
@@ -32,6 +32,7 @@ class Watch:
         teller: Who is told.
         stuck_s: How long a running sweep may take no env step.
         now: A monotonic clock, in seconds.
+        outages: Where it is noted that sweeps can't be looked at.
     """
 
     def __init__(
@@ -42,7 +43,9 @@ class Watch:
         *,
         stuck_s: float = STUCK_S,
         now: Callable[[], float] = time.monotonic,
+        outages: Outages | None = None,
     ) -> None:
+        self._outages = Outages() if outages is None else outages
         self._queue, self._statuses, self._teller = queue, statuses, teller
         self._stuck_s, self._now = stuck_s, now
         self._best: dict[str, float | None] = {}
@@ -77,8 +80,9 @@ class Watch:
         while not self._end.wait(LOOK_S):
             try:
                 self.look()
-            except Exception:  # noqa: BLE001 (such as a database that is away for a while)
-                _log.exception("Running sweeps could not be looked at; it is tried again.")
+                self._outages.worked(_LOOKING)
+            except Exception as error:  # noqa: BLE001 (such as a database that is away for a while)
+                self._outages.failed(_LOOKING, error)
 
     def look(self) -> None:
         """Look at all running sweeps once."""

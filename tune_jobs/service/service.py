@@ -75,8 +75,10 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             )
             metrics = Metrics()
             watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
-            teller = Teller(engine, config.targets, secret=config.webhook_secret, on_attempt=metrics.delivered)
-            watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s)
+            teller = Teller(
+                engine, config.targets, secret=config.webhook_secret, on_attempt=metrics.delivered, outages=gate.outages
+            )
+            watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s, outages=gate.outages)
 
             def on_end(job: Job) -> None:
                 watch.ended(job)
@@ -84,7 +86,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
 
             supervisor = Supervisor(
                 queue, storage, where,
-                spare_idle_s=config.spare_idle_s, on_end=on_end, on_death=metrics.driver_died,
+                spare_idle_s=config.spare_idle_s, on_end=on_end, on_death=metrics.driver_died, outages=gate.outages,
             )  # fmt: skip
             metrics.add(
                 StateCollector(

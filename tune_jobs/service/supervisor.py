@@ -21,6 +21,7 @@ from policies.errors import TuneJobsError
 from tune_jobs.service.job_files import JobFiles, held_jobs
 from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.logs import LogFormat
+from tune_jobs.service.outages import Outages
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver, memory_of_tree
 from tune_jobs.store.contract import Storage, Sweep
@@ -30,6 +31,7 @@ _log = logging.getLogger(__name__)
 TICK_S = 0.25
 MAX_ATTEMPTS = 5
 """How many driver processes may die of one job before it counts as failed."""
+_LOOKING = "The queue can't be looked at"
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class Supervisor:
         on_end: Called with each job that has ended; after a kill perhaps again.
         on_death: Called when a driver has died before its job had ended.
         make_driver: Starts a driver process.
+        outages: Where it is noted that the queue can't be looked at.
     """
 
     def __init__(
@@ -70,6 +73,7 @@ class Supervisor:
         on_end: Callable[[Job], None] = lambda _: None,
         on_death: Callable[[], None] = lambda: None,
         make_driver: Callable[[Mapping[str, Any]], Driver] = Driver,
+        outages: Outages | None = None,
     ) -> None:
         self._queue, self._storage, self._where = queue, storage, where
         self._spare_idle_s, self._on_end, self._on_death, self._make_driver = (
@@ -78,6 +82,7 @@ class Supervisor:
             on_death,
             make_driver,
         )
+        self._outages = Outages() if outages is None else outages
         self._idle_since = time.monotonic()
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
@@ -187,9 +192,10 @@ class Supervisor:
         while not self._end.is_set():
             try:
                 self._look()
-            except Exception:  # noqa: BLE001 (whatever it is, the queue has to go on)
+                self._outages.worked(_LOOKING)
+            except Exception as error:  # noqa: BLE001 (whatever it is, the queue has to go on)
                 # Such as a database that is away for a while: it is tried again, and the service says that it is so.
-                _log.exception("The queue could not be looked at; it is tried again.")
+                self._outages.failed(_LOOKING, error)
                 self._end.wait(1.0)
             self._wake.wait(TICK_S)
             self._wake.clear()

@@ -29,6 +29,7 @@ from sqlalchemy import Engine, delete, func, insert, or_, select, update
 
 from policies.errors import SpecError
 from tune_jobs.service.database.tables import messages
+from tune_jobs.service.outages import Outages
 
 Kind = Literal["webhook", "command"]
 Delivery = Literal["arrived", "failed", "given_up"]
@@ -44,6 +45,7 @@ _SHORTEST_PATH = 8
 _TIMEOUT_S = 15.0
 _COMMAND_TIMEOUT_S = 60.0
 _KEPT_S = 7 * 24 * 3_600.0
+_SENDING = "Messages can't be sent"
 _log = logging.getLogger(__name__)
 
 
@@ -114,6 +116,7 @@ class Teller:
         secret: What webhooks are signed with; None: they are not.
         on_attempt: Called after each attempt to send.
         now: Returns seconds since 1970.
+        outages: Where it is noted that messages can't be read.
     """
 
     def __init__(
@@ -124,7 +127,9 @@ class Teller:
         secret: str | None = None,
         on_attempt: Callable[[Kind, Delivery], None] = lambda _kind, _delivery: None,
         now: Callable[[], float] = time.time,
+        outages: Outages | None = None,
     ) -> None:
+        self._outages = Outages() if outages is None else outages
         self._engine, self._targets, self._secret, self._now = engine, tuple(targets), secret, now
         self._on_attempt = on_attempt
         self._wake, self._end = threading.Event(), threading.Event()
@@ -169,8 +174,9 @@ class Teller:
         while not self._end.is_set():
             try:
                 self.send_due()
-            except Exception:  # noqa: BLE001 (such as a database that is away for a while)
-                _log.exception("Messages could not be sent; they are tried again.")
+                self._outages.worked(_SENDING)
+            except Exception as error:  # noqa: BLE001 (such as a database that is away for a while)
+                self._outages.failed(_SENDING, error)
                 self._end.wait(5.0)
             self._wake.wait(1.0)
             self._wake.clear()

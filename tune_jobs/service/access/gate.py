@@ -16,6 +16,7 @@ from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.access.tokens import Token, Tokens
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database
+from tune_jobs.service.outages import Outages
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,14 @@ class Gate:
         tokens: Who may come in.
         audit: Where what was done is written down.
         failed_logins: How often a client may show what is no token.
+        outages: Where it is noted that the database can't be used.
     """
 
     config: ServiceConfig
     tokens: Tokens
     audit: Audit
     failed_logins: RateLimit = field(default_factory=RateLimit)
+    outages: Outages = field(default_factory=Outages)
 
     def find(self, secret: str, client: str) -> Token | None:
         """Return the token of a secret, also if it is no longer valid; None: there is none.

@@ -5,7 +5,6 @@ It is ASGI alone and holds back no part of an answer, as event streams pass thro
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,7 +31,6 @@ PUBLIC_PATHS = frozenset({"/", "/healthz", "/readyz", "/api/v1/login"})
 PUBLIC_FOLDERS = ("/static/",)
 """What needs no token: the page's own files, which show nothing until somebody has logged in, and what monitors ask."""
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
-_log = logging.getLogger(__name__)
 
 
 class AccessMiddleware:
@@ -73,7 +71,7 @@ class AccessMiddleware:
             await error.answer()(request.scope, receive, send)
             return
         except SQLAlchemyError as error:
-            _log.error("The database can't be used: %s", error)
+            self._gate.outages.failed("A request", error)
             await database_problem(error)(request.scope, receive, send)
             return
         except GoneError:

@@ -77,7 +77,7 @@ def open_database(url: str) -> Engine:
     except SQLAlchemyError as error:
         engine.dispose()
         raise CannotRunError(
-            f"The service's database {told} can't be used: {_reason(error)}.",
+            f"The service's database {told} can't be used: {reason_of(error)}.",
             "Check the address, the permissions and the space left; a damaged SQLite file can be moved away: sweeps "
             "are found again by their folders.",
         ) from error
@@ -153,6 +153,7 @@ def _migrate(engine: Engine, told: str) -> None:
             raise CannotRunError(f"The service's database {told} can't be migrated: {error}.") from error
 
 
-def _reason(error: SQLAlchemyError) -> str:
+def reason_of(error: SQLAlchemyError) -> str:
+    """Return why a database can't be used, in its own words, on one line."""
     said = str(error.orig) if isinstance(error, DBAPIError) else str(error)
     return " ".join(said.split())[:300].rstrip(".")

@@ -101,8 +101,8 @@ async def _http(request: Request, error: HTTPException) -> JSONResponse:
     return answer
 
 
-async def _database(_: Request, error: SQLAlchemyError) -> JSONResponse:
-    _log.error("The database can't be used: %s", error)
+async def _database(request: Request, error: SQLAlchemyError) -> JSONResponse:
+    request.app.state.service.gate.outages.failed("A request", error)
     return database_problem(error)
 
 
@@ -112,8 +112,9 @@ async def _system(request: Request, error: OSError) -> JSONResponse:
     return await _unexpected(request, error)
 
 
-async def _unexpected(_: Request, error: Exception) -> JSONResponse:
+async def _unexpected(request: Request, error: Exception) -> JSONResponse:
     _log.error("Unexpected %s", type(error).__name__, exc_info=error)
+    request.state.logged = error
     detail = f"Unexpected {type(error).__name__}; the service's log has the traceback."
     return problem(HTTPStatus.INTERNAL_SERVER_ERROR, detail)
 

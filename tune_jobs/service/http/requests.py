@@ -57,11 +57,14 @@ class RequestMiddleware:
 
         try:
             await self._app(scope, receive, sending)
-        except Exception:
+        except Exception as error:
             if status is None:
                 # What the server answers then.
                 status = 500
                 self._metrics.answered(scope["method"], request.route, status, self._clock() - began)
+            elif scope.get("state", {}).get("logged") is error:
+                # Starlette raises it once more when it is answered, and the server would log it once more.
+                return
             raise
         finally:
             took_s = round(self._clock() - began, 6)
