@@ -191,6 +191,11 @@ def test_a_sweep_is_submitted_stopped_and_refused_with_a_sentence(page: Page) ->
     page.says("[role=alert]", "Sweep from-the-page neither waits nor runs")
     page.button("Close", "[role=alert]").click()
     assert page.text("[role=alert]") == ""
+    # One from a preset has its name, with a number if that is taken.
+    page.open("#/new?preset=cartpole-ppo")
+    page.says(".plan", "20 points")
+    page.button("Submit sweep").click()
+    page.says("main h1", "cartpole-ppo-2")
 
 
 def test_dialogs_show_what_is_refused_and_change_what_is_not(page: Page) -> None:

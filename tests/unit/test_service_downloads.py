@@ -95,6 +95,9 @@ def test_a_sweep_that_has_made_nothing_says_so(live: Live) -> None:
     make_sweep_folder(live.storage / "mine")
     assert get(live, "/files").json() == []
     assert "written when the sweep has ended" in get(live, "/report/index.html").json()["hint"]
+    assert "has no report yet" in get(live, "/report/").json()["detail"]
+    for path in ("/best", "/policy"):
+        assert get(live, path).json()["hint"] == "It is chosen when the sweep has ended."
     for path in ("/report/", "/films/after_mp4", "/policy", "/policy/policy.json", "/best"):
         problem(get(live, path), 404)
 

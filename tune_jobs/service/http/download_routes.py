@@ -64,8 +64,11 @@ def report(name: str, path: str, service: TheService) -> Download:
     known = _sweep(service, name).report_files()
     path = path or next((file for file in known if file.endswith(_PAGE_SUFFIX)), "")
     if path not in known:
-        has = "It has those that `files` lists." if known else "It is written when the sweep has ended."
-        raise NotFoundError(f"The report of sweep {name} has no file {path[:80]!r}.", has)
+        if not known:
+            raise NotFoundError(f"Sweep {name} has no report yet.", "It is written when the sweep has ended.")
+        raise NotFoundError(
+            f"The report of sweep {name} has no file {path[:80]!r}.", "It has those that `files` lists."
+        )
     suffix = PurePosixPath(path).suffix
     headers = {"Content-Security-Policy": SANDBOX if suffix == _PAGE_SUFFIX else NO_SCRIPTS}
     filename = None if suffix in _SHOWN else f"{name}-{PurePosixPath(path).name}"
@@ -104,8 +107,12 @@ def _policy_files(service: Service, name: str) -> Mapping[str, Path]:
     sweep = _sweep(service, name)
     found = policy_files(sweep.best_folder) if sweep.has_best() else {}
     if not found:
-        raise NotFoundError(f"Sweep {name} has no best policy yet.", "It is chosen when the sweep has ended.")
+        raise _no_best_yet(name)
     return found
+
+
+def _no_best_yet(name: str) -> NotFoundError:
+    return NotFoundError(f"Sweep {name} has no best policy yet.", "It is chosen when the sweep has ended.")
 
 
 @router.get(
@@ -137,7 +144,11 @@ def sweep_file(name: str, service: TheService) -> Response:
 @router.get("/best")
 def best(name: str, service: TheService) -> dict[str, Any]:
     """Return the policy to deploy and the setting to train with, as `tune-jobs best --json` prints them."""
-    found: dict[str, Any] = to_json(_sweep(service, name).read_best())
+    sweep = _sweep(service, name)
+    # The store's message names the command that chooses it, which is the one that a client was given.
+    if not sweep.has_best():
+        raise _no_best_yet(name)
+    found: dict[str, Any] = to_json(sweep.read_best())
     return found
 
 

@@ -49,7 +49,7 @@ export function openNew(main, route) {
       "name",
       "Name",
       { type: "text", maxlength: 200, spellcheck: "false" },
-      "Empty: the file's, or one that is free.",
+      "Empty: the file's or the preset's, with a number if it is taken.",
     ),
     field(
       "priority",
@@ -164,6 +164,8 @@ export function openNew(main, route) {
       const body = {
         text: editor.text,
         name: name.value.trim() || null,
+        // A preset that was changed is named after it, too.
+        default_name: choice.value || null,
         priority: Number(priority.value),
         tags: tagsOf(tags.value),
         note: note.value,
