@@ -8,6 +8,7 @@ import functools
 import json
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,9 +18,10 @@ import pytest
 from fake_driver import JOURNAL
 from synthetic_sweep import make_sweep_record
 
+from tests.narrowing import present
 from tune_jobs.service import supervisor as module
 from tune_jobs.service.database.opening import open_database, sqlite_url
-from tune_jobs.service.job_files import SERVICE_FOLDER, JobFiles
+from tune_jobs.service.job_files import SERVICE_FOLDER, Holder, JobFiles
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
@@ -197,6 +199,30 @@ def test_draining_lets_sweeps_save_and_wait(place: Place) -> None:
     place.until_all_end()
     second.close()
     assert len(place.begins("a")) == 2
+
+
+def test_draining_asks_no_process_that_has_the_id_of_a_driver_elsewhere_or_of_one_before(place: Place) -> None:
+    job = place.submit("a")
+    files = JobFiles(place.service_folder, job.uid)
+    # Of the second attempt's driver only the lock is there yet.
+    before = present(files.take())
+    files.say_who(Holder(pid=os.getpid(), sweep="a"))
+    assert files.holder() is not None
+    os.close(before)
+    lock = present(files.take())
+    assert files.holder() is None
+    with subprocess.Popen(["sleep", "60"]) as bystander:
+        try:
+            # In another container, the driver has an id that is this process's here.
+            files.say_who(Holder(pid=bystander.pid, sweep="a"))
+            place.queue.claim(2.0)
+            service = place.new_service()
+            service.start()
+            assert not service.drain(0.3)
+            assert bystander.poll() is None
+        finally:
+            bystander.kill()
+            os.close(lock)
 
 
 def test_with_the_database_lost_sweeps_are_found_by_their_folders(place: Place) -> None:

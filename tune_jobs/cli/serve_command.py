@@ -11,6 +11,7 @@ import click
 
 from tune_jobs.cli.base import json_option, storage_option
 from tune_jobs.cli.server import here_only
+from tune_jobs.process.first import leave_first_place
 
 if TYPE_CHECKING:
     from tune_jobs.service.logs import LogFormat
@@ -86,12 +87,14 @@ def serve(
 
     On 127.0.0.1 it needs no token; anywhere else it does: `tune-jobs token make`.
     """
+    here_only()
+    # Before anything begins a thread.
+    leave_first_place()
     from tune_jobs.service import logs
     from tune_jobs.service.config import ServiceConfig
     from tune_jobs.service.serve import serve as run
     from tune_jobs.sweeps.storage import storage_folder
 
-    here_only()
     config = ServiceConfig(
         storage=storage_folder(storage), host=host, port=port, address=address, database=database,
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,

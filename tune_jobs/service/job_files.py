@@ -91,6 +91,8 @@ class JobFiles:
         except OSError:
             os.close(descriptor)
             return None
+        # The last driver's id may be any process's by now, the first one's of this container too.
+        os.ftruncate(descriptor, 0)
         return descriptor
 
     def is_run(self) -> bool:
@@ -109,6 +111,23 @@ class JobFiles:
             return Holder.model_validate_json(self._lock.read_bytes())
         except (OSError, ValidationError):
             return None
+
+    def is_open_in(self, pid: int) -> bool:
+        """Whether a process of this id has the lock open: in a container, ids are others than outside of it.
+
+        Where the system does not say what a process has open, this is true.
+        """
+        try:
+            lock = self._lock.stat()
+            if not Path("/proc/self/fd").exists():
+                return True
+            for path in Path(f"/proc/{pid}/fd").iterdir():
+                with contextlib.suppress(OSError):
+                    if os.path.samestat(path.stat(), lock):
+                        return True
+        except OSError:  # it has ended, or is another user's
+            pass
+        return False
 
     def write_ended(self, ended: Ended) -> None:
         """Write how an attempt ended."""

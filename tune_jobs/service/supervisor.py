@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from policies.errors import TuneJobsError
+from tune_jobs.process.interruption import ASKED
 from tune_jobs.service.job_files import JobFiles, held_jobs
 from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.logs import LogFormat
@@ -259,8 +259,15 @@ class Supervisor:
         if holder is None or job.id in self._interrupted:
             return
         self._interrupted.add(job.id)
+        if not files.is_open_in(holder.pid):
+            _log.warning(
+                "The driver of job %d (sweep %s) can't be asked to save: process %d is another one here. It runs on.",
+                job.id, job.sweep, holder.pid, extra=job.log_fields,
+            )  # fmt: skip
+            return
         with contextlib.suppress(OSError):
-            os.kill(holder.pid, signal.SIGTERM)
+            # Not SIGTERM, as systemd may have sent that to all: a second one would end the trials before they save.
+            os.kill(holder.pid, ASKED)
 
     def _finish(self, job: Job, outcome: Outcome, message: str | None = None) -> None:
         told = (job.id, job.verb, job.sweep, outcome)
