@@ -3,7 +3,7 @@
 The system makes the first process (PID 1) of a container the parent of each process whose own parent has ended, and
 keeps a little of an ended process until its parent asks how it ended. A killed driver leaves a dozen of Ray's behind.
 Asking for all of them in the program itself would take from its libraries the ends of processes that they started; so
-the program goes on in a child, and what is left of the first process does nothing else. `docker run --init` and
+the program goes on in a child, and what is left of the first process does nothing else. Docker's --init and
 Kubernetes' shared process namespace put such a process there by themselves; this does it where nobody has.
 """
 
