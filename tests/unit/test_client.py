@@ -83,7 +83,11 @@ def test_what_is_told_of_a_trial_is_what_its_folder_says(site: Live, looking: Cl
     assert isinstance(looking.log("mine", "t0002", lines=5), str)
     curve = looking.curves("mine", points=3).trials["t0002"]
     assert (curve.iteration[0], curve.iteration[-1]) == (1, 6)
-    assert "hyperparams" in looking.importance("mine")
+    assert looking.importance("mine") == verbs.importance(folder)
+    assert looking.compare("mine", top=2) == verbs.compare(folder, top=2)
+    settings = ["mine/t0000", "mine/t0002/"]
+    found = looking.compare(settings, objective="area")
+    assert found == verbs.compare(settings, objective="area", storage=site.storage)
 
 
 def test_lists_are_read_to_their_last_page(looking: Client, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,6 +138,8 @@ def test_a_sweep_is_changed_stopped_resumed_and_deleted(client: Client, live: Li
     client.submit(FAKE, name="mine")
     assert client.change("mine", note="a", tags=["b"], priority=7).note == "a"
     assert client.job(1).priority == 7
+    assert [job.id for job in client.jobs("waiting", "running")] == [1]
+    assert client.jobs("ended") == client.jobs("running", "creating") == []
     assert [job.outcome for job in client.stop("mine")] == ["cancelled"]
     with pytest.raises(ConflictError, match="neither waits nor runs"):
         client.stop("mine")

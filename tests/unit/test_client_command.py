@@ -10,6 +10,7 @@ from typing import Any
 import click
 import pytest
 from cutting_proxy import cutting_proxy
+from fake_results import COMPARISON, IMPORTANCE
 from fake_sweeps import RunCommand
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
 from sweep_folders import make_sweep_folder
@@ -18,7 +19,7 @@ from test_service_downloads import FILM, PAGE, make_finished
 from tune_jobs.cli import remote_runs
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.server import THERE
-from tune_jobs.client import event_stream
+from tune_jobs.client import Client, event_stream
 from tune_jobs.service.views import SweepView
 from tune_jobs.store.sweep_store import SweepStore
 
@@ -62,7 +63,10 @@ def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         "list", "status mine", "status failed", "status stopped", "trials mine", "trials failed", "trials stopped",
         "trials mine --sort lr", "trials failed --top 2", "trials mine --sort none", "best mine", "best none",
-        "status none", "trials none", "stop mine",
+        "status none", "trials none", "stop mine", "importance mine", "importance failed", "importance stopped",
+        "importance none", "compare mine failed", "compare mine", "compare mine/t0001 mine/t0003 stopped",
+        "compare failed/t0000 mine --objective best", "compare mine --top 2", "compare mine/t0001", "compare mine mine",
+        "compare stopped mine/t0099", "compare mine none", "compare mine/t0001 mine/t0000",
     ],
 )  # fmt: skip
 def test_what_is_printed_is_what_is_printed_there(
@@ -90,6 +94,21 @@ def test_what_is_printed_is_what_is_printed_there(
     # Longer commands in hints make wider columns.
     by_option = run("--server", site.url, *words).stdout.replace(f" --server {site.url}", "")
     assert re.sub(" +\n", "\n", by_option) == re.sub(" +\n", "\n", there.stdout)
+
+
+def test_numbers_that_json_lacks_are_printed_as_there(
+    run: RunCommand, site: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for verb, derived, answer in (("importance", "importance", IMPORTANCE), ("compare", "compared", COMPARISON)):
+        monkeypatch.setattr(site.service.derived, derived, lambda *_, answer=answer: answer)
+        monkeypatch.setattr(f"tune_jobs.sweeps.verbs.{verb}", lambda *_, answer=answer, **__: answer)
+        for words in ((verb, "mine"), (verb, "mine", "--json")):
+            here, there = run(*words), run("--server", site.url, *words)
+            assert here.exit_code == 0
+            assert there.output == here.output
+    with Client(site.url) as client:
+        assert client.compare(["mine", "failed"]) == COMPARISON
+        assert repr(client.importance("mine")) == repr(IMPORTANCE)
 
 
 def test_commands_in_hints_go_to_the_same_service(run: RunCommand, site: Live) -> None:
@@ -159,9 +178,10 @@ def test_a_sweep_is_downloaded_as_one_file(run: RunCommand, site: Live, tmp_path
         ("resume mine --storage s", "--storage"), ("extend mine --num-samples 2 --allow-module m", "--allow-module"),
         ("launch x.yaml --dry-run --address auto", "--address"), ("status mine --storage s", "--storage"),
         ("best mine --num-episodes 7", "--num-episodes"), ("video mine --seed 3", "--seed"),
-        ("evaluate mine", "`tune-jobs evaluate`"), ("compare mine other", "`tune-jobs compare`"),
+        ("evaluate mine", "`tune-jobs evaluate`"), ("compare mine other --html x.html", "--html"),
+        ("compare ../mine other", "is no name of a sweep"), ("compare mine/../x other", "is no id of a trial"),
         ("export mine", "--format sweep"), ("export mine --format sweep --top 2", "--format sweep"),
-        ("export mine failed --format sweep", "--format sweep"), ("importance mine", "`tune-jobs importance`"),
+        ("export mine failed --format sweep", "--format sweep"), ("importance a/b", "is no name of a sweep"),
         ("reproduce mine/t0001", "`tune-jobs reproduce`"), ("serve", "`tune-jobs serve`"),
         ("token list", "`tune-jobs token list`"), ("launch none.yaml", "none.yaml"),
         ("status a/b", "is no name of a sweep"),
@@ -176,7 +196,7 @@ def test_what_goes_with_no_service_is_refused(run: RunCommand, site: Live, argum
 
 def test_all_commands_are_done_there_or_refused_or_about_nothing_there() -> None:
     about_neither = {"presets", "hyperparams", "schema"}
-    refused = {"evaluate", "compare", "importance", "reproduce", "serve", "token"}
+    refused = {"evaluate", "reproduce", "serve", "token"}
     assert {*THERE, *about_neither, *refused} == cli.commands.keys()
     assert "--output" in {name for item in cli.commands["report"].params for name in item.opts}
     assert isinstance(cli, click.Group)

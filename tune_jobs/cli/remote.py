@@ -11,7 +11,9 @@ from policies.errors import NotFoundError, SpecError
 from tune_jobs.client import Client, ConflictError
 
 if TYPE_CHECKING:
-    from analysis.records import BestRecord, TrialRecord
+    from analysis.comparison.compare import Comparison
+    from analysis.importance.answer import WhatMattered
+    from analysis.records import BestRecord, Objective, TrialRecord
     from tune_jobs.plan.sweep_plan import SweepPlan
     from tune_jobs.spec.sweep_spec import SweepSpec
     from tune_jobs.sweeps.status import SweepStatus
@@ -52,6 +54,16 @@ class RemoteVerbs:
     def best(self, sweep: str, *, storage: None = None, num_episodes: int = 0) -> BestRecord:  # noqa: ARG002
         """Return the policy that was chosen when the sweep ended."""
         return self._client.best(sweep)
+
+    def importance(self, sweep: str, *, storage: None = None) -> WhatMattered:  # noqa: ARG002
+        """Say which hyperparameters a sweep's scores depend on."""
+        return self._client.importance(sweep)
+
+    def compare(
+        self, sources: Sequence[str], *, objective: Objective | None = None, top: int = 3, **_: Any
+    ) -> Comparison:
+        """Compare sweeps or settings."""
+        return self._client.compare(sources, objective=objective, top=top)
 
     def report(self, sweep: str, *, storage: None = None, output: str | None = None) -> Path:  # noqa: ARG002
         """Download the page of a sweep's report, and return its path."""

@@ -89,11 +89,10 @@ def compare(
     settings are compared.
     """
     from tune_jobs.cli import comparison_view
-    from tune_jobs.sweeps import verbs
 
-    here_only()
+    does = verbs_of_command()
     with stdout_for(as_json=as_json):
-        found = verbs.compare(list(sources), objective=objective, top=top, html=html, storage=storage)
+        found = does.compare(list(sources), objective=objective, top=top, html=html, storage=storage)
     comparison_view.show_comparison(found, html=html, as_json=as_json)
 
 
@@ -104,11 +103,10 @@ def compare(
 def importance(*, sweep: str, storage: str | None, as_json: bool) -> None:
     """Say which hyperparameters the scores of a sweep depend on, how sure that is, and which bounds to widen."""
     from tune_jobs.cli import importance_view
-    from tune_jobs.sweeps import verbs
 
-    here_only()
+    does = verbs_of_command()
     with stdout_for(as_json=as_json):
-        found = verbs.importance(sweep, storage=storage)
+        found = does.importance(sweep, storage=storage)
     importance_view.show_importance(found, as_json=as_json)
 
 

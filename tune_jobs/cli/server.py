@@ -26,7 +26,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 THERE = (
     "launch", "list", "status", "trials", "stop", "resume", "extend", "inject", "replicate", "best", "report", "video",
-    "export",
+    "importance", "compare", "export",
 )  # fmt: skip
 """The commands that a service does."""
 _ONLY_HERE = {
@@ -34,6 +34,7 @@ _ONLY_HERE = {
     "address": ("--address", "the service runs sweeps where its operator has said"),
     "finish": ("--finish or --no-finish", "the service always makes what follows the trials"),
     "allow_module": ("--allow-module", "its operator says which modules sweeps may name (`serve --allow-module`)"),
+    "html": ("--html", "its page is made on the machine of the sweeps' folder"),
     "num_episodes": ("--num-episodes", "the policy was confirmed there when the sweep ended"),
     "seed": ("--seed", "a service has the films that were made when the sweep ended"),
     "env_id": ("--env", "a service has films of a sweep's best policy in its own environment"),

@@ -7,7 +7,7 @@ import json
 import logging
 import ssl
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +31,7 @@ CONNECT_S = 10.0
 _WAITS_S = (0.2, 0.5, 1.0, 2.0)
 """How long is waited before each further attempt."""
 JSON = "application/json"
-Query = Mapping[str, str | int | float | bool | None]
+Query = Mapping[str, str | int | float | bool | Sequence[str] | None]
 
 
 class Connection:
@@ -111,7 +111,7 @@ class Connection:
             method: Of HTTP.
             path: Behind the service's address.
             repeat: Whether it may be asked twice.
-            query: Parameters; those that are None are left out.
+            query: Parameters; those that are None are left out, those with several values come several times.
             body: What is sent, as JSON; None: nothing.
             headers: Further headers.
             timeout_s: How long the answer may take; None: as the connection's.

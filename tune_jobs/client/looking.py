@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 from tune_jobs.client.answers import Curves, FileOfSweep, Job, Me, Summary, Trial
 from tune_jobs.client.asking import Asking, sweep_path, trial_path
 
 if TYPE_CHECKING:
-    from analysis.records import BestRecord, IterationRecord, TrialRecord
+    from analysis.comparison.compare import Comparison
+    from analysis.importance.answer import WhatMattered
+    from analysis.records import BestRecord, IterationRecord, Objective, TrialRecord
     from tune_jobs.sweeps.status import SweepStatus
 
 
@@ -129,10 +130,38 @@ class Looking(Asking):
 
         return self._read(BestRecord, self._ask("GET", f"{sweep_path(name)}/best"))
 
-    def importance(self, name: str) -> dict[str, Any]:
-        """Return which hyperparameters scores depend on, as `tune-jobs importance --json` prints it."""
-        found: dict[str, Any] = self._ask("GET", f"{sweep_path(name)}/importance")
-        return found
+    def importance(self, name: str) -> WhatMattered:
+        """Say which hyperparameters a sweep's scores depend on, as `tune_jobs.importance` does there.
+
+        Raises:
+            NotFoundError: There is no such sweep.
+        """
+        from analysis.importance.answer import WhatMattered
+
+        return self._read(WhatMattered, self._ask("GET", f"{sweep_path(name)}/what-mattered"))
+
+    def compare(self, sources: str | Sequence[str], *, objective: Objective | None = None, top: int = 3) -> Comparison:
+        """Compare sweeps by their leading settings, or settings with each other, as `tune_jobs.compare` does there.
+
+        Args:
+            sources: Each a sweep, or a setting by one of its trials: `SWEEP/t0003`. Of one sweep alone the leading
+                settings are compared.
+            objective: What all are judged by; None: what their sweep files say, or `final` where these differ.
+            top: How many settings are compared of a sweep that is named alone.
+
+        Raises:
+            NotFoundError: There is no such sweep or trial.
+            SpecError: Fewer than two different things, or too many, are to be compared.
+        """
+        from analysis.comparison.compare import Comparison
+
+        named = [sources] if isinstance(sources, str) else list(sources)
+        for source in named:
+            sweep, _, trial_id = source.rstrip("/").partition("/")
+            # Neither is part of a path here, but what can be none is told in the same words.
+            _ = trial_path(sweep, trial_id) if trial_id else sweep_path(sweep)
+        query = {"source": named, "objective": objective, "top": top}
+        return self._read(Comparison, self._ask("GET", "/comparison", query=query))
 
     def files(self, name: str) -> list[FileOfSweep]:
         """Return which files can be downloaded of a sweep: its report, films and policy."""
@@ -140,8 +169,7 @@ class Looking(Asking):
 
     def jobs(self, *states: str) -> list[Job]:
         """Return jobs in the order in which they came, of some states or all."""
-        query = "&".join(f"state={quote(state)}" for state in states)
-        return self._read(list[Job], self._ask("GET", f"/jobs?{query}" if query else "/jobs"))
+        return self._read(list[Job], self._ask("GET", "/jobs", query={"state": states}))
 
     def job(self, number: int) -> Job:
         """Return one job.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,8 +14,9 @@ from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.sweeps.status import SweepStatus
 
 if TYPE_CHECKING:
+    from analysis.comparison.compare import Comparison
     from analysis.importance import WhatMattered
-    from analysis.records import TrialRecord
+    from analysis.records import Objective, TrialRecord
     from tune_jobs.sweeps.side_by_side import SideBySide
 
 _SHARE = 0.1
@@ -81,6 +83,29 @@ class Derived:
             self._statuses.see(name)
         side_by_side.check_comparable([self._storage.sweep(name) for name in names])
         found: SideBySide = self._get_of(names, "comparison", side_by_side.side_by_side)
+        return found
+
+    def compared(self, sources: Sequence[tuple[str, str | None]], objective: Objective | None, top: int) -> Comparison:
+        """Compare sweeps or settings of sweeps, as of a while ago if any of them runs.
+
+        Args:
+            sources: Each a sweep's name, and the id of one of its trials; None: the sweep.
+            objective: What all are judged by; None: what their sweep files say.
+            top: How many settings are compared of a sweep that is named alone.
+
+        Raises:
+            NotFoundError: There is no such sweep or trial, or it is damaged.
+            SpecError: They can't be compared.
+        """
+        from tune_jobs.sweeps.compare import compared
+
+        names = list(dict.fromkeys(name for name, _ in sources))
+
+        def make(sweeps: Sequence[Sweep]) -> Comparison:
+            known = dict(zip(names, sweeps, strict=True))
+            return compared([(known[name], trial_id) for name, trial_id in sources], objective, top)[0]
+
+        found: Comparison = self._get_of(names, f"compared {json.dumps([sources, objective, top])}", make)
         return found
 
     def sweep_file(self, name: str) -> bytes:

@@ -11,6 +11,7 @@ from analysis.comparison.compare import MAX_ENTRIES, Comparison
 from analysis.comparison.compare import compare as compare_all
 from analysis.comparison.entries import Wanted
 from analysis.exports.frames import ranked_settings
+from analysis.records import Objective
 from policies.arguments import PositiveInt, checked
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.spec.file import stored_spec
@@ -49,24 +50,39 @@ def compare(
         CannotRunError: The page cannot be written.
     """
     named = [sources] if isinstance(sources, str | Path) else list(sources)
-    if not named:
+    found, wanted = compared([find_source(each, storage) for each in named], objective, top)
+    if html is not None:
+        from analysis.comparison.page import write_page
+
+        write_page(expanded(html), found, wanted)
+    return found
+
+
+def compared(
+    sources: Sequence[tuple[Sweep, str | None]], objective: Objective | None, top: int
+) -> tuple[Comparison, dict[str, Wanted]]:
+    """Compare what was found already; see `compare`.
+
+    Args:
+        sources: Each a sweep, and the id of one of its trials or None, as of `find_source`.
+        objective: See `compare`.
+        top: See `compare`.
+
+    Returns:
+        The comparison, and what it was made of, by letter.
+    """
+    if not sources:
         raise SpecError("Nothing was given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials.")
-    wanted = _settings_of(named[0], top, storage) if len(named) == 1 else [_wanted(each, storage) for each in named]
+    wanted = _settings_of(*sources[0], top) if len(sources) == 1 else [_wanted(*each) for each in sources]
     _refuse_twice(wanted)
     if not 2 <= len(wanted) <= MAX_ENTRIES:
         raise SpecError(
             f"{len(wanted)} things were given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials."
         )
-    found = compare_all(wanted, objective)
-    if html is not None:
-        from analysis.comparison.page import write_page
-
-        write_page(expanded(html), found, dict(zip(string.ascii_uppercase, wanted, strict=False)))
-    return found
+    return compare_all(wanted, objective), dict(zip(string.ascii_uppercase, wanted, strict=False))
 
 
-def _wanted(source: str | Path, storage: str | Path | None) -> Wanted:
-    store, trial_id = find_source(source, storage)
+def _wanted(store: Sweep, trial_id: str | None) -> Wanted:
     if trial_id is None:
         return wanted_sweep(store)
     trial = find_trial(store, trial_id)
@@ -89,9 +105,8 @@ def _of(store: Sweep, name: str, point_index: int | None) -> Wanted:
     return Wanted(name, record, sweep_data(store), cores, point_index)
 
 
-def _settings_of(source: str | Path, top: int, storage: str | Path | None) -> list[Wanted]:
+def _settings_of(store: Sweep, trial_id: str | None, top: int) -> list[Wanted]:
     """Return the leading settings of a sweep, each called after its first trial."""
-    store, trial_id = find_source(source, storage)
     if trial_id is not None:
         raise SpecError(
             f"Only {store.name}/{trial_id} was given to be compared.", "Name another trial or sweep to compare it with."

@@ -8,8 +8,10 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 from fastapi import Path as PathParameter
+from pydantic import StringConstraints
 from pydantic_core import to_json
 
+from analysis.records import Objective
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.pages import page_of
 from tune_jobs.service.jobs import Job
@@ -17,6 +19,10 @@ from tune_jobs.service.problem_documents import problems
 from tune_jobs.sweeps.status import SweepStatus
 
 router = APIRouter(prefix="/api/v1", tags=["records"])
+
+
+Source = Annotated[str, StringConstraints(max_length=500)]
+_MOST_SOURCES = 100
 
 
 def _json(kind: str, what: str) -> dict[int | str, dict[str, Any]]:
@@ -54,6 +60,35 @@ def records(name: str, service: TheService) -> Response:
     found = service.derived.records(name)
     body = b",".join(record.model_dump_json().encode() for record in found)
     return Response(b"[%s]" % body, media_type="application/json")
+
+
+@router.get("/sweeps/{name}/what-mattered", responses=_json("object", "What mattered."), response_class=Response)
+def what_mattered(name: str, service: TheService) -> Response:
+    """Say which hyperparameters scores depend on, as `importance` does, with the numbers that JSON lacks as texts."""
+    return _answer(service.derived.importance(name))
+
+
+@router.get(
+    "/comparison",
+    responses={**_json("object", "The comparison."), **problems({404: "There is no such sweep or trial."})},
+    response_class=Response,
+)
+def comparison(
+    service: TheService,
+    *,
+    source: Annotated[
+        list[Source],
+        Query(min_length=1, max_length=_MOST_SOURCES, description="A sweep, or one of its trials: NAME/t0003."),
+    ],
+    objective: Annotated[Objective | None, Query(description="What all are judged by; none: as they say.")] = None,
+    top: Annotated[int, Query(ge=2, le=10_000, description="Settings of a sweep that is named alone.")] = 3,
+) -> Response:
+    """Compare sweeps or settings, as `tune-jobs compare`; of running ones as of a while ago.
+
+    Numbers that JSON lacks are texts.
+    """
+    parts = [text.rstrip("/").partition("/") for text in source]
+    return _answer(service.derived.compared([(name, trial or None) for name, _, trial in parts], objective, top))
 
 
 @router.get("/jobs/{number}", responses=problems({404: "There is no such job."}))
