@@ -146,7 +146,8 @@ def test_what_the_supervisor_logs_names_sweep_job_and_owner(client: TestClient, 
     client.post("/api/v1/sweeps", json={"spec": FAKE, "name": "mine"})
     store = service.storage.sweep("mine")
     record = store.read_record()
-    store.write_record(record.model_copy(update={"spec": record.spec | {"hyperparams": {"seconds": 0}}}))
+    how = {"seconds": 0, "error": "it broke"}
+    store.write_record(record.model_copy(update={"spec": record.spec | {"hyperparams": how}}))
 
     def has_ended() -> bool:
         service.supervisor._look()
@@ -157,11 +158,11 @@ def test_what_the_supervisor_logs_names_sweep_job_and_owner(client: TestClient, 
     told = [line for line in handler.objects if line["logger"].endswith("supervisor")]
     assert len(told) == 2
     assert all((line["sweep"], line["job"], line["owner"]) == ("mine", 1, "local") for line in told)
-    # The driver's own log.
+    # The driver's own log, which is kept as it has failed.
     said = JobFiles(service.config.folder, service.queue.jobs()[0].uid).last_lines().splitlines()
     assert "Attempt 1 is run by process" in said[0]
     assert said[0].endswith("[job 1, sweep mine]")
-    assert said[-1].endswith("Attempt 1 has ended: completed. [job 1, sweep mine]")
+    assert said[-1].endswith("Attempt 1 has ended: failed. [job 1, sweep mine]")
 
 
 # -- secrets

@@ -21,7 +21,7 @@ from synthetic_sweep import make_sweep_record
 from tests.narrowing import present
 from tune_jobs.service import supervisor as module
 from tune_jobs.service.database.opening import open_database, sqlite_url
-from tune_jobs.service.job_files import SERVICE_FOLDER, Holder, JobFiles
+from tune_jobs.service.job_files import KEPT_S, SERVICE_FOLDER, Holder, JobFiles
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
@@ -322,3 +322,54 @@ def test_no_more_run_at_once_than_there_are_cpus(place: Place, service: Supervis
         at_once += 1 if line["what"] == "begin" else -1
         most = max(most, at_once)
     assert most == 2
+
+
+def files_of(place: Place) -> set[str]:
+    """The names of the files of all jobs."""
+    return {path.name for path in (place.service_folder / "jobs").iterdir()}
+
+
+def test_of_jobs_that_ended_only_what_the_failed_ones_said_is_kept(place: Place, service: Supervisor) -> None:
+    place.submit("good")
+    place.submit("bad", error="it broke")
+    place.submit("dies", exit=True)
+    stopped, runs = place.submit("stopped", seconds=100), place.submit("runs", seconds=100)
+    place.until_it_runs(stopped)
+    place.queue.request_stop("stopped")
+    place.until_it_runs(runs)
+    place.wait(lambda: len(place.queue.jobs("ended")) == 4, "they never ended")
+    uids = {job.sweep: job.uid for job in place.queue.jobs()}
+    kept = {f"{uids['bad']}.log", f"{uids['dies']}.log", f"{uids['runs']}.log", f"{uids['runs']}.held"}
+    place.wait(lambda: files_of(place) == kept, "other files are left")
+    # A good one whose files could not be removed, as the service was killed, and a failed one of long ago.
+    old = time.time() - KEPT_S - 60
+    os.utime(place.service_folder / "jobs" / f"{uids['bad']}.log", (old, old))
+    for name in ("left.held", "left.json"):
+        (place.service_folder / "jobs" / name).write_text("{}")
+    place.submit("last")
+    place.wait(lambda: len(place.queue.jobs("ended")) == 5, "it never ended")
+    place.wait(lambda: files_of(place) == kept - {f"{uids['bad']}.log"}, "other files are left")
+
+
+def test_a_start_removes_the_files_of_jobs_that_ended_and_no_others(place: Place) -> None:
+    first = place.new_service()
+    first.start()
+    runs = place.submit("runs", seconds=3.0)
+    pid = place.until_it_runs(runs)
+    first.close()
+    jobs = place.service_folder / "jobs"
+    for name in ("ended.held", "ended.json", "ended.log"):
+        (jobs / name).write_text("{}")
+    # Of a job that the database has lost, whose driver lives.
+    unknown = JobFiles(place.service_folder, "unknown")
+    lock = unknown.take()
+    second = place.new_service()
+    second.reconcile()
+    assert files_of(place) == {"ended.log", f"{runs.uid}.held", f"{runs.uid}.log", "unknown.held"}
+    assert lock is not None
+    os.close(lock)
+    second.start()
+    (job,) = place.until_all_end()
+    second.close()
+    assert (job.outcome, [line["pid"] for line in place.begins("runs")]) == ("completed", [pid])
+    assert files_of(place) == {"ended.log"}

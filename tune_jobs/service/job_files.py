@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +21,8 @@ from tune_jobs.store.locks import is_held
 
 SERVICE_FOLDER = ".service"
 """In the storage folder; hidden, so that it is no sweep."""
+KEPT_S = 7 * 24 * 3_600.0
+"""How long what the driver of a job that failed has printed is kept, in seconds."""
 
 
 def own_folder(root: Path) -> Path:
@@ -50,6 +53,26 @@ class Holder(BaseModel):
 
     pid: int
     sweep: str
+
+
+def remove_ended(folder: Path, open_uids: Collection[str], now: float) -> None:
+    """Remove the files of jobs that have ended, as far as nobody needs them any more.
+
+    What drivers printed is kept for `KEPT_S`: whoever wants to know why a job failed reads it. Nothing is left of jobs
+    that ended well, unless the service was killed meanwhile.
+
+    Args:
+        folder: The service's folder.
+        open_uids: The jobs that have not ended.
+        now: Seconds since 1970.
+    """
+    for path in (folder / "jobs").glob("*"):
+        # A driver may run a job that no database knows any more.
+        if path.stem in open_uids or JobFiles(folder, path.stem).is_run():
+            continue
+        with contextlib.suppress(OSError):
+            if path.suffix in (".held", ".json") or (path.suffix == ".log" and path.stat().st_mtime < now - KEPT_S):
+                path.unlink()
 
 
 def held_jobs(folder: Path) -> list[Holder]:
@@ -151,4 +174,6 @@ class JobFiles:
     def remove(self) -> None:
         """Remove the files of a job that has ended."""
         for path in (self._ended, self.log, self._lock):
-            path.unlink(missing_ok=True)
+            # What can't be removed now is removed at the next start.
+            with contextlib.suppress(OSError):
+                path.unlink()

@@ -18,7 +18,7 @@ from typing import Any
 
 from policies.errors import TuneJobsError
 from tune_jobs.process.interruption import ASKED
-from tune_jobs.service.job_files import JobFiles, held_jobs
+from tune_jobs.service.job_files import JobFiles, held_jobs, remove_ended
 from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.logs import LogFormat
 from tune_jobs.service.outages import Outages
@@ -187,6 +187,7 @@ class Supervisor:
                 continue
             if state in ("created", "running"):
                 self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.num_cpus)
+        self._remove_files()
 
     def _run(self) -> None:
         while not self._end.is_set():
@@ -275,6 +276,15 @@ class Supervisor:
         # First it is told: whoever is killed in between tells it twice, and not never.
         self._on_end(job.model_copy(update={"state": "ended", "outcome": outcome, "message": message}))
         self._queue.end(job.id, outcome, message)
+        # All that they said is in the queue now.
+        if outcome != "failed":
+            self._files(job).remove()
+        self._remove_files()
+
+    def _remove_files(self) -> None:
+        """Remove the files of jobs that have ended."""
+        open_uids = {job.uid for job in self._queue.jobs("creating", "waiting", "running")}
+        remove_ended(self._where.service_folder, open_uids, time.time())
 
     def _start(self, job: Job) -> None:
         files = self._files(job)
