@@ -8,27 +8,34 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from weakref import ReferenceType, ref
 
 from tune_jobs.service.statuses import Statuses, Trials
 from tune_jobs.store.contract import Storage, Sweep
+from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.status import SweepStatus
 
 if TYPE_CHECKING:
     from analysis.comparison.compare import Comparison
     from analysis.importance import WhatMattered
-    from analysis.records import Objective, TrialRecord
+    from analysis.records import Objective
     from tune_jobs.sweeps.side_by_side import SideBySide
 
 _SHARE = 0.1
 """The share of a core that making one thing anew of a running sweep takes."""
 _MOST_KEPT = 64
+_MOST_BYTES = 256 * 2**20
+"""What is kept of all, besides the last, which may be larger; a sweep as one file has at most so many."""
+_BYTES_OF_JSON = 8
+"""What one character of JSON takes as objects, about."""
 
 
 @dataclass(frozen=True)
 class _Made:
-    of: tuple[tuple[Trials, SweepStatus], ...]
-    """What each sweep was like."""
+    of: tuple[tuple[ReferenceType[Trials], ReferenceType[SweepStatus]], ...]
+    """What each sweep was like; not to keep all its trials, of which `Statuses` has those of now."""
     value: Any
+    num_bytes: int
     at: float
     took_s: float
 
@@ -120,15 +127,20 @@ class Derived:
         content: bytes = self._get(name, "file", sweep_file)
         return content
 
-    def records(self, name: str) -> list[TrialRecord]:
-        """Return the records of a sweep's trials with the checkpoints that may be chosen, as of a while ago if it runs.
+    def records(self, name: str) -> bytes:
+        """Return the records of a sweep's trials with the checkpoints that may be chosen, as a JSON list.
+
+        They are as of a while ago if it runs.
 
         Raises:
             NotFoundError: There is no such sweep, or it is damaged.
         """
         from tune_jobs.store.candidates import read_trials
 
-        found: list[TrialRecord] = self._get(name, "records", read_trials)
+        def records_of(sweep: Sweep) -> bytes:
+            return b"[%s]" % b",".join(record.model_dump_json().encode() for record in read_trials(sweep))
+
+        found: bytes = self._get(name, "records", records_of)
         return found
 
     def _get(self, name: str, what: str, make: Callable[[Sweep], Any]) -> Any:
@@ -145,7 +157,7 @@ class Derived:
             known = self._made.pop(key, None)
             if known is not None:
                 is_of_now = all(
-                    trials is one.trials and status is one.status
+                    trials() is one.trials and status() is one.status
                     for one, (trials, status) in zip(seen, known.of, strict=True)
                 )
                 runs = any(not one.is_over for one in seen)
@@ -153,9 +165,21 @@ class Derived:
                     self._made[key] = known
                     return known.value
             value = make([self._storage.sweep(name) for name in names])
-            of = tuple((one.trials, one.status) for one in seen)
-            self._made[key] = _Made(of, value, now, self._clock() - now)
-            while len(self._made) > _MOST_KEPT:
+            took_s = self._clock() - now
+            of = tuple((ref(one.trials), ref(one.status)) for one in seen)
+            self._made[key] = _Made(of, value, _num_bytes(value), now, took_s)
+            while len(self._made) > _MOST_KEPT or (len(self._made) > 1 and self.num_bytes > _MOST_BYTES):
                 # The first is the one that nobody has asked for the longest.
                 del self._made[next(iter(self._made))]
             return value
+
+    @property
+    def num_bytes(self) -> int:
+        """About how many bytes are kept."""
+        return sum(made.num_bytes for made in self._made.values())
+
+
+def _num_bytes(value: Any) -> int:
+    if isinstance(value, bytes | str):
+        return len(value)
+    return _BYTES_OF_JSON * len(json.dumps(to_json(value)))

@@ -57,9 +57,7 @@ def statuses(
 @router.get("/sweeps/{name}/records", responses=_json("array", "The records, by index."), response_class=Response)
 def records(name: str, service: TheService) -> Response:
     """Return the records of all trials with the checkpoints that may be chosen; of a running sweep as a while ago."""
-    found = service.derived.records(name)
-    body = b",".join(record.model_dump_json().encode() for record in found)
-    return Response(b"[%s]" % body, media_type="application/json")
+    return Response(service.derived.records(name), media_type="application/json")
 
 
 @router.get("/sweeps/{name}/what-mattered", responses=_json("object", "What mattered."), response_class=Response)

@@ -1,0 +1,71 @@
+"""What is made of whole sweeps is kept within a number of bytes, and keeps no sweep's trials."""
+
+import gc
+import weakref
+from pathlib import Path
+
+import pytest
+from sweep_folders import make_sweep_folder
+
+from tune_jobs.service import derived as module
+from tune_jobs.service.derived import Derived
+from tune_jobs.service.statuses import Statuses
+from tune_jobs.store.local_storage import open_storage
+
+NAMES = ("a", "b", "c")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("sweeps")
+    for name in NAMES:
+        make_sweep_folder(made / name)
+    return made
+
+
+@pytest.fixture
+def statuses(folder: Path) -> Statuses:
+    return Statuses(open_storage(folder))
+
+
+@pytest.fixture
+def derived(folder: Path, statuses: Statuses) -> Derived:
+    return Derived(open_storage(folder), statuses)
+
+
+def test_what_nobody_has_asked_for_the_longest_goes_where_bytes_are_short(
+    derived: Derived, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes = {name: len(derived.sweep_file(name)) for name in NAMES}
+    assert derived.num_bytes == sum(sizes.values())
+    kept = derived.sweep_file("a"), derived.sweep_file("c")
+    monkeypatch.setattr(module, "_MOST_BYTES", sum(sizes.values()))
+    text = derived.trials_csv("b")
+    # The file of b has gone, whose turn was the longest ago.
+    assert derived.num_bytes == sizes["a"] + sizes["c"] + len(text)
+    assert derived.sweep_file("a") is kept[0]
+    assert derived.sweep_file("c") is kept[1]
+
+
+def test_the_last_is_kept_however_large_it_is(derived: Derived, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MOST_BYTES", 10)
+    first = derived.sweep_file("a")
+    assert derived.sweep_file("a") is first
+    derived.sweep_file("b")
+    assert derived.num_bytes == len(derived.sweep_file("b"))
+
+
+def test_objects_count_by_what_they_hold(derived: Derived) -> None:
+    derived.importance("a")
+    small = derived.num_bytes
+    derived.comparison(["a", "b"])
+    assert 100 < small < derived.num_bytes < 10**6
+
+
+def test_trials_of_a_sweep_that_is_gone_are_not_kept(derived: Derived, statuses: Statuses) -> None:
+    derived.trials_csv("a")
+    trials = weakref.ref(statuses.see("a").trials)
+    assert trials() is not None
+    statuses.forget("a")
+    gc.collect()
+    assert trials() is None
