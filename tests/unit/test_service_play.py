@@ -1,8 +1,10 @@
 """Watching a policy play over HTTP: events in order, what can't be played, and that a player ends with its watcher."""
 
+import asyncio
 import contextlib
 import json
 import os
+import subprocess
 import threading
 import time
 import urllib.request
@@ -10,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 import uvicorn
 from fastapi.testclient import TestClient
@@ -22,6 +25,8 @@ from tune_jobs.service.http.app import make_app
 from tune_jobs.service.service import Service
 
 # ruff: noqa: F811 - fixtures are named as arguments
+
+PIPES: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "start_new_session": True}
 
 
 @pytest.fixture
@@ -98,6 +103,31 @@ def test_an_env_that_fails_is_said(client: TestClient, service: Service) -> None
     assert "Acrobot-v1" in told["detail"]
 
 
+def test_of_many_that_come_at_once_only_as_many_are_played_as_may(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def slow(*_: Any, **__: Any) -> Any:
+        # As on a busy machine, where a process takes a while to begin.
+        begun.append(len(play_routes._playing))
+        await asyncio.sleep(0.2)
+        return await begin("false", **PIPES)
+
+    async def ask_for_ten() -> list[int]:
+        transport = httpx2.ASGITransport(make_app(service))
+        async with httpx2.AsyncClient(transport=transport, base_url="http://127.0.0.1:8265") as asking:
+            path = "/api/v1/sweeps/done/play?trial=t0003&speed=10"
+            return [answer.status_code for answer in await asyncio.gather(*(asking.get(path) for _ in range(10)))]
+
+    begun: list[int] = []
+    begin = asyncio.create_subprocess_exec
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", slow)
+    assert sorted(asyncio.run(ask_for_ten())) == [200] * 4 + [429] * 6
+    assert len(begun) == 4
+    # All places are free again.
+    assert not play_routes._playing
+    assert sorted(asyncio.run(ask_for_ten()))[:4] == [200] * 4
+
+
 @pytest.fixture
 def url(service: Service) -> Iterator[str]:
     """The address of a real server."""
@@ -114,7 +144,9 @@ def url(service: Service) -> Iterator[str]:
 def test_a_player_ends_with_its_watcher(url: str) -> None:
     with urllib.request.urlopen(f"{url}/api/v1/sweeps/done/play?trial=t0003&speed=0.1", timeout=60) as answer:
         assert answer.readline() == b"event: info\n"
-        (pid,) = play_routes._playing
+        (episode,) = play_routes._playing
+        pid = episode.pid
+        assert pid is not None
     deadline = time.monotonic() + 30
     with contextlib.suppress(ProcessLookupError):
         while True:

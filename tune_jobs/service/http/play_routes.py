@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import anyio
 from fastapi import APIRouter, Query
 from fastapi.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from policies.errors import NotFoundError
 from tune_jobs.service.http.caller import TheService
@@ -38,7 +39,7 @@ main()
 _MAX_LINE = 8 * 1024**2
 _PATIENCE_S = 60.0
 """How long an environment may take for one step before the episode is ended."""
-_playing: set[int] = set()
+_playing: set[_Play] = set()
 
 
 def num_playing() -> int:
@@ -47,7 +48,72 @@ def num_playing() -> int:
 
 
 class _Play(StreamingResponse):
+    """An episode, while one more may be played.
+
+    Args:
+        request: What is played, see `player.play`.
+        folder: Where its process begins.
+        limit: How many episodes may be played at once.
+    """
+
     media_type = "text/event-stream"
+
+    def __init__(self, request: dict[str, Any], folder: str, limit: int) -> None:
+        # An abandoned connection ends the generator, and with it the process.
+        super().__init__(
+            self._events(request, folder), headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        )
+        self._limit = limit
+        self.pid: int | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Play it.
+
+        Raises:
+            TooManyError: As many episodes are played as may.
+        """
+        # Nothing else runs between the look and the taking of the place, and whatever comes then gives it back.
+        if len(_playing) >= self._limit:
+            raise TooManyError(f"{self._limit} episodes are being played.", "Close one, or wait for its end.")
+        _playing.add(self)
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            _playing.discard(self)
+
+    async def _events(self, request: dict[str, Any], folder: str) -> AsyncIterator[str]:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-P", "-c", _BEGIN,
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL,
+            cwd=folder, start_new_session=True, limit=_MAX_LINE,
+        )  # fmt: skip
+        self.pid = process.pid
+        try:
+            if process.stdin is None or process.stdout is None:
+                raise RuntimeError("the player has no pipes")
+            process.stdin.write(json.dumps(request).encode())
+            process.stdin.close()
+            last = ""
+            while True:
+                try:
+                    line = await asyncio.wait_for(process.stdout.readline(), _PATIENCE_S)
+                except TimeoutError:
+                    yield _event(
+                        "problem", {"detail": f"The environment took over {_PATIENCE_S:g} s for a step.", "hint": ""}
+                    )
+                    return
+                if not line:
+                    break
+                told = json.loads(line)
+                last = told.pop("event")
+                yield _event(last, told)
+            if last not in ("end", "problem"):
+                yield _event("problem", {"detail": "The environment ended the process that played it.", "hint": ""})
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            with anyio.CancelScope(shield=True):
+                await process.wait()
 
 
 @router.get(
@@ -68,14 +134,8 @@ async def play(
 ) -> _Play:
     """Play one greedy episode: the events `info`, `step` after step, and `end`, or `problem`."""
     request = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
-    limit = service.config.limits.players
-    if len(_playing) >= limit:
-        raise TooManyError(f"{limit} episodes are being played.", "Close one, or wait for its end.")
-    # An abandoned connection ends the generator, and with it the process.
-    return _Play(
-        _events({**request, "seed": seed, "speed": speed, "start": start}, str(service.config.storage)),
-        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
-    )
+    told = {**request, "seed": seed, "speed": speed, "start": start}
+    return _Play(told, str(service.config.storage), service.config.limits.players)
 
 
 def _request(service: Service, name: str, trial: str | None, iteration: int | None, random: bool) -> dict[str, Any]:  # noqa: FBT001
@@ -96,42 +156,6 @@ def _request(service: Service, name: str, trial: str | None, iteration: int | No
         policy = str(sweep.trial(trial).checkpoint_folder(kept[-1] if iteration is None else iteration))
     modules = sorted({*service.config.modules, *record.allowed_modules})
     return {"policy": policy, "env_id": spec.env.id, "env_args": spec.env.wrapped_args, "modules": modules}
-
-
-async def _events(request: dict[str, Any], folder: str) -> AsyncIterator[str]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-P", "-c", _BEGIN,
-        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL,
-        cwd=folder, start_new_session=True, limit=_MAX_LINE,
-    )  # fmt: skip
-    _playing.add(process.pid)
-    try:
-        if process.stdin is None or process.stdout is None:
-            raise RuntimeError("the player has no pipes")
-        process.stdin.write(json.dumps(request).encode())
-        process.stdin.close()
-        last = ""
-        while True:
-            try:
-                line = await asyncio.wait_for(process.stdout.readline(), _PATIENCE_S)
-            except TimeoutError:
-                yield _event(
-                    "problem", {"detail": f"The environment took over {_PATIENCE_S:g} s for a step.", "hint": ""}
-                )
-                return
-            if not line:
-                break
-            told = json.loads(line)
-            last = told.pop("event")
-            yield _event(last, told)
-        if last not in ("end", "problem"):
-            yield _event("problem", {"detail": "The environment ended the process that played it.", "hint": ""})
-    finally:
-        _playing.discard(process.pid)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        with anyio.CancelScope(shield=True):
-            await process.wait()
 
 
 def _event(kind: str, data: Any) -> str:
