@@ -21,6 +21,7 @@ _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)'
 _LOOPS = (
     "/tune_jobs/ray_tune/trainable.py",
     "/tune_jobs/training/trial_loop.py",
+    "/tune_jobs/training/trial_steps.py",
     "/tune_jobs/training/pack_loop.py",
     "/tune_jobs/ray_tune/pack_trainable.py",
 )

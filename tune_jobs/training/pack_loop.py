@@ -1,6 +1,6 @@
 """Run the trials of one pack from start to end, trained and evaluated together.
 
-Each follows the rules of `tune_jobs.training.trial_loop`. A member that fails is retried by itself, from its latest
+Each follows the rules of `tune_jobs.training.trial_steps`. A member that fails is retried by itself, from its latest
 checkpoint, without any effect on the others.
 """
 
@@ -28,7 +28,7 @@ from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.training.protocol import IterationStats, PackEngine, TrialTask
-from tune_jobs.training.trial_loop import TrialLoop
+from tune_jobs.training.trial_steps import TrialSteps
 
 _NUM_WRITERS = 8
 
@@ -53,7 +53,7 @@ class MemberReport:
 
 
 class _MemberEngine:
-    """A member of a pack, in the form of an engine for one trial; it does only what concerns this member.
+    """A member of a pack, as an engine that holds one trial; the pack trains it, and this does what is its alone.
 
     Args:
         pack: The engine that trains the member.
@@ -71,9 +71,6 @@ class _MemberEngine:
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         self._pack.add(task, checkpoint)
         self.is_built = True
-
-    def train_iteration(self) -> IterationStats:
-        raise NotImplementedError("The members of a pack are trained together.")
 
     def policy(self) -> PortablePolicy:
         # The policy that is evaluated is the one that is saved.
@@ -100,14 +97,14 @@ class _TrialInPack:
     def __init__(self, task: TrialTask, num_failures: int) -> None:
         self.task = task
         self.num_failures = num_failures
-        self.loop: TrialLoop | None = None
+        self.loop: TrialSteps | None = None
         self.engine: _MemberEngine | None = None
         self.unreported: Progress | None = None
         self.may_save = False
         """Whether the end of this iteration may write a checkpoint."""
 
     @property
-    def trial(self) -> TrialLoop:
+    def trial(self) -> TrialSteps:
         """The trial's loop, after it was opened."""
         assert self.loop is not None
         return self.loop
@@ -310,7 +307,7 @@ class PackLoop:
 
     def _open(self, member: _TrialInPack) -> None:
         member.engine = _MemberEngine(self._engine, member.task.trial_id, self._lock)
-        member.loop = TrialLoop(member.task, member.engine, self._evaluator, self._clock, self._under)
+        member.loop = TrialSteps(member.task, member.engine, self._evaluator, self._clock, self._under)
         try:
             with self._watch(member.task.iteration_timeout_s):
                 member.loop.open()

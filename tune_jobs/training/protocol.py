@@ -1,7 +1,7 @@
 """The protocol of engines, which compute the iterations of trials.
 
-Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is in `tune_jobs.training.trial_loop`
-and the same for all engines. There are two kinds: those that train one trial at a time, and those that train a pack
+Everything else about a trial (stop rules, evaluation, checkpoints, results, logs) is the same for all engines, and in
+`tune_jobs.training.trial_steps`. There are two kinds: those that train one trial at a time, and those that train a pack
 of them together (`tune_jobs.training.pack_loop`). This module imports no ray, so that both sides can import it.
 """
 
@@ -61,8 +61,8 @@ class IterationStats:
     """Metrics of the last update, such as losses, entropy and learning rate."""
 
 
-class TrainingEngine(Protocol):
-    """Trains one trial at a time; another `build` reuses it for the next trial."""
+class TrialEngine(Protocol):
+    """Holds one trial; another `build` reuses it for the next one. What trains the trial may be a pack."""
 
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Make the networks and environments of a trial, fresh or exactly as a checkpoint folder holds them.
@@ -75,10 +75,6 @@ class TrainingEngine(Protocol):
         """
         ...
 
-    def train_iteration(self) -> IterationStats:
-        """Train for one iteration."""
-        ...
-
     def policy(self) -> PortablePolicy:
         """Return the current greedy policy."""
         ...
@@ -89,6 +85,14 @@ class TrainingEngine(Protocol):
 
     def close(self) -> None:
         """Free everything; `build` may be called again."""
+        ...
+
+
+class TrainingEngine(TrialEngine, Protocol):
+    """Trains one trial at a time."""
+
+    def train_iteration(self) -> IterationStats:
+        """Train for one iteration."""
         ...
 
 
