@@ -348,6 +348,9 @@ class ReplicationRecord(_Record):
     by: Literal["replicate", "confirm"] = Field(
         "replicate", description="Who asked for them: a person, or the sweep's own `confirm`."
     )
+    race: str = Field("", description="The name of the race that it is a round of; empty: `confirm`, or an old record.")
+    contenders: tuple[Annotated[int, Field(ge=0, le=2**31)], ...] = Field((), description="The points that race in it.")
+    num_seeds: Annotated[int, Field(ge=0, le=100_000)] = Field(0, description="The most seeds that it gives a point.")
 
 
 class ChosenPointRecord(_Record):

@@ -271,6 +271,16 @@ def test_an_interrupted_sweep_is_shown_as_far_as_it_got(
     assert json.loads(run("launch", "x", "--json").stdout)["exit_code"] == 130
 
 
+def test_an_interrupted_extend_says_that_another_one_adds_again(run: RunCommand, sweeps: FakeSweeps) -> None:
+    result = dataclasses.replace(sweeps.answers["extend"], interrupted=True, exit_code=130)
+    sweeps.answers["extend"] = sweeps.answers["resume"] = SweepInterrupted(result)
+    told = "The samples are in the sweep by now: extend again would add as many once more."
+    first, last = run("extend", "mine", "--num-samples", 3).stderr.strip().splitlines()
+    assert first == told
+    assert last.endswith("tune-jobs resume mine")
+    assert told not in run("resume", "mine").stderr
+
+
 def test_an_unexpected_error_is_one_line_and_its_traceback_is_kept(
     run: RunCommand, sweeps: FakeSweeps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,7 +173,10 @@ def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: b
 def extend(
     ctx: click.Context, /, *, sweep: str, num_samples: int, storage: str | None, as_json: bool, **options: Any
 ) -> None:
-    """Add trials to a sweep: more samples of its space, the earlier points stay as they are."""
+    """Add trials to a sweep: more samples of its space, the earlier points stay as they are.
+
+    If it is interrupted or killed, resume goes on with it; extend again would add as many samples once more.
+    """
     run_verb(ctx, "extend", sweep, num_samples, storage=storage, as_json=as_json, **options)
 
 
@@ -188,7 +191,10 @@ def extend(
 def replicate(
     ctx: click.Context, /, *, sweep: str, top: int, seeds: int, storage: str | None, as_json: bool, **options: Any
 ) -> None:
-    """Train the leading settings of a sweep again, with fresh seeds, to see which is the best."""
+    """Train the leading settings of a sweep again, with fresh seeds, to see which is the best.
+
+    A race that was interrupted goes on by resume, or by the same command again.
+    """
     run_verb(ctx, "replicate", sweep, top=top, seeds=seeds, storage=storage, as_json=as_json, **options)
 
 

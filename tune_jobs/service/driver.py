@@ -158,7 +158,10 @@ def _done(request: Mapping[str, Any]) -> Any:
         case "inject" if not _has_point(folder, arguments["point"]):
             return verbs.inject(folder, arguments["point"], **common)
         case "replicate":
-            return verbs.replicate(folder, top=arguments["top"], seeds=arguments["seeds"], **common)
+            # The race has the job's name, so that an attempt that follows a killed one begins no other.
+            return verbs.replicate(
+                folder, top=arguments["top"], seeds=arguments["seeds"], race=request["job"], **common
+            )
         case "retry":
             return verbs.resume(folder, retry_failed=True, **common)
         case _:

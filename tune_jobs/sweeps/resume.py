@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from analysis.records import ReplicationRecord
 from policies.envs.modules import allow_modules
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine
@@ -15,7 +16,7 @@ from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
 from tune_jobs.sweeps.drive import connected, machine_here, settled
 from tune_jobs.sweeps.outcome import SweepResult
-from tune_jobs.sweeps.stages import MoreSeeds, run_sweep
+from tune_jobs.sweeps.stages import RACE, MoreSeeds, run_sweep
 
 
 @guarding()
@@ -51,7 +52,7 @@ def go_on(
 def replicate(
     store: Sweep,
     address: str | None,
-    next_points: Callable[[], tuple[int, ...]],
+    next_round: Callable[[], ReplicationRecord | None],
     *,
     finish: bool,
     progress: str,
@@ -61,7 +62,7 @@ def replicate(
     Args:
         store: The sweep.
         address: Ray cluster to run on; None: this machine.
-        next_points: Says before each stage which points get one more seed each; the indices may repeat. None: the end.
+        next_round: Says before each stage which points get one more seed each; None: that was all.
         finish: The same as for `launch`.
         progress: The same as for `launch`.
 
@@ -74,7 +75,7 @@ def replicate(
         spec = stored_spec(record)
         check_replicable(spec)
         plan = add_what_is_missing(store, record, spec, where, address)
-        more = MoreSeeds("replicate", next_points, "more seeds")
+        more = MoreSeeds(next_round, RACE)
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress, more=more)
 
 

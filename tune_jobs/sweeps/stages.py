@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from analysis.records import FINISHED, ReplicationRecord
 from analysis.wording import counted
 from policies.errors import TuneJobsError
 from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.points import num_points_of
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import stored_spec
@@ -19,15 +19,18 @@ from tune_jobs.sweeps.confirm import points_to_confirm
 from tune_jobs.sweeps.drive import Shared, close_if_open, run_trials_of
 from tune_jobs.sweeps.finishing import finish_sweep
 from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.races import last_race, next_round
+
+RACE = "more seeds"
+"""What the rounds of a race are called."""
 
 
 @dataclass(frozen=True)
 class MoreSeeds:
     """More seeds that some points get when the trials have ended, in rounds."""
 
-    by: Literal["replicate", "confirm"]
-    next_points: Callable[[], tuple[int, ...]]
-    """Says before each round which points get one more seed each; the indices may repeat. None: the end."""
+    next_round: Callable[[], ReplicationRecord | None]
+    """Says before each round which points get one more seed each; None: that was all."""
     told: str
     """What it is, for the table's heading."""
 
@@ -53,7 +56,7 @@ def run_sweep(
         machine: This machine, if Ray is started here.
         finish: Whether it is concluded; only then its `confirm` gives more seeds.
         progress: The same as for `launch`.
-        more: What gives more seeds instead of `confirm`.
+        more: What gives more seeds; None: a race that was interrupted, else `confirm`.
 
     Raises:
         CannotRunError: Ray cannot run here, or died.
@@ -82,23 +85,23 @@ def _run_sweep(
     had_all = all(trial.status in FINISHED for trial in store.read_trials())
     with Shared() as shared:
         result = run_trials_of(store, plan, shared, address=address, machine=machine, progress=progress)
-        rounds = more or (MoreSeeds("confirm", lambda: points_to_confirm(store), "confirm") if finish else None)
+        rounds = more or _own_rounds(store, finish=finish)
         while rounds is not None and not result.interrupted and not current().came and not store.stop_requested():
             try:
-                points = rounds.next_points()
+                added = rounds.next_round()
             except TuneJobsError as error:
                 if more is not None:
                     raise
                 notes.append(f"The leading settings were not trained again: {error}")
                 break
-            if not points:
+            if added is None:
                 break
             had_all = False
             record = store.read_record()
-            added = ReplicationRecord(num_points=plan.num_points, points=points, by=rounds.by)
             record = record.model_copy(update={"replications": (*record.replications, added)})
             plan = add_what_is_missing(store, record, stored_spec(record), plan.machine, address)
-            told = f"{rounds.told}: {counted(len(points), 'training')} of {counted(len(set(points)), 'setting')}"
+            trainings, settings = len(added.points), len(set(added.points))
+            told = f"{rounds.told}: {counted(trainings, 'training')} of {counted(settings, 'setting')}"
             result = run_trials_of(
                 store, plan, shared, address=address, machine=machine, progress=progress, told=told
             )  # fmt: skip
@@ -108,3 +111,19 @@ def _run_sweep(
         return replace(result, interrupted=True)
     result = finish_sweep(store, result, progress, keep=had_all)
     return replace(result, notes=(*notes, *result.notes))
+
+
+def _own_rounds(store: Sweep, *, finish: bool) -> MoreSeeds | None:
+    """Return the rounds that nobody asks for anew: those of a race that was interrupted, else the sweep's `confirm`."""
+    if last_race(store.read_record()) is not None:
+        return MoreSeeds(lambda: next_round(store), RACE)
+    return MoreSeeds(lambda: _round_of_confirm(store), "confirm") if finish else None
+
+
+def _round_of_confirm(store: Sweep) -> ReplicationRecord | None:
+    points = points_to_confirm(store)
+    if not points:
+        return None
+    record = store.read_record()
+    num_points = num_points_of(stored_spec(record), record.chosen_points)
+    return ReplicationRecord(num_points=num_points, points=points, by="confirm")

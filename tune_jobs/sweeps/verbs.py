@@ -252,7 +252,7 @@ def extend(
         SpecError: num_samples is not positive, or the space has nothing random to draw.
         NotFoundError: There is no such sweep.
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
-        SweepInterrupted: In the same cases as `launch`.
+        SweepInterrupted: In the same cases as `launch`. `resume` goes on; this again would add as many samples more.
     """
     from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.resume import go_on
@@ -307,6 +307,7 @@ def replicate(
     *,
     top: PositiveInt = 5,
     seeds: PositiveInt = 5,
+    race: str | None = None,
     storage: str | Path | None = None,
     address: str | None = None,
     finish: bool = True,
@@ -317,10 +318,14 @@ def replicate(
     The settings race: one that the seeds so far show to be worse than another gets no more of them. Whatever is missing
     of the sweep is run first. A scheduler of the sweep ends none of the new trials.
 
+    A race that was interrupted goes on by `resume`, or by the same call again; once it is over, the same call is
+    another race.
+
     Args:
         sweep: Name or folder.
         top: How many of the leading settings race.
         seeds: How many more seeds a setting gets at most.
+        race: A name for the race: of one name there is one race, however often it is asked for. None: it has none.
         storage: Folder for sweeps.
         address: Ray cluster to run on.
         finish: The same as for `launch`.
@@ -330,12 +335,13 @@ def replicate(
         SpecError: The sweep is one of population based training, whose trials have no setting.
         NotFoundError: There is no such sweep.
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
-        SweepInterrupted: In the same cases as `launch`; `resume` trains what is missing of the seeds that were given.
+        SweepInterrupted: In the same cases as `launch`.
     """
     from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.replicate import run_race
 
-    return run_race(find_sweep(sweep, storage), address, top=top, seeds=seeds, finish=finish, progress=progress)
+    store = find_sweep(sweep, storage)
+    return run_race(store, address, top=top, seeds=seeds, finish=finish, progress=progress, name=race)
 
 
 @checked
