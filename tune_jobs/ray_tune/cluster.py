@@ -148,7 +148,7 @@ def _start(machine: Machine | None) -> None:
     if machine is not None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
     try:
-        with _finding_own_modules():
+        with _finding_own_modules(), _without_unused_processes():
             # "local": a cluster of this sweep's own, even if another one runs already.
             ray.init(
                 address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
@@ -158,6 +158,27 @@ def _start(machine: Machine | None) -> None:
             f"Ray cannot be started on this machine: {_first_line(error)}",
             "Look for the cause in Ray's logs in /tmp/ray/session_latest/logs.",
         ) from error
+
+
+_UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
+
+
+@contextlib.contextmanager
+def _without_unused_processes() -> Iterator[None]:
+    """Start Ray in the block without three processes that nobody asks here: autoscaler, log monitor and dashboard.
+
+    `include_dashboard=False` starts the last one all the same. Together they take 1.5 s of CPU time before the first
+    trial, 200 MB of memory, and a second at the end. Nothing public of Ray 2.60 leaves them out.
+    """
+    node: Any = ray._private.node.Node  # noqa: SLF001
+    originals = {name: getattr(node, name) for name in _UNUSED if hasattr(node, name)}
+    for name in originals:
+        setattr(node, name, lambda *_, **__: None)
+    try:
+        yield
+    finally:
+        for name, original in originals.items():
+            setattr(node, name, original)
 
 
 @contextlib.contextmanager
