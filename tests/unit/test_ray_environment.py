@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tune_jobs.process.home import name_a_home
 from tune_jobs.ray_tune import environment as ray_environment
 from tune_jobs.ray_tune.environment import provide_token
 
@@ -56,3 +57,18 @@ def test_what_the_user_has_set_holds(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv(name, "mine")
     provide_token()
     assert {key: os.environ[key] for key in NAMES} == {key: "mine" if key == name else "" for key in NAMES}
+
+
+def test_a_user_that_no_file_names_can_import_what_ray_tune_needs_a_home_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(number: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {number}")
+
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr("pwd.getpwuid", nobody)
+    with pytest.raises(RuntimeError, match="home directory"):
+        Path("~/ray_results").expanduser()
+    name_a_home()
+    assert not Path("~/ray_results").expanduser().parent.exists()
+    monkeypatch.setenv("HOME", "/home/ann")
+    name_a_home()
+    assert os.environ["HOME"] == "/home/ann"

@@ -364,9 +364,11 @@ def schema(*, as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON either 
 
 def main() -> None:
     """Entry point of the `tune-jobs` script."""
+    from tune_jobs.process.home import name_a_home
     from tune_jobs.process.interruption import end_in_order
 
     end_in_order()
+    name_a_home()
     with standard_streams():
         cli(prog_name="tune-jobs")
 

@@ -22,7 +22,7 @@ from typing import Any
 
 from policies.envs.modules import allow_modules
 from policies.errors import CannotRunError, TuneJobsError
-from tune_jobs.process.interruption import ASKED, end_in_order
+from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
 
@@ -38,7 +38,9 @@ def main(descriptor: int) -> None:
     Args:
         descriptor: This end of the socket to the service. If the other one is closed before a job comes, this ends.
     """
-    end_in_order(ASKED)
+    # Under nohup it would be ignored; it is how the service asks for an end, and no terminal sends it here.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    end_in_order()
     with contextlib.ExitStack() as stack:
         with socket.socket(fileno=descriptor) as asked:
             asked.set_inheritable(False)
@@ -77,7 +79,7 @@ def _do(request: Mapping[str, Any], lock: int, log: int) -> None:
     ended = _ended(request)
     _log.info("Attempt %d has ended: %s.", request["attempt"], ended.outcome)
     # Whatever comes now, the outcome is written.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, ASKED):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     files.write_ended(ended)
     os.close(lock)

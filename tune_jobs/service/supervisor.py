@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from policies.errors import TuneJobsError
-from tune_jobs.process.interruption import ASKED
 from tune_jobs.service.job_files import JobFiles, held_jobs, remove_ended
 from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.logs import LogFormat
@@ -268,7 +268,7 @@ class Supervisor:
             return
         with contextlib.suppress(OSError):
             # Not SIGTERM, as systemd may have sent that to all: a second one would end the trials before they save.
-            os.kill(holder.pid, ASKED)
+            os.kill(holder.pid, signal.SIGHUP)
 
     def _finish(self, job: Job, outcome: Outcome, message: str | None = None) -> None:
         told = (job.id, job.verb, job.sweep, outcome)
