@@ -41,16 +41,20 @@ class Live:
 
 
 @contextlib.contextmanager
-def serving(storage: Path, *, require_token: bool = False, **limits: Any) -> Iterator[Live]:
-    """Serve a storage folder; its queue stands still."""
+def serving(
+    storage: Path, *, require_token: bool = False, certificate: tuple[Path, Path] | None = None, **limits: Any
+) -> Iterator[Live]:
+    """Serve a storage folder, with TLS if there is a certificate and its key; its queue stands still."""
+    chain, key = certificate or (None, None)
     config = ServiceConfig(
-        storage=storage, port=0, spare_idle_s=0, limits=Limits(**limits), drain_s=1.0, require_token=require_token
-    )
+        storage=storage, port=0, spare_idle_s=0, limits=Limits(**limits), drain_s=1.0, require_token=require_token,
+        tls_certificate=chain, tls_key=key,
+    )  # fmt: skip
     started = threading.Event()
     with listening_socket(config) as listening, _idle(config) as service:
         server = Server(service, config, make_app(service), started.set)
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
-        url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        url = f"{'http' if certificate is None else 'https'}://127.0.0.1:{listening.getsockname()[1]}"
         thread.start()
         assert started.wait(30)
         try:

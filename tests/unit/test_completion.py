@@ -1,12 +1,18 @@
 """What a shell completes: presets, sweep files, sweeps and trials, in the storage folder that stands before them."""
 
+import socket
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
-from click.shell_completion import ShellComplete
+from click.shell_completion import ShellComplete, get_completion_class
+from live_service import Live, serving
 from sweep_folders import make_sweep_folder
 
+from tests.narrowing import present
+from tune_jobs.cli import completion
 from tune_jobs.cli.commands import cli
 from tune_jobs.spec.file import list_presets, preset_names
 
@@ -25,7 +31,8 @@ def names(line: str) -> list[str]:
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
+    for name in ("TUNE_JOBS_STORAGE", "TUNE_JOBS_SERVER", "TUNE_JOBS_TOKEN", "HTTP_PROXY", "http_proxy"):
+        monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 
@@ -74,6 +81,63 @@ def test_a_point_is_completed_with_what_the_sweep_searches_and_has_no_value_yet(
     assert names("inject mine g") == ["gamma="]
     assert names("inject none l") == []
     assert names("inject mi") == ["mine"]
+
+
+# -- of a service
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Live]:
+    with serving(tmp_path / "there") as made:
+        for name in ("mine", "Minor", "other"):
+            make_sweep_folder(made.storage / name, iterations=1)
+        yield made
+
+
+def test_sweeps_of_a_service_are_completed_where_one_is_named(
+    here: Path, site: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_sweep_folder(here / "sweeps" / "mine-here", iterations=1)
+    assert names(f"--server {site.url} status ") == ["Minor", "mine", "other"]
+    # A service knows no folders of this machine.
+    assert completed(f"--server {site.url} status mi") == [("plain", "mine")]
+    assert completed(f"--server {site.url} compare o") == [("plain", "other")]
+    monkeypatch.setenv("TUNE_JOBS_SERVER", site.url)
+    assert names("resume --retry-failed o") == ["other"]
+    assert names("compare mine/t000") == ["mine/t0000", "mine/t0001", "mine/t0002", "mine/t0003"]
+    assert names("inject mine ") == ["lr="]
+    assert names("status x") == names("inject none l") == names("compare none/t") == []
+    assert names(f"status {'x' * 200}") == []
+    monkeypatch.setenv("TUNE_JOBS_SERVER", "")
+    assert names("status mi") == ["mine-here"]
+
+
+def test_a_service_that_does_not_answer_at_once_is_not_waited_for(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(completion, "_PATIENCE_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        for url in (f"http://127.0.0.1:{silent.getsockname()[1]}", "http://127.0.0.1:1", "no address", "https://a@b"):
+            monkeypatch.setenv("TUNE_JOBS_SERVER", url)
+            began = time.monotonic()
+            assert names("status ") == []
+            assert time.monotonic() - began < 3
+    # A token that goes without TLS is warned of by commands; here it would stand in the line that is being written.
+    monkeypatch.setenv("TUNE_JOBS_TOKEN", "tune-jobs_00000000_" + "A" * 43)
+    monkeypatch.setenv("TUNE_JOBS_SERVER", "http://192.0.2.1:1")
+    assert names("status ") == []
+    assert caplog.records == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_words_that_bash_has_taken_apart_are_put_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends words at colons and equals signs."""
+    line = "tune-jobs --server http : //127.0.0.1 : 8470 inject mine --storage = a lr = 0.1 gam"
+    monkeypatch.setenv("COMP_WORDS", line.replace(" ", "\n"))
+    monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
+    bash = present(get_completion_class("bash"))(cli, {}, "tune-jobs", "_TUNE_JOBS_COMPLETE")
+    words = ["--server", "http://127.0.0.1:8470", "inject", "mine", "--storage=a", "lr=0.1"]
+    assert bash.get_completion_args() == (words, "gam")
 
 
 def test_an_algorithm_is_completed() -> None:

@@ -3,10 +3,8 @@
 import contextlib
 import dataclasses
 import gc
-import shutil
 import socket
 import ssl
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 import httpx2
 import pytest
+from certificates import make_key, openssl
 from fake_sweeps import RunCommand
 from service_access import bearer, place, problem, shared  # noqa: F401 (fixture)
 
@@ -147,20 +146,14 @@ def test_the_announced_proxy_is_believed(shared: Service) -> None:
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a certificate and its key, another key, and the key with a password."""
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is not installed")
     folder = tmp_path_factory.mktemp("tls")
-
-    def run(*arguments: str) -> None:
-        subprocess.run(["openssl", *arguments], check=True, capture_output=True, cwd=folder)
-
     for name in ("key", "other"):
-        run("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", f"{name}.pem")
-    run(
-        "req", "-x509", "-new", "-key", "key.pem", "-out", "certificate.pem", "-days", "2", "-subj", "/CN=localhost",
-        "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
+        make_key(folder, f"{name}.pem")
+    openssl(
+        folder, "req", "-x509", "-new", "-key", "key.pem", "-out", "certificate.pem", "-days", "2",
+        "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
     )  # fmt: skip
-    run("ec", "-in", "key.pem", "-aes256", "-passout", "pass:secret", "-out", "locked.pem")
+    openssl(folder, "ec", "-in", "key.pem", "-aes256", "-passout", "pass:secret", "-out", "locked.pem")
     (folder / "text.pem").write_text("no certificate\n")
     return folder
 

@@ -64,8 +64,11 @@ class Server:
         """How a command for the same service begins."""
         return f"tune-jobs {self.given}".rstrip()
 
-    def client(self) -> Client:
+    def client(self, *, timeout_s: float = 60.0) -> Client:
         """Return a client of it.
+
+        Args:
+            timeout_s: How long an answer may take to begin, and to go on.
 
         Raises:
             SpecError: The address, the token or the certificates are none.
@@ -73,7 +76,7 @@ class Server:
         from tune_jobs.client import Client
 
         token = None if self.token_file else os.environ.get(_TOKEN) or None
-        return Client(self.url, token, token_file=self.token_file, ca_file=self.ca_file)
+        return Client(self.url, token, token_file=self.token_file, ca_file=self.ca_file, timeout_s=timeout_s)
 
 
 def server_options(command: _Command) -> _Command:
@@ -101,6 +104,17 @@ def remember_server(ctx: click.Context, server: str | None, token_file: str | No
         if value and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
     ]
     ctx.meta[_META] = Server(server, token_file or None, ca_file or None, " ".join(given))
+
+
+def server_to_complete_from(ctx: click.Context) -> Server | None:
+    """Return the service that the words name which stand before the one to complete, or the environment; None: none.
+
+    Nothing was remembered then, as no command runs.
+    """
+    params = ctx.find_root().params
+    if not params.get("server"):
+        return None
+    return Server(params["server"], params.get("token_file") or None, params.get("ca_file") or None, "")
 
 
 def server_of() -> Server | None:

@@ -51,7 +51,7 @@ class Connection:
         import httpx2
 
         self.url = url
-        self._timeout_s = timeout_s
+        self._timeout_s, self._ca_file = timeout_s, ca_file
         # What was never reached has a wrong address, more likely than it is away for a moment.
         self.has_answered = False
         headers = {"User-Agent": "tune-jobs", "Accept": f"{JSON}, */*;q=0.1"}
@@ -194,15 +194,18 @@ class Connection:
         try:
             yield
         except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.UnsupportedProtocol) as error:
-            raise unreachable(self.url, error) from error
+            raise unreachable(self.url, error, self._ca_file) from error
         except (httpx2.ProxyError, httpx2.InvalidURL) as error:
-            raise unreachable(self.url, error) from error
+            raise unreachable(self.url, error, self._ca_file) from error
         except httpx2.HTTPError as error:
             known = (
                 "Try again."
                 if may_repeat
                 else "It is not known whether it was done: look with `tune-jobs status` before you try again."
             )
+            if not self.has_answered and self.url.startswith("http:"):
+                # What listens with TLS closes a connection that begins without it.
+                known += f" If the service speaks TLS, write https://{self.url.partition('://')[2]}."
             why = said_by(error) or type(error).__name__
             raise LostConnectionError(
                 f"The connection to {self.url} was lost before {method} {path} was answered: {why}.", known

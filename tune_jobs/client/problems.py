@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -37,24 +38,33 @@ _BY_STATUS: dict[int, type[TuneJobsError]] = {
 }  # fmt: skip
 
 
-def unreachable(url: str, error: Exception) -> NoServiceError:
+def unreachable(url: str, error: Exception, ca_file: str | Path | None = None) -> NoServiceError:
     """Return the error for a service that can't be reached.
 
     Args:
         url: The service's address.
         error: What came of the attempt.
+        ca_file: The certificates that are trusted; None: this machine's.
     """
     why = said_by(error) or type(error).__name__
     if "CERTIFICATE_VERIFY_FAILED" in why:
-        return NoServiceError(
-            f"The service at {url} can't be trusted: {why}.",
-            "If its certificate is of an authority of your own, give that one's by --ca-file (in Python ca_file=).",
-        )
+        return NoServiceError(f"The service at {url} can't be trusted: {why}.", _how_to_trust(why, ca_file))
     if "SSL" in why or "WRONG_VERSION_NUMBER" in why:
         hint = f"Does it speak TLS? If not, write http://{url.partition('://')[2]}."
     else:
         hint = "Check the address and its port, and that `tune-jobs serve` runs there."
     return NoServiceError(f"The service at {url} can't be reached: {why}.", hint)
+
+
+def _how_to_trust(why: str, ca_file: str | Path | None) -> str:
+    """Return what to do where a certificate was refused; another authority helps only if that is what is missing."""
+    if "mismatch" in why:
+        return "Give the address with a name that the service's certificate has."
+    if "expired" in why or "not yet valid" in why:
+        return "The service's operator has to renew its certificate; check this machine's clock, too."
+    if ca_file is not None:
+        return f"No certificate in {ca_file} is of the authority that has signed the service's: give that one's file."
+    return "If its certificate is of an authority of your own, give that one's by --ca-file (in Python ca_file=)."
 
 
 def media_type_of(answer: httpx2.Response) -> str:
