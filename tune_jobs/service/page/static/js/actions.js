@@ -163,7 +163,6 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
     el("hr"),
     button("remove", "Delete…", "bad-text"),
   );
-  menu.addEventListener("click", () => menu.hidePopover());
   const more = el("button", { type: "button", popovertarget: "more-actions", "aria-haspopup": "true" }, "More");
   menu.addEventListener("toggle", (event) => {
     if (event.newState !== "open") return;
@@ -171,6 +170,16 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
     menu.style.top = `${box.bottom + 4}px`;
     menu.style.left = `${Math.max(8, Math.min(box.right - menu.offsetWidth, innerWidth - menu.offsetWidth - 8))}px`;
   });
+  // Before what was chosen opens a dialog, which gives the focus back to where it was.
+  menu.addEventListener(
+    "click",
+    (event) => {
+      if (!event.target.closest("button")) return;
+      menu.hidePopover();
+      more.focus();
+    },
+    { capture: true },
+  );
   const follow = () => {
     if (menu.matches(":popover-open")) menu.hidePopover();
   };
@@ -191,8 +200,11 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
       const sweep = state();
       node.hidden = !mayChange(sweep);
       const live = isLive(sweep) || isWaiting(sweep);
+      const focused = document.activeElement;
       main.stop.hidden = !live || Boolean(sweep.job?.stop_requested);
       main.resume.hidden = live || sweep.state === "completed";
+      // Who has just pressed what is gone now goes on beside it.
+      if (focused?.hidden && node.contains(focused)) [main.resume, main.stop, more].find((other) => !other.hidden).focus();
       const failed = sweep.counts.failed ?? 0;
       const retry = menu.querySelector('[data-action="retry"]');
       retry.hidden = failed === 0;

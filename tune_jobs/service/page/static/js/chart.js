@@ -2,7 +2,7 @@
 import { colour, el, reconcile, setText } from "./dom.js";
 import { returnText } from "./format.js";
 import { drawLine } from "./lines.js";
-import { Plot, withAir } from "./plot.js";
+import { FONT_FAMILY, Plot, withAir } from "./plot.js";
 
 const HEIGHT_PX = 300;
 const NEAR_PX = 24;
@@ -24,6 +24,7 @@ export class Chart {
     this.plot = new Plot(this.body, {
       label,
       xLabel,
+      yLabel: "return",
       height: HEIGHT_PX,
       paint: (context, places) => this.paint(context, places),
       find: (places, left, top) => this.find(places, left, top),
@@ -100,6 +101,18 @@ export class Chart {
     context.lineTo(places.left + places.width, places.y(this.goal));
     context.stroke();
     context.setLineDash([]);
+    // Below it, where it would leave the plot; with a rim, as lines go through it.
+    const isHigh = places.y(this.goal) - places.top < 18 * places.ratio;
+    context.font = `${12 * places.ratio}px ${FONT_FAMILY}`;
+    context.textAlign = "left";
+    context.textBaseline = isHigh ? "top" : "bottom";
+    context.lineWidth = 4 * places.ratio;
+    context.strokeStyle = colour("card");
+    context.fillStyle = colour("accent");
+    const text = `goal ${returnText(this.goal)}`;
+    const place = [places.left + 6 * places.ratio, places.y(this.goal) + (isHigh ? 4 : -3) * places.ratio];
+    context.strokeText(text, ...place);
+    context.fillText(text, ...place);
   }
 
   // The line nearest to a place on the canvas, as { line, x, y }; null: none is near. `valueOf(line, x)` is a line's value, or

@@ -100,6 +100,9 @@ export function openCompare(main, route) {
       const wanted = namesOf(params.sweeps);
       if (wanted.join() === names.join()) return;
       names = wanted;
+      // Those of before are none of what the address says.
+      grid.hidden = problem.hidden = true;
+      told.hidden = false;
       asking.close();
       asking = begin();
       asking.now();
@@ -204,14 +207,14 @@ function showTable(card, title, entries, rows) {
   // What scrolls is reached by the Tab key.
   const options = { class: "sideways", tabindex: 0, role: "region", "aria-label": `${title}: table` };
   const scroller = known ?? el("div", options);
-  scroller.replaceChildren(
-    el(
-      "table",
-      { class: "compared" },
-      el("thead", {}, el("tr", {}, el("td", {}), heads)),
-      el("tbody", {}, rows.map(row)),
-    ),
+  const table = el(
+    "table",
+    { class: "compared" },
+    el("thead", {}, el("tr", {}, el("td", {}), heads)),
+    el("tbody", {}, rows.map(row)),
   );
+  table.style.setProperty("--sweeps", entries.length);
+  scroller.replaceChildren(table);
   scroller.hidden = rows.length === 0;
   if (known) {
     while (known.nextElementSibling) known.nextElementSibling.remove();

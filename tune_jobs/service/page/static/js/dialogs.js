@@ -67,7 +67,13 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
   );
   const dialog = el("dialog", { class: "dialog", "aria-labelledby": "dialog-title" }, form);
   cancel.addEventListener("click", () => dialog.close());
-  dialog.addEventListener("close", () => dialog.remove());
+  // Who goes back has left what it was about.
+  const left = () => dialog.close();
+  addEventListener("hashchange", left);
+  dialog.addEventListener("close", () => {
+    removeEventListener("hashchange", left);
+    dialog.remove();
+  });
   dialog.addEventListener("click", (event) => {
     if (event.target === dialog) dialog.close();
   });

@@ -46,7 +46,7 @@ export class Finished {
         "div",
         { class: "card-head" },
         el("h2", {}, "Result"),
-        hasReport ? this.reportLink() : null,
+        hasReport ? this.reportLinks() : null,
       ),
       el(
         "div",
@@ -60,9 +60,12 @@ export class Finished {
     );
   }
 
-  reportLink() {
-    const link = { class: "button", href: this.source.address("/report/"), target: "_blank", rel: "noopener" };
-    return el("a", link, "Open the report", el("span", { class: "for-readers" }, " in a new tab"));
+  reportLinks() {
+    const { name } = this.source;
+    const link = { class: "button", href: this.source.address("/report/") };
+    const open = el("a", { ...link, target: "_blank", rel: "noopener" }, "Open the report");
+    open.append(el("span", { class: "for-readers" }, " in a new tab"));
+    return [open, el("a", { ...link, download: `${name}-report.html` }, "Download the report")];
   }
 
   policyAnswer({ checkpoint, confirmation, random }) {
@@ -78,8 +81,13 @@ export class Finished {
       el("p", { class: "score" }, returnText(confirmation.mean_return), " ", solved === null ? null : badge),
       el("p", { class: "quiet small" }, `mean over ${episodes}; a random policy has ${returnText(random.mean_return)}`),
       el("p", { class: "small" }, trial, ` at ${counted(checkpoint.num_env_steps, "env step")}`),
-      this.source.isFile ? null : el("p", {}, playLink(this.source.name)),
+      this.source.isFile ? null : el("p", { class: "head-links" }, playLink(this.source.name), this.policyLink()),
     );
+  }
+
+  policyLink() {
+    const title = "An archive of the policy's files, which need no training code to act";
+    return el("a", { class: "button", href: this.source.address("/policy"), download: "", title }, "Download it");
   }
 
   film(name) {

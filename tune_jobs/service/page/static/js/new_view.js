@@ -173,7 +173,8 @@ export function openNew(main, route) {
       const made = await ask("sweeps", { method: "POST", body, headers: { "Idempotency-Key": key } });
       sessionStorage.removeItem(DRAFT);
       toast(`${made.sweep} is submitted.`);
-      location.hash = sweepAddress(made.sweep);
+      // Who has gone elsewhere meanwhile stays there.
+      if (!isClosed) location.hash = sweepAddress(made.sweep);
     } catch (error) {
       problem.replaceChildren(...refusal(error));
       submit.disabled = false;

@@ -82,6 +82,7 @@ export class Parallel {
       this.legend.firstElementChild,
       scores.length ? `score ${returnText(scores.reduce((a, b) => Math.min(a, b)))}` : "no scores yet",
     );
+    this.legend.children[1].hidden = scores.length === 0;
     setText(this.legend.lastElementChild, scores.length ? returnText(scores.reduce((a, b) => Math.max(a, b))) : "");
     this.layOut();
   }

@@ -19,6 +19,7 @@ export class Picture {
   clear() {
     this.run += 1;
     this.next = null;
+    this.canvas.classList.remove("drawn");
     this.context.clearRect(0, 0, this.canvas.width, this.canvas.height);
   }
 
@@ -36,6 +37,7 @@ export class Picture {
         if (this.canvas.width !== bitmap.width) this.canvas.width = bitmap.width;
         if (this.canvas.height !== bitmap.height) this.canvas.height = bitmap.height;
         this.context.drawImage(bitmap, 0, 0);
+        this.canvas.classList.add("drawn");
       }
       bitmap.close();
     }

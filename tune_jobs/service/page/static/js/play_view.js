@@ -10,7 +10,7 @@ import { keep, sweepAddress } from "./route.js";
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 10];
 const MOST_SEED = 2 ** 32 - 1;
 // How long one that is held still keeps its place among those that the service plays at once.
-const HELD_MS = 30_000;
+export const held = { ms: 30_000 };
 // Who clicks through seeds or policies starts a process for the last one alone.
 const START_MS = 200;
 const REDUCED = matchMedia("(prefers-reduced-motion: reduce)");
@@ -192,7 +192,7 @@ export function openPlay(main, route) {
     clearTimers();
     isRunning = false;
     for (const player of players) player.pause();
-    holding = setTimeout(() => players.forEach((player) => player.halt()), HELD_MS);
+    holding = setTimeout(() => players.forEach((player) => player.halt()), held.ms);
     showState();
   }
 
@@ -243,9 +243,8 @@ export function openPlay(main, route) {
   load();
   return {
     follow(params) {
-      if (known === null) return;
       seen = seenOf(params);
-      begin();
+      if (known !== null) begin();
     },
     close() {
       isClosed = true;

@@ -89,7 +89,8 @@ export class Player {
     Object.assign(this, { policy, seed, speed, step: null, info: null, isPaused: false, drawnAt: 0 });
     setText(this.title, titleOf(policy));
     this.node.dataset.policy = textOf(policy);
-    for (const node of [this.what, this.total, this.steps, this.action, this.ending]) setText(node, "");
+    for (const node of [this.what, this.ending]) setText(node, "");
+    for (const node of [this.total, this.steps, this.action]) setText(node, "–");
     this.problem.hidden = true;
     for (const part of [this.picture, this.observations, this.scores, this.line]) part.clear();
     this.picture.describe(`${titleOf(policy)}, not begun`);

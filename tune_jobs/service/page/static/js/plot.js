@@ -3,12 +3,13 @@ import { colour, el, onThemeChange } from "./dom.js";
 import { compact } from "./format.js";
 
 const { uPlot } = window;
-const FONT = '12px system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "Liberation Sans", sans-serif';
+export const FONT_FAMILY = 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "Liberation Sans", sans-serif';
+const FONT = `12px ${FONT_FAMILY}`;
 
 export class Plot {
   // `paint(context, places)` draws; `find(places, left, top)` returns what is near the cursor as { lines, id }, or null;
-  // `axes` are options of uPlot for the horizontal and the vertical axis, where they are others than those of numbers.
-  constructor(host, { label, xLabel, height, paint, find, onPick, axes = [] }) {
+  // `yLabel` names what is plotted; `axes` are options of uPlot for the horizontal and the vertical axis, where they are others than those of numbers.
+  constructor(host, { label, xLabel, yLabel = null, height, paint, find, onPick, axes = [] }) {
     this.range = { x: [0, 1], y: [0, 1] };
     this.isZoomed = false;
     this.found = null;
@@ -24,6 +25,7 @@ export class Plot {
     box.style.minHeight = `${height}px`;
     host.append(box);
     const axis = {
+      labelFont: FONT,
       stroke: () => colour("soft"),
       font: FONT,
       ticks: { show: false },
@@ -41,7 +43,6 @@ export class Plot {
           {
             ...axis,
             label: xLabel,
-            labelFont: FONT,
             labelSize: 20,
             size: 30,
             gap: 4,
@@ -49,7 +50,15 @@ export class Plot {
             values: (_, values) => values.map(compact),
             ...axes[0],
           },
-          { ...axis, size: 52, gap: 6, space: 34, values: (_, values) => values.map(compact), ...axes[1] },
+          {
+            ...axis,
+            ...(yLabel ? { label: yLabel, labelSize: 18 } : {}),
+            size: yLabel ? 44 : 52,
+            gap: 6,
+            space: 34,
+            values: (_, values) => values.map(compact),
+            ...axes[1],
+          },
         ],
         series: [{}, { show: true, paths: () => null, points: { show: false } }],
         cursor: {

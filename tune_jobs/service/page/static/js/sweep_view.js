@@ -230,7 +230,8 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     },
     show(error) {
       if (error === null) return showAll();
-      if (page.hidden) loading.replaceChildren(...refusal(error));
+      const back = el("p", {}, el("a", { href: "#/" }, "To all sweeps"));
+      if (page.hidden) loading.replaceChildren(...refusal(error), error.status === 404 ? back : "");
       else if (error.status === 404) alert.show(error);
       return undefined;
     },

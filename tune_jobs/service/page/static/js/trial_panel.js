@@ -133,6 +133,7 @@ export class TrialPanel {
     return new Plot(this.chart, {
       label: "Curve of the trial",
       xLabel: "env steps",
+      yLabel: "return",
       height: 190,
       paint: (context, places) => this.paint(context, places),
       find: (places, left) => this.find(places, left),
