@@ -1,20 +1,12 @@
 """The service's page in a browser, driven as a reader would: look, sort, filter, brush, submit, stop."""
 
-import pytest
+from live_service import Live
+from page_browser import IN_A_BROWSER, Page
+from page_sweeps import HOSTILE, write_large
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
-
-from live_service import Live  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
-from page_sweeps import HOSTILE, write_large  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
-]
+pytestmark = IN_A_BROWSER
 FAILED = "#/sweeps/cartpole-ppo?trial=t0003"
 
 

@@ -4,22 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from live_service import Live, serving
+from page_browser import IN_A_BROWSER, Page
+from page_sweeps import write_large, write_storage, write_sweep
+from selenium.webdriver import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from synthetic_sweep import make_points, make_sweep
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
-
-from live_service import Live, serving  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
-from page_sweeps import write_large, write_storage, write_sweep  # noqa: E402
-from selenium.webdriver import ActionChains  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-from synthetic_sweep import make_points, make_sweep  # noqa: E402
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
-]
+pytestmark = IN_A_BROWSER
 BOTH = "#/compare?sweeps=cartpole-ppo,cartpole-seeds"
 TIMELINE = "#/sweeps/cartpole-seeds?timeline=open"
 

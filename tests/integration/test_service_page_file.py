@@ -10,26 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from live_service import Live, serving
+from page_browser import IN_A_BROWSER, Page
+from page_sweeps import HOSTILE
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
+from tune_jobs.service.access.gate import opened_gate
+from tune_jobs.service.config import ServiceConfig
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.sweep_file import MAX_BYTES, sweep_file
 
-from live_service import Live, serving  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
-from page_sweeps import HOSTILE  # noqa: E402
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-
-from tune_jobs.service.access.gate import opened_gate  # noqa: E402
-from tune_jobs.service.config import ServiceConfig  # noqa: E402
-from tune_jobs.store.sweep_store import SweepStore  # noqa: E402
-from tune_jobs.sweeps.sweep_file import MAX_BYTES, sweep_file  # noqa: E402
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
-]
+pytestmark = IN_A_BROWSER
 DROP = """
     const transfer = new DataTransfer();
     for (const [name, text] of arguments[0]) {

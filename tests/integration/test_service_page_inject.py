@@ -3,21 +3,14 @@
 from collections.abc import Iterator
 
 import pytest
+from live_service import Live, serving
+from page_browser import IN_A_BROWSER, Page
+from page_sweeps import write_sweep
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
+from synthetic_sweep import make_sweep
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
-
-from live_service import Live, serving  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
-from page_sweeps import write_sweep  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-from selenium.webdriver.support.ui import Select  # noqa: E402
-from synthetic_sweep import make_sweep  # noqa: E402
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
-]
+pytestmark = IN_A_BROWSER
 SPACE = {"lr": {"loguniform": [1e-5, 1e-1]}, "hidden_sizes": {"grid": [[32], [64]]}, "num_epochs": {"randint": [2, 9]}}
 POINTS = [
     {"lr": 1e-5, "hidden_sizes": [32], "num_epochs": 3},

@@ -5,32 +5,24 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
+from live_service import Live, serving, serving_a_viewer
+from page_browser import IN_A_BROWSER, Page
+from page_sweeps import write_sweep
+from policy_factory import balancing_policy, make_portable
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
+from synthetic_sweep import Synthetic, make_sweep
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
+from analysis.records import CheckpointRecord
+from policies.portable.file import PortablePolicy, save_policy
+from tests.narrowing import present
+from tune_jobs.service.http import play_routes
 
-from live_service import Live, serving  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
-from page_sweeps import write_sweep  # noqa: E402
-from policy_factory import balancing_policy, make_portable  # noqa: E402
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-from selenium.webdriver.support.ui import Select  # noqa: E402
-from synthetic_sweep import Synthetic, make_sweep  # noqa: E402
-
-from analysis.records import CheckpointRecord  # noqa: E402
-from policies.portable.file import PortablePolicy, save_policy  # noqa: E402
-from tests.narrowing import present  # noqa: E402
-from tune_jobs.service.access.gate import opened_gate  # noqa: E402
-from tune_jobs.service.config import ServiceConfig  # noqa: E402
-from tune_jobs.service.http import play_routes  # noqa: E402
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
-]
+pytestmark = IN_A_BROWSER
 LONG, SHORT = "t0000", "t0001"
 """The trial whose policy keeps the pole up, and the one whose policy does not."""
 
@@ -100,7 +92,7 @@ def fact(page: Page, name: str, number: int = 1) -> str:
 
 
 def num_steps(page: Page, number: int = 1) -> int:
-    return int(fact(page, "Env steps", number).replace(",", "") or "0")
+    return int(fact(page, "Env steps", number).replace(",", "").strip("\u2013") or "0")
 
 
 def ending(page: Page, number: int = 1) -> str:
@@ -143,6 +135,8 @@ def test_checkpoints_and_the_result_lead_there(page: Page) -> None:
     assert page.address() == f"#/sweeps/drawn/play?trial={SHORT}&iteration=5"
     page.browser.back()
     page.says(".finished", "The policy to deploy")
+    archive = page.button("Download it", ".finished").get_attribute("href")
+    assert httpx2.get(str(archive)).headers["content-disposition"] == 'attachment; filename="drawn-policy.zip"'
     page.button("Watch it play", ".finished").click()
     page.says(".player h2", "Best policy")
 
@@ -304,6 +298,40 @@ def test_nothing_plays_where_nobody_looks(page: Page) -> None:
     page.until(lambda: not play_routes._playing)
 
 
+def test_who_holds_still_for_long_gives_their_place_up(page: Page) -> None:
+    page.open("#/")
+    page.browser.execute_async_script("""
+        const done = arguments[arguments.length - 1];
+        import(new URL("static/js/play_view.js", document.baseURI).href).then(({ held }) => {
+          window.held = held;
+          done();
+        });
+    """)
+    assert page.run("return window.held.ms") == 30_000
+    page.run("window.held.ms = 600")
+    page.run("location.hash = '#/sweeps/drawn/play?speed=0.5'")
+    page.until(lambda: num_steps(page) > 5)
+    page.button("Pause").click()
+    # For a moment it stays where it is, at the service too.
+    assert play_routes._playing
+    page.until(lambda: not play_routes._playing)
+    page.says(".player .state", "paused")
+    stopped = num_steps(page)
+    page.run("window.held.ms = 30_000")
+    page.button("Play").click()
+    page.until(lambda: num_steps(page) > stopped)
+    # Who goes on in time keeps their place.
+    page.button("Pause").click()
+    page.button("Play").click()
+    page.says(".player .state", "playing")
+    assert play_routes._playing
+    page.run("window.held.ms = 100")
+    page.button("Pause").click()
+    # There were two, and the second went on from the step that was seen.
+    page.wait(f"{PLAYED}.length === 2")
+    assert page.run(f"{PLAYED}.at(-1).name").endswith(f"&start={stopped + 1}")
+
+
 def test_it_is_said_why_a_policy_is_not_played(page: Page, live: Live) -> None:
     page.open("#/sweeps/drawn/play?trial=t0001&iteration=77")
     page.says(
@@ -358,9 +386,7 @@ def test_it_has_no_barriers_and_fits_each_width(page: Page, view: str) -> None:
 def test_a_viewer_may_watch(browser: webdriver.Chrome, tmp_path: Path, env_plugin: None) -> None:
     storage = tmp_path / "sweeps"
     write_playables(storage)
-    with opened_gate(ServiceConfig(storage=storage)) as gate:
-        _, secret = gate.tokens.make("vera", "viewer")
-    with serving(storage, require_token=True) as closed:
+    with serving_a_viewer(storage, "vera") as (closed, secret):
         page = Page(browser, closed.url)
         page.errors()
         page.open("#/sweeps/drawn/play?speed=10")

@@ -1,24 +1,14 @@
 """Who reaches the service's page: with a keyboard, a screen reader, a phone, a token of their own."""
 
 import pytest
+from live_service import Live, serving_a_viewer
+from page_browser import IN_A_BROWSER, Page
+from page_sweeps import write_storage
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed (make install)")
-
-from live_service import serving  # noqa: E402
-from page_browser import CHROMIUM, DRIVER, Page  # noqa: E402
-from page_sweeps import write_storage  # noqa: E402
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-
-from tune_jobs.service.access.gate import opened_gate  # noqa: E402
-from tune_jobs.service.config import ServiceConfig  # noqa: E402
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-    pytest.mark.skipif(DRIVER is None, reason="no chromedriver on this machine"),
-]
+pytestmark = IN_A_BROWSER
 FAILED = "#/sweeps/cartpole-ppo?trial=t0003"
 
 
@@ -91,9 +81,7 @@ def test_who_has_no_token_logs_in_and_a_viewer_changes_nothing(
 ) -> None:
     storage = tmp_path_factory.mktemp("closed") / "sweeps"
     write_storage(storage)
-    with opened_gate(ServiceConfig(storage=storage)) as gate:
-        _, secret = gate.tokens.make("vera", "viewer")
-    with serving(storage, require_token=True) as closed:
+    with serving_a_viewer(storage, "vera") as (closed, secret):
         page = Page(browser, closed.url)
         page.errors()
         page.open("#/sweeps/cartpole-ppo")
@@ -113,3 +101,46 @@ def test_who_has_no_token_logs_in_and_a_viewer_changes_nothing(
         page.button("Log out").click()
         page.says("main h1", "Log in")
         assert page.errors() == []
+
+
+def test_the_focus_stays_with_who_goes_by_keys_alone(page: Page) -> None:
+    page.open("#/sweeps/cartpole-seeds")
+    page.says(".sweep-title", "interrupted")
+    # What a dialog was opened from is gone with the menu: the focus goes back to what opened that.
+    page.run("arguments[0].focus()", page.button("More"))
+    page.keys(Keys.ENTER, Keys.TAB, Keys.ENTER)
+    assert page.focused() == "More samples"
+    page.keys(Keys.ESCAPE)
+    page.until(lambda: page.focused() == "More")
+    # What was pressed is gone: the other one has its place.
+    page.run("arguments[0].focus()", page.button("Resume"))
+    page.keys(Keys.ENTER)
+    page.says(".sweep-title", "waiting")
+    page.until(lambda: page.focused() == "Stop")
+    page.keys(Keys.ENTER)
+    page.says(".sweep-title", "stopped")
+    page.until(lambda: page.focused() == "Resume")
+
+
+def test_who_goes_back_leaves_a_dialog_behind(page: Page) -> None:
+    page.open("#/")
+    page.button("cartpole-ppo").click()
+    page.button("More").click()
+    page.button("Delete…").click()
+    page.one("dialog form")
+    page.browser.back()
+    page.says("main h1", "Sweeps")
+    page.wait("return document.querySelector('dialog') === null")
+
+
+def test_the_report_is_downloaded(page: Page, live: Live) -> None:
+    report = live.storage / "cartpole-ppo" / "report"
+    report.mkdir(exist_ok=True)
+    (report / "index.html").write_text("<!DOCTYPE html><title>Report</title>")
+    page.open("#/sweeps/cartpole-ppo")
+    link = page.button("Download the report")
+    address = link.get_attribute("href")
+    assert link.get_attribute("download") == "cartpole-ppo-report.html"
+    assert "<title>Report" in page.browser.execute_async_script(
+        "fetch(arguments[0]).then((answer) => answer.text()).then(arguments[arguments.length - 1])", address
+    )

@@ -14,6 +14,7 @@ from typing import Any, Self
 import httpx2
 import pytest
 
+from tune_jobs.service.access.gate import opened_gate
 from tune_jobs.service.config import Limits, ServiceConfig
 from tune_jobs.service.http.app import make_app
 from tune_jobs.service.serve import Server, listening_socket
@@ -63,6 +64,15 @@ def serving(
             server.should_exit = True
             thread.join(30)
             assert not thread.is_alive()
+
+
+@contextlib.contextmanager
+def serving_a_viewer(storage: Path, name: str) -> Iterator[tuple[Live, str]]:
+    """Serve a storage folder to those with a token alone; yields it, and the token of a viewer of this name."""
+    with opened_gate(ServiceConfig(storage=storage)) as gate:
+        _, secret = gate.tokens.make(name, "viewer")
+    with serving(storage, require_token=True) as closed:
+        yield closed, secret
 
 
 @contextlib.contextmanager

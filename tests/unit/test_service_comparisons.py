@@ -7,15 +7,13 @@ from typing import Any
 import httpx2
 import pytest
 from fake_sweeps import run  # noqa: F401 (a fixture)
-from live_service import Live, live, serving  # noqa: F401 (a fixture)
+from live_service import Live, live, serving, serving_a_viewer  # noqa: F401 (a fixture)
 from store_parts import make_best, make_checkpoint, make_iteration
 from sweep_folders import make_sweep_folder
 
 from analysis.best_so_far import best_so_far
 from analysis.records import EvaluationRecord, IterationRecord, TrialRecord
 from tune_jobs.service import derived
-from tune_jobs.service.access.gate import opened_gate
-from tune_jobs.service.config import ServiceConfig
 from tune_jobs.spec.differences import differences
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import side_by_side as module
@@ -176,9 +174,7 @@ def test_a_viewer_may_compare_and_nobody_without_a_token(tmp_path: Path) -> None
     storage = tmp_path / "sweeps"
     for name in ("one", "two"):
         make_sweep_folder(storage / name, iterations=2)
-    with opened_gate(ServiceConfig(storage=storage)) as gate:
-        _, secret = gate.tokens.make("vera", "viewer")
-    with serving(storage, require_token=True) as closed:
+    with serving_a_viewer(storage, "vera") as (closed, secret):
         compared(closed, "one", "two", status=401)
         compared(closed, "one", "two", headers={"Authorization": f"Bearer {secret}"})
 
