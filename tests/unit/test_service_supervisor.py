@@ -113,8 +113,8 @@ def test_jobs_are_run_and_end_as_their_sweeps_do(place: Place, service: Supervis
     good, bad = place.until_all_end()
     assert (good.outcome, good.message) == ("completed", None)
     assert (bad.outcome, bad.message) == ("failed", "ValueError: it broke")
-    told = sorted((job.id, job.outcome, job.message) for job in place.ended)
-    assert told == [(job.id, job.outcome, job.message) for job in (good, bad)]
+    told = sorted((job.id, job.outcome, job.message, job.ended_at) for job in place.ended)
+    assert told == [(job.id, job.outcome, job.message, job.ended_at) for job in (good, bad)]
 
 
 def test_a_sweep_is_stopped_and_goes_on_when_it_is_asked_for(place: Place, service: Supervisor) -> None:

@@ -43,7 +43,8 @@ database_option = click.option(
     "--webhook-secret", metavar="SECRET", envvar="TUNE_JOBS_WEBHOOK_SECRET", show_envvar=True,
     help="What messages to webhooks are signed with (Standard Webhooks); better set by the variable.",
 )  # fmt: skip
-@click.option("--run-command", metavar="COMMAND", help="Run when something happens, with the message as its input.")
+@click.option("--run-command", metavar="COMMAND",
+              help="Run when something happens, without a shell, with the message as its input.")  # fmt: skip
 @click.option("--stuck", "stuck_s", type=click.FloatRange(1), default=900.0, show_default=True, metavar="SECONDS",
               help="A running sweep that takes no env step for so long is told to be stuck.")  # fmt: skip
 @click.option("--public-name", "public_names", multiple=True, metavar="NAME[:PORT]",

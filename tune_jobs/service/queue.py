@@ -188,9 +188,10 @@ class Queue:
         """Let a running job wait again, as the service is drained."""
         return self._change(job_id, {"state": "waiting", "stop_requested": False}, ("running",))
 
-    def end(self, job_id: int, outcome: Outcome, message: str | None = None) -> Job:
-        """End a job that waits or runs."""
-        values = {"state": "ended", "outcome": outcome, "message": message, "ended_at": self._now()}
+    def end(self, job_id: int, outcome: Outcome, message: str | None = None, *, at: float | None = None) -> Job:
+        """End a job that waits or runs, at a time in seconds since 1970; None: now."""
+        ended_at = self._now() if at is None else at
+        values = {"state": "ended", "outcome": outcome, "message": message, "ended_at": ended_at}
         return self._change(job_id, values, ("waiting", "running"))
 
     # -- what people change

@@ -274,8 +274,10 @@ class Supervisor:
         told = (job.id, job.verb, job.sweep, outcome)
         _log.info("Job %d (%s of sweep %s) has ended: %s.", *told, extra=job.log_fields)
         # First it is told: whoever is killed in between tells it twice, and not never.
-        self._on_end(job.model_copy(update={"state": "ended", "outcome": outcome, "message": message}))
-        self._queue.end(job.id, outcome, message)
+        now = time.time()
+        ended = {"state": "ended", "outcome": outcome, "message": message, "ended_at": now}
+        self._on_end(job.model_copy(update=ended))
+        self._queue.end(job.id, outcome, message, at=now)
         # All that they said is in the queue now.
         if outcome != "failed":
             self._files(job).remove()
