@@ -91,6 +91,36 @@ def test_env_steps_count_from_the_begin_of_the_service_and_never_go_back(live: L
     assert scrape(live).value("env_steps_total") == steps
 
 
+def test_steps_of_a_sweep_that_came_and_went_between_two_scrapes_count(client: TestClient, service: Service) -> None:
+    """It was trained by a job, or from a terminal."""
+    expected = 0
+    for name in ("queued", "terminal"):
+        store = make_sweep_folder(service.config.storage / name)
+        store.write_record(store.read_record().model_copy(update={"created_at": time.time() + 1}))
+        expected += sum(trial.num_env_steps for trial in store.read_trials())
+    job, _ = service.queue.begin("queued", "drive", {}, owner=OWNER, num_cpus=1.0)
+    service.supervisor._finish(job, "completed")
+    service.storage.sweep("queued").delete()
+    assert client.delete("/api/v1/sweeps/terminal").status_code == 204
+    assert Scrape(client.get("/metrics").text).value("env_steps_total") == expected > 0
+
+
+def test_what_was_seen_earlier_and_comes_later_counts_nothing_twice(client: TestClient, service: Service) -> None:
+    store = make_sweep_folder(service.config.storage / "new")
+    store.write_record(store.read_record().model_copy(update={"created_at": time.time() + 1}))
+    trial = store.trial("t0001").read_record()
+    store.trial("t0001").write_record(trial.model_copy(update={"num_env_steps": trial.num_env_steps - 100}))
+    before = service.statuses.see("new")
+    store.trial("t0001").write_record(trial)
+    store.write_record(store.read_record())
+    after = service.statuses.see("new")
+    assert after.status.num_env_steps == before.status.num_env_steps + 100
+    steps = EnvSteps(began_at=0.0)
+    for item in (after, before, after):
+        steps.saw(item)
+    assert steps.total == after.status.num_env_steps
+
+
 def test_a_sweep_that_could_not_be_read_for_a_while_counts_once(live: Live) -> None:
     store = make_sweep_folder(live.storage / "new")
     record = store.read_record().model_copy(update={"created_at": time.time() + 1})

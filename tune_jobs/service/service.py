@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sqlalchemy import Engine
 
-from policies.errors import CannotRunError
+from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.plan.machine import local_machine
 from tune_jobs.service.access.audit import Audit
 from tune_jobs.service.access.gate import Gate
@@ -26,7 +26,7 @@ from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.metrics import Metrics
 from tune_jobs.service.queue import Queue
-from tune_jobs.service.state_metrics import StateCollector
+from tune_jobs.service.state_metrics import EnvSteps, StateCollector
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.submitting import Submitter
 from tune_jobs.service.supervisor import Supervisor, Surroundings
@@ -52,6 +52,7 @@ class Service:
     watching: Watching
     derived: Derived
     metrics: Metrics
+    env_steps: EnvSteps
 
 
 @contextlib.contextmanager
@@ -80,9 +81,13 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             )
             watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s, outages=gate.outages)
 
+            env_steps = EnvSteps()
+
             def on_end(job: Job) -> None:
                 watch.ended(job)
                 metrics.job_ended(job)
+                with contextlib.suppress(TuneJobsError):
+                    env_steps.saw(statuses.see(job.sweep))
 
             supervisor = Supervisor(
                 queue, storage, where,
@@ -96,6 +101,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     supervisor=supervisor,
                     watching=watching,
                     teller=teller,
+                    env_steps=env_steps,
                 )
             )
             pruning = Pruning(gate.audit, config.keep_audit_days)
@@ -117,6 +123,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     watching=watching,
                     derived=Derived(storage, statuses),
                     metrics=metrics,
+                    env_steps=env_steps,
                 )
         finally:
             engine.dispose()

@@ -37,6 +37,7 @@ class StateCollector(Collector):
         supervisor: Runs the queue.
         watching: Has the clients that follow sweeps.
         teller: Has the messages that wait.
+        env_steps: Counts those of all sweeps.
     """
 
     def __init__(
@@ -48,10 +49,11 @@ class StateCollector(Collector):
         supervisor: Supervisor,
         watching: Watching,
         teller: Teller,
+        env_steps: EnvSteps,
     ) -> None:
         self._queue, self._storage, self._statuses = queue, storage, statuses
         self._supervisor, self._watching, self._teller = supervisor, watching, teller
-        self._steps = EnvSteps()
+        self._steps = env_steps
         self._memory = (float("-inf"), 0)
 
     def collect(self) -> Iterator[Metric]:
@@ -143,14 +145,15 @@ class EnvSteps:
     """Counts env steps from the numbers that sweeps have; threads may share one.
 
     A counter must not go back: what a sweep has trained counts on when it is deleted. What was there before the service
-    began is not counted, as a counter begins at zero.
+    began is not counted, as a counter begins at zero. Sweeps are looked at whenever somebody asks for the total, and
+    when they end: nobody may ask before they are deleted.
     """
 
     began_at: float = field(default_factory=time.time)
     """Seconds since 1970."""
     total: int = 0
-    _known: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """When a sweep was created, and its env steps when it was last seen."""
+    _known: dict[str, tuple[float, int, float]] = field(default_factory=dict)
+    """When a sweep was created, its env steps when it was last seen, and when that was."""
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def update(self, seen: Sequence[Seen], names: Collection[str]) -> int:
@@ -162,17 +165,28 @@ class EnvSteps:
         """
         with self._lock:
             for item in seen:
-                created_at, steps = item.status.sweep.created_at, item.status.num_env_steps
-                known = self._known.get(item.name)
-                if known is None or known[0] != created_at:
-                    # Another one of the same name, or one that is seen for the first time.
-                    before = 0 if created_at >= self.began_at else steps
-                else:
-                    before = known[1]
-                self.total += max(0, steps - before)
-                self._known[item.name] = (created_at, steps)
+                self._count(item)
             self._known = {name: known for name, known in self._known.items() if name in names}
             return self.total
+
+    def saw(self, item: Seen) -> None:
+        """Count what is new of one sweep."""
+        with self._lock:
+            self._count(item)
+
+    def _count(self, item: Seen) -> None:
+        created_at, steps, at = item.status.sweep.created_at, item.status.num_env_steps, item.summed_up.at
+        known = self._known.get(item.name)
+        if known is None or known[0] != created_at:
+            # Another one of the same name, or one that is seen for the first time.
+            before = 0 if created_at >= self.began_at else steps
+        elif at < known[2]:
+            # Somebody else has seen it later, and counted.
+            return
+        else:
+            before = known[1]
+        self.total += max(0, steps - before)
+        self._known[item.name] = (created_at, steps, at)
 
 
 def _by(names: Sequence[str], counts: Mapping[str, int]) -> dict[tuple[str, ...], int]:

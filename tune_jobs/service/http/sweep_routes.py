@@ -174,6 +174,8 @@ def delete(
             f"Sweep {name} has not finished: it is {seen.status.state}.", "Resume it, or delete it with force=true."
         )
     service.storage.sweep(name).delete()
+    # It may have been run from a terminal, and nobody has asked for metrics since.
+    service.env_steps.saw(seen)
     service.queue.remove_sweep(name)
     service.labels.forget(name)
     service.statuses.forget(name)
