@@ -1,5 +1,7 @@
 """What the Docker files promise, read from them."""
 
+import subprocess
+import sys
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path, PurePosixPath
@@ -7,6 +9,9 @@ from typing import Any
 
 import pytest
 from image import read_compose, read_dockerfile
+from served import Served
+
+from tune_jobs.cli.serve_command import serve
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
@@ -65,17 +70,54 @@ def test_without_a_token_nothing_starts() -> None:
 
 def test_every_service_shows_the_token_and_shares_the_storage(compose: dict[str, Any]) -> None:
     (storage,) = [part for rest in rest_of("ENV") for part in rest.split() if part.startswith("TUNE_JOBS_STORAGE=")]
-    for service in compose["services"].values():
+    services = compose["services"]
+    for name, service in services.items():
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        if name == "database":
+            continue
         assert service["environment"]["RAY_AUTH_MODE"] == "token"
         assert service["environment"]["RAY_AUTH_TOKEN"] == "secret"
         assert f"sweeps:{storage.partition('=')[2]}" in service["volumes"]
-        assert service["cap_drop"] == ["ALL"]
-        assert service["security_opt"] == ["no-new-privileges:true"]
-    assert list(compose["volumes"]) == ["sweeps"]
+    assert "sweeps" not in str(services["database"]["volumes"])
+    assert list(compose["volumes"]) == ["sweeps", "database"]
 
 
-def test_no_port_is_published(compose: dict[str, Any]) -> None:
-    assert not any("ports" in service or "network_mode" in service for service in compose["services"].values())
+def test_no_port_is_published_but_the_services_for_this_machine(compose: dict[str, Any]) -> None:
+    services = compose["services"]
+    assert not any("network_mode" in service for service in services.values())
+    assert [name for name, service in services.items() if "ports" in service] == ["service"]
+    assert services["service"]["ports"] == ["127.0.0.1:8470:8470"]
+
+
+def test_the_service_is_asked_for_what_it_has_and_stopped_after_sweeps_have_saved(compose: dict[str, Any]) -> None:
+    service = compose["services"]["service"]
+    program, command, *options = service["command"]
+    assert (program, command) == ("tune-jobs", "serve")
+    given = serve.make_context("serve", options).params
+    assert (given["address"], given["host"], given["port"]) == ("ray://head:10001", "0.0.0.0", 8470)
+    assert given["drain_s"] < int(service["stop_grace_period"].removesuffix("s"))
+    assert f":{given['port']}/readyz" in service["healthcheck"]["test"][-1]
+    assert (service["read_only"], service["tmpfs"]) == (True, ["/tmp"])
+    # Without a setting, no other database; with the profile, the one beside it.
+    assert service["environment"]["TUNE_JOBS_DATABASE"] == ""
+    database = compose["services"]["database"]
+    assert (database["profiles"], database["user"]) == (["postgresql"], "postgres")
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert "postgresql" in extras
+    assert any("['postgresql']" in rest for rest in rest_of("RUN"))
+
+
+def test_the_health_check_of_the_service_says_what_is_ready(compose: dict[str, Any], tmp_path: Path) -> None:
+    kind, python, *test = compose["services"]["service"]["healthcheck"]["test"]
+    assert (kind, python) == ("CMD", "python")
+    server = Served(tmp_path / "sweeps", "--spare-idle", "0")
+    try:
+        test[-1] = test[-1].replace("http://127.0.0.1:8470", server.url)
+        assert subprocess.run([sys.executable, *test], check=False, timeout=60).returncode == 0
+    finally:
+        assert server.end() == 0
+    assert subprocess.run([sys.executable, *test], check=False, capture_output=True, timeout=60).returncode != 0
 
 
 def test_workers_scale(compose: dict[str, Any]) -> None:
