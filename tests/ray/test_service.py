@@ -1,12 +1,17 @@
-"""A real service with a real sweep: submitted, stopped, resumed and extended over HTTP, drained and begun again."""
+"""A real service with a real sweep: over HTTP and by commands, stopped, resumed, extended, drained and begun again."""
 
+import json
 import urllib.error
 from pathlib import Path
 
 import pytest
+import yaml
+from fake_sweeps import RunCommand, run  # noqa: F401 (a fixture)
 from served import Served
 
 from tune_jobs.store.sweep_store import SweepStore
+
+# ruff: noqa: F811 - fixtures are named as arguments
 
 pytestmark = pytest.mark.ray
 SPEC = {
@@ -23,7 +28,11 @@ def storage(tmp_path: Path) -> Path:
     return tmp_path / "sweeps"
 
 
-def test_a_sweep_from_its_submission_to_its_report(storage: Path) -> None:
+def test_a_sweep_from_its_submission_to_its_report(
+    storage: Path, tmp_path: Path, run: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("TUNE_JOBS_SERVER", "TUNE_JOBS_TOKEN", "TUNE_JOBS_TOKEN_FILE"):
+        monkeypatch.delenv(name, raising=False)
     server = Served(storage, "--spare-idle", "0")
     try:
         server.ask("POST", "sweeps", {"spec": SPEC, "name": "mine"})
@@ -47,8 +56,22 @@ def test_a_sweep_from_its_submission_to_its_report(storage: Path) -> None:
         assert server.ask("GET", "jobs")[-1]["state"] == "running"
         server.ask("POST", "sweeps/mine/stop")
         assert server.wait_for_job()["outcome"] == "stopped"
-        short = SPEC | {"stop": {"num_env_steps": 2_560}}
-        server.ask("POST", "sweeps", {"spec": short, "name": "short"})
+        (tmp_path / "short.yaml").write_text(yaml.safe_dump(SPEC | {"stop": {"num_env_steps": 2_560}}))
+        command = ("--server", server.url)
+        followed = run(*command, "launch", "short.yaml", "--json")
+        assert followed.exit_code == 0, followed.output
+        assert followed.stderr.splitlines()[0] == "short: waits for its turn"
+        assert "100 %" in followed.stderr.splitlines()[-1]
+        launched = json.loads(followed.stdout)
+        assert [trial["status"] for trial in launched["trials"]] == ["completed"] * 2
+        best = json.loads(run(*command, "best", "short", "--json").stdout)
+        assert best == launched["best"]
+        assert best["checkpoint"]["trial_id"] in {trial["trial_id"] for trial in launched["trials"]}
+        assert "report" in json.loads(run(*command, "report", "short", "--json").stdout)
+        page = (storage / "short" / "report" / "index.html").read_bytes()
+        assert (tmp_path / "short-report.html").read_bytes() == page
+        for words in (("importance", "short"), ("compare", "short"), ("trials", "short"), ("compare", "short", "mine")):
+            assert run(*command, *words).output == run(*words, "--storage", storage).output
         server.ask("POST", "sweeps/short/extend", {"num_samples": 1})
         assert server.wait_for_job()["outcome"] == "completed"
         found = server.ask("GET", "sweeps/short")

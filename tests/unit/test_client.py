@@ -1,17 +1,11 @@
-"""The client over real HTTP: each route, what is refused and in which words, lost connections."""
+"""The client over real HTTP: each route, and refusals, which are the errors of this machine."""
 
-import contextlib
 import json
-import threading
-import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
-from cutting_proxy import cutting_proxy
-from fake_sweeps import RunCommand
 from live_service import Live, live, serving  # noqa: F401 (a fixture)
 from services import FAKE
 from sweep_folders import make_sweep_folder
@@ -19,7 +13,7 @@ from test_service_downloads import FILM, make_finished
 
 from policies.errors import CannotRunError, CheckpointError, EnvError, NotFoundError, SpecError
 from tests.narrowing import present
-from tune_jobs.client import Client, ConflictError, LostConnectionError, NoServiceError, answers
+from tune_jobs.client import Client, ConflictError, answers
 from tune_jobs.client import connection as connection_module
 from tune_jobs.service.http import models
 from tune_jobs.service.jobs import Job
@@ -178,214 +172,6 @@ def test_files_are_downloaded_whole_or_not_at_all(looking: Client, tmp_path: Pat
     assert not list(tmp_path.glob(".*"))
     with pytest.raises(CannotRunError, match="is a folder"):
         looking.download("mine", "policy", tmp_path)
-
-
-def test_a_download_goes_on_where_the_connection_was_lost(site: Live, tmp_path: Path) -> None:
-    with cutting_proxy(site.url) as proxy, Client(proxy.url) as client:
-        proxy.cuts = [300_000, 0, 200_000]
-        assert client.download("mine", "films/after_mp4", tmp_path / "film").read_bytes() == FILM
-        parts = [request.partition(b"Range: bytes=")[2].partition(b"-")[0] for request in proxy.requests]
-        assert parts[0] == b""
-        assert 0 < int(parts[1]) == int(parts[2]) < int(parts[3]) < len(FILM)
-
-
-def test_a_download_that_changes_meanwhile_begins_anew(live: Live, tmp_path: Path) -> None:
-    film = make_finished(live.storage / "mine").films()["after_mp4"]
-    with cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
-        proxy.cuts = [300_000]
-        real = connection_module.Connection.stream
-
-        def stream(*args: Any, **options: Any) -> Any:
-            if len(proxy.requests) == 1:
-                film.write_bytes(b"b" * len(FILM))
-            return real(*args, **options)
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(connection_module.Connection, "stream", stream)
-            assert client.download("mine", "films/after_mp4", tmp_path / "film").read_bytes() == b"b" * len(FILM)
-
-
-# -- lost connections
-
-
-def test_what_only_looks_is_asked_again(site: Live) -> None:
-    with cutting_proxy(site.url) as proxy, Client(proxy.url) as client:
-        proxy.cuts = [0, 20, 500]
-        assert client.status("mine").sweep.name == "mine"
-        assert len(proxy.requests) == 4
-
-
-def test_a_submission_whose_answer_is_lost_makes_one_sweep(live: Live) -> None:
-    with cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
-        proxy.cuts = [0, 10]
-        assert client.submit(FAKE, name="mine").sweep == "mine"
-        keys = {request.partition(b"Idempotency-Key: ")[2].partition(b"\r\n")[0].lower() for request in proxy.requests}
-        assert (len(keys), len(proxy.requests)) == (1, 3)
-    assert [job.sweep for job in live.service.queue.jobs()] == ["mine"]
-
-
-def test_what_changes_something_is_not_asked_twice(live: Live) -> None:
-    make_sweep_folder(live.storage / "done")
-    with cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
-        proxy.cuts = [0]
-        with pytest.raises(LostConnectionError, match="POST /api/v1/sweeps/done/extend") as caught:
-            client.extend("done", 1)
-        assert "not known whether it was done" in caught.value.hint
-        assert len(proxy.requests) == 1
-
-
-def test_a_connection_that_is_lost_again_and_again_is_told(site: Live) -> None:
-    with cutting_proxy(site.url) as proxy, Client(proxy.url) as client:
-        proxy.cuts = [0] * 20
-        with pytest.raises(LostConnectionError, match=proxy.url):
-            client.me()
-
-
-# -- what is no service, or lets nobody in
-
-
-@contextlib.contextmanager
-def answering(status: int, body: str, media_type: str, **headers: str) -> Iterator[str]:
-    """The address of a server that answers everything alike."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(status)
-            for name, value in {"Content-Type": media_type, "Content-Length": str(len(body)), **headers}.items():
-                self.send_header(name.replace("_", "-"), value)
-            self.end_headers()
-            self.wfile.write(body.encode())
-
-        do_POST = do_GET  # noqa: N815
-
-        def log_message(self, *_: Any) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join(30)
-
-
-JSON, PROBLEM = "application/json", "application/problem+json"
-
-
-@pytest.mark.parametrize(
-    ("status", "body", "media_type", "words"),
-    [
-        (200, "<!DOCTYPE html><title>Jenkins</title>", "text/html; charset=x", ("no service", "Jenkins", "text/html")),
-        (404, "<html>nothing here</html>", "text/html", ("no service", "status 404")),
-        (404, '{"detail":"Not Found"}', JSON, ("no service", "Not Found")),
-        (200, "{]", JSON, ("no service",)),
-        (200, "[1]", JSON, ("does not know",)),
-        (200, '{"name": 3}', JSON, ("does not know", "name")),
-        (502, "<h1>Bad Gateway</h1>", "text/html", ("proxy", "502")),
-        (401, '{"detail": "A token is needed."}', PROBLEM, ("token", "A token is needed.")),
-        (404, '{"detail": "Not Found"}', PROBLEM, ("does not know GET /api/v1/me",)),
-        (404, '{"detail": "There is nothing at this path."}', PROBLEM, ("does not know GET /api/v1/me",)),
-        (405, '{"detail": "This path takes no GET."}', PROBLEM, ("does not know GET /api/v1/me",)),
-        (507, '{"detail": "The disk is full."}', PROBLEM, ("The disk is full.",)),
-        (429, '{"detail": "Too many."}', PROBLEM, ("Too many.",)),
-        (200, "", "", ("no service",)),
-    ],
-)  # fmt: skip
-def test_what_answers_and_is_no_service_is_told(status: int, body: str, media_type: str, words: Any) -> None:
-    with answering(status, body, media_type) as url, Client(url) as client:
-        with pytest.raises(CannotRunError) as caught:
-            client.me()
-        for word in words:
-            assert word in caught.value.message
-        assert url in caught.value.message or status in (429, 507)
-        assert caught.value.hint or status == 507
-
-
-def test_a_token_is_not_carried_to_another_address() -> None:
-    to = "http://user:pass@elsewhere.example/x?token=1"
-    with (
-        answering(302, "", "", Location=to) as url,
-        Client(url, "abc") as client,
-        pytest.raises(NoServiceError) as caught,
-    ):
-        client.me()
-    assert "http://elsewhere.example " in caught.value.message
-    assert "pass" not in str(caught.value)
-
-
-def test_an_address_at_which_nobody_answers_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time, "sleep", lambda _: pytest.fail("it waited"))
-    with Client("http://127.0.0.1:1") as client:
-        with pytest.raises(NoServiceError, match=r"http://127\.0\.0\.1:1 can't be reached"):
-            client.me()
-        with pytest.raises(NoServiceError):
-            next(client.events("mine"))
-
-
-@pytest.mark.parametrize(
-    ("url", "words"),
-    [
-        ("127.0.0.1:8470", "http://"), ("ftp://x", "http://"), ("", "http://"), ("http://", "http://"),
-        ("http://me:s3cret@x:1", "password"), ("https://s3cret@x", "password"), ("http://x:99999", "port"),
-        ("http://x?token=s3cret", "query"), ("http://x/#s3cret", "query"), ("http://a b", "http://"),
-    ],
-)  # fmt: skip
-def test_addresses_that_are_none_are_refused_and_show_no_secret(url: str, words: str) -> None:
-    with pytest.raises(SpecError) as caught:
-        Client(url)
-    assert words in caught.value.message
-    assert "s3cret" not in str(caught.value)
-
-
-# -- tokens
-
-
-def test_a_token_lets_in_and_a_wrong_one_is_told(tmp_path: Path, run: RunCommand) -> None:
-    make = ("token", "make", "--json", "--storage", tmp_path / "sweeps")
-    viewer, ann = (
-        json.loads(run(*make, name, "--role", role).stdout)["token"]
-        for name, role in (("eve", "viewer"), ("ann", "submitter"))
-    )
-    with serving(tmp_path / "sweeps", require_token=True) as made:
-        make_sweep_folder(made.storage / "done")
-        file = tmp_path / "token"
-        file.write_text(f"{ann}\n")
-        with Client(made.url, token_file=file) as client:
-            assert client.me().name == "ann"
-            assert client.submit(FAKE, name="mine").job.owner == "ann"
-            with pytest.raises(CannotRunError, match="belongs to nobody"):
-                client.delete("done")
-        with Client(made.url, f" {viewer}\n") as client:
-            assert client.me().role == "viewer"
-            with pytest.raises(CannotRunError, match="viewer"):
-                client.submit(FAKE)
-            assert next(client.events("done")).kind == "status"
-        wrong = "tune-jobs_00000000_" + "A" * 43
-        for token in (None, wrong):
-            with Client(made.url, token) as client:
-                with pytest.raises(CannotRunError, match="valid token") as caught:
-                    client.status("done")
-                assert wrong not in str(caught.value)
-                assert "TUNE_JOBS_TOKEN" in caught.value.hint
-                assert wrong not in repr(client)
-
-
-def test_tokens_that_are_none_are_refused_and_not_shown(tmp_path: Path) -> None:
-    file = tmp_path / "token"
-    for content in ("", "two s3crets", "s3cret\ns3cret", "s3crét"):
-        file.write_text(content)
-        with pytest.raises(SpecError) as caught:
-            Client("http://x", token_file=file)
-        assert "s3cr" not in str(caught.value)
-    with pytest.raises(SpecError, match="can't be read"):
-        Client("http://x", token_file=tmp_path / "none")
-    with pytest.raises(SpecError, match="one of them"):
-        Client("http://x", "abc", token_file=file)
-    with pytest.raises(SpecError, match="certificates in"):
-        Client("https://x", ca_file=tmp_path / "none")
 
 
 # -- refusals are the errors of this machine

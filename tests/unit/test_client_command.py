@@ -2,28 +2,26 @@
 
 import json
 import re
-import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import get_args
 
 import click
 import pytest
-from cutting_proxy import cutting_proxy
 from fake_results import COMPARISON, IMPORTANCE
 from fake_sweeps import RunCommand
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
 from sweep_folders import make_sweep_folder
 from test_service_downloads import FILM, PAGE, make_finished
 
-from tune_jobs.cli import remote_runs
 from tune_jobs.cli.commands import cli
+from tune_jobs.cli.remote import FILMS
 from tune_jobs.cli.server import THERE
 from tune_jobs.client import Client, event_stream
+from tune_jobs.client.answers import FileOfSweep
+from tune_jobs.service.http.download_routes import Film
 from tune_jobs.service.views import SweepView
 from tune_jobs.store.sweep_store import SweepStore
-
-# ruff: noqa: F811 - fixtures are named as arguments
 
 YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\nconfirm: none\n"
 
@@ -156,6 +154,22 @@ def test_report_and_films_are_downloaded(run: RunCommand, site: Live, tmp_path: 
         assert run("--server", site.url, *words.split()).exit_code == code
 
 
+def test_films_of_other_names_are_not_downloaded(
+    run: RunCommand, site: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = Client.files
+
+    def more(client: Client, name: str) -> list[FileOfSweep]:
+        odd = {"num_bytes": 1, "modified_at": 0.0, "media_type": "video/mp4"}
+        names = ("films/../../../out", "films/after_mp4/../../../../x_mp4", "films//etc/x_mp4")
+        return [*(FileOfSweep(path=path, **odd) for path in names), *files(client, name)]
+
+    monkeypatch.setattr(Client, "files", more)
+    printed = json.loads(run("--server", site.url, "video", "mine", "--json").stdout)
+    assert tuple(printed) == get_args(Film) == FILMS
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(printed.values())
+
+
 def test_a_sweep_is_downloaded_as_one_file(run: RunCommand, site: Live, tmp_path: Path) -> None:
     here = run("export", "mine", "--format", "sweep", "--out", "here", "--storage", site.storage)
     there = run("--server", site.url, "export", "mine", "--format", "sweep", "--out", "there")
@@ -239,158 +253,3 @@ def test_a_token_comes_from_the_environment_or_a_file(
         monkeypatch.setenv("TUNE_JOBS_TOKEN", "wrong")
         (tmp_path / "token").write_text(secret)
         assert run("--token-file", "token", *asked).exit_code == 0
-
-
-# -- runs that are followed
-
-
-class Queue:
-    """Does what the processes of a service do, while a command follows."""
-
-    def __init__(self, live: Live) -> None:
-        self.live = live
-        self.jobs = live.service.queue
-
-    def wait_for_job(self) -> int:
-        wait_until(lambda: self.jobs.jobs("waiting"))
-        return self.jobs.jobs("waiting")[0].id
-
-    def watched(self) -> None:
-        wait_until(lambda: self.live.service.watching.num_watchers > 0)
-
-    def finish(
-        self, name: str, outcome: Any = "completed", message: str | None = None, until: Any = lambda: True
-    ) -> None:
-        number = self.wait_for_job()
-        self.watched()
-        assert self.jobs.claim(8.0) is not None
-        wait_until(until)
-        store = SweepStore(self.live.storage / name)
-        if outcome == "completed" and not store.has_best():
-            record = store.read_record()
-            store.write_record(record.model_copy(update={"state": "completed"}))
-        self.jobs.end(number, outcome, message)
-
-
-def during(what: Any) -> threading.Thread:
-    thread = threading.Thread(target=what, daemon=True)
-    thread.start()
-    return thread
-
-
-def test_a_launch_is_followed_to_its_end(
-    run: RunCommand, live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(remote_runs, "_LINE_INTERVAL_S", 0.0)
-    (tmp_path / "poles.yaml").write_text(YAML)
-    queue = Queue(live)
-    said: list[str] = []
-    follow = remote_runs._followed
-
-    def followed(client: Any, job: Any, say: Any) -> Any:
-        def say_both(line: str) -> None:
-            said.append(line)
-            say(line)
-
-        return follow(client, job, say_both)
-
-    monkeypatch.setattr(remote_runs, "_followed", followed)
-    worker = during(lambda: queue.finish("poles", message="It can't be drawn.", until=lambda: "poles: runs" in said))
-    result = run("--server", live.url, "launch", "poles.yaml", "--set", "num_samples=2")
-    worker.join(30)
-    assert result.exit_code == 3, result.output
-    lines = result.stderr.splitlines()
-    assert lines[0] == "poles: waits for its turn"
-    assert "poles: runs" in lines
-    assert said == lines
-    assert "0 %, 0 env steps" in lines[-1]
-    assert "no best policy: It can't be drawn." in result.stdout
-    assert f"{live.url}/#/sweeps/poles" in result.stdout
-    assert live.service.storage.sweep("poles").read_record().spec["num_samples"] == 2
-
-
-def test_a_resumed_sweep_ends_with_the_result_of_one_that_runs_here(run: RunCommand, live: Live) -> None:
-    make_finished(live.storage / "mine")
-    worker = during(lambda: Queue(live).finish("mine"))
-    result = run("--server", live.url, "resume", "mine", "--json", "--progress", "none")
-    worker.join(30)
-    assert result.exit_code == 0, result.output
-    assert result.stderr == ""
-    document = json.loads(result.stdout)
-    assert document.keys() == {
-        "folder", "sweep", "trials", "best", "why_no_best", "artifacts", "interrupted", "notes", "finish_failed",
-        "exit_code",
-    }  # fmt: skip
-    assert document["best"]["checkpoint"]["trial_id"] == "t0003"
-    assert document["artifacts"]["report"] == f"{live.url}/api/v1/sweeps/mine/report/"
-    assert live.get("/sweeps/mine/films/after_gif").status_code == 200
-    assert document["artifacts"].keys() == {
-        "policy", "before_mp4", "after_mp4", "after_gif", "before_after_mp4", "report",
-    }  # fmt: skip
-
-
-def test_what_stops_a_sweep_there_ends_its_command_here(run: RunCommand, live: Live) -> None:
-    make_sweep_folder(live.storage / "mine")
-    queue = Queue(live)
-    worker = during(lambda: queue.finish("mine", "stopped"))
-    result = run("--server", live.url, "extend", "mine", "--num-samples", "2")
-    worker.join(30)
-    assert result.exit_code == 130
-    assert result.stderr.splitlines()[-1].endswith(f"tune-jobs --server {live.url} resume mine")
-    worker = during(lambda: queue.finish("mine", "failed", "ValueError: no CPU is left"))
-    result = run("--server", live.url, "replicate", "mine", "--json")
-    worker.join(30)
-    assert result.exit_code == 1
-    assert "no CPU is left" in json.loads(result.stdout)["error"]
-
-
-def test_failed_trials_are_retried_if_there_are_any(run: RunCommand, live: Live) -> None:
-    store = make_sweep_folder(live.storage / "mine")
-    queue = Queue(live)
-    for status, verb in (("completed", "drive"), ("failed", "retry")):
-        trial = store.trial("t0000")
-        trial.write_record(trial.read_record().model_copy(update={"status": status, "error": "it broke"}))
-        # A sweep whose record is the same has not changed, for a service.
-        store.write_record(store.read_record())
-        worker = during(lambda: queue.finish("mine"))
-        result = run("--server", live.url, "resume", "mine", "--retry-failed")
-        worker.join(30)
-        assert result.exit_code == 3, result.output
-        assert live.service.queue.jobs()[-1].verb == verb
-
-
-def test_ctrl_c_stops_following_and_not_the_sweep(
-    run: RunCommand, live: Live, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "poles.yaml").write_text(YAML)
-
-    def interrupted(*_: Any) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(remote_runs, "_followed", interrupted)
-    result = run("--server", live.url, "launch", "poles.yaml", "--json")
-    assert result.exit_code == 130
-    assert f"Stop it with: tune-jobs --server {live.url} stop poles" in result.stderr
-    assert json.loads(result.stdout)["exit_code"] == 130
-    assert [job.state for job in live.service.queue.jobs()] == ["waiting"]
-    assert "stops after" in run("--server", live.url, "stop", "poles").stdout
-    assert "not running" in run("--server", live.url, "stop", "poles").stdout
-
-
-def test_following_goes_on_where_the_connection_was_lost(run: RunCommand, live: Live) -> None:
-    make_sweep_folder(live.storage / "mine")
-    with cutting_proxy(live.url) as proxy:
-        queue = Queue(live)
-
-        def work() -> None:
-            queue.wait_for_job()
-            queue.watched()
-            proxy.cut_all()
-            queue.finish("mine")
-
-        worker = during(work)
-        result = run("--server", proxy.url, "resume", "mine")
-        worker.join(30)
-        assert result.exit_code == 3, result.output
-        assert result.stderr.startswith("mine: waits for its turn\n")
-        assert len([request for request in proxy.requests if b"/events " in request]) <= 2

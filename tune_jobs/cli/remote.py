@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sweep_spec import SweepSpec
     from tune_jobs.sweeps.status import SweepStatus
 
+FILMS = ("before_mp4", "after_mp4", "after_gif", "before_after_mp4")
 _FILMS, _ONE_FILE = "films/", ".tunejobs"
 
 
@@ -85,7 +86,9 @@ class RemoteVerbs:
             raise SpecError(
                 f"A service has films of sweeps' best policies; {source!r} is no sweep.", "Name a sweep, by its name."
             )
-        known = [file.path.removeprefix(_FILMS) for file in self._client.files(source) if file.path.startswith(_FILMS)]
+        there = {file.path for file in self._client.files(source)}
+        # Only names that are known here: others might lead out of the folder.
+        known = [film for film in FILMS if _FILMS + film in there]
         if output is None or _is_folder(output):
             wanted = {film: Path(output or ".") / f"{source}-{'.'.join(film.rsplit('_', 1))}" for film in known}
             names = {film: film for film in known}

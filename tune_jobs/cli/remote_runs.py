@@ -92,7 +92,11 @@ def _done(  # noqa: PLR0917 (all of them are one request)
             f"Sweep {job.sweep} failed at {client.url}: {job.message or 'nothing is known of why'}",
             f"Continue with: {server.program} resume {name}",
         )
-    return _result(client, job)
+    try:
+        return _result(client, job)
+    except KeyboardInterrupt:
+        message = f"Sweep {job.sweep} has ended at {client.url}: {job.outcome}."
+        return _Left(message, f"See what came of it: {server.program} status {name}")
 
 
 def _say_left(left: _Left, *, as_json: bool) -> int:
