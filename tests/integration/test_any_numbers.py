@@ -91,7 +91,7 @@ def test_everything_is_shown_and_json_is_json(
 
 def test_the_running_sweep_is_shown_and_written_for_tensorboard(made: Synthetic, tmp_path: Path) -> None:
     running = [trial.model_copy(update={"status": "running"}) for trial in made.trials]
-    monitor = SweepMonitor("mine", running, caps={trial.trial_id: 100_000 for trial in running}, max_concurrent=2)
+    monitor = SweepMonitor("mine", running, caps={trial.trial_id: 100_000 for trial in running})
     monitor.update(made.trials[0])
     assert "1 completed" in summary_line(monitor)
     writer = ScalarWriter(SweepStore(tmp_path))

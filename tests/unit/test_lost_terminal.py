@@ -14,7 +14,7 @@ from pathlib import Path
 from tune_jobs.sweeps.live_view import shown
 from tune_jobs.sweeps.monitor import SweepMonitor
 
-monitor = SweepMonitor("mine", [], caps={}, max_concurrent=1)
+monitor = SweepMonitor("mine", [], caps={})
 with shown(monitor, "auto", Path(sys.argv[1])):
     os.write(1, b"what a library says")
     sys.stdin.read()

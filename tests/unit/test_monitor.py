@@ -2,9 +2,12 @@
 
 import pytest
 from fake_engine import FakeClock
+from rich.console import Console
 
 from analysis.records import CheckpointRecord, TrialRecord
 from tests.narrowing import present
+from tune_jobs.sweeps.forecast import forecast
+from tune_jobs.sweeps.live_table import render, summary_line
 from tune_jobs.sweeps.monitor import SweepMonitor
 
 
@@ -36,14 +39,11 @@ def make_trial(
     )
 
 
-def make_monitor(
-    *records: TrialRecord, clock: FakeClock | None = None, cap: int = 1_000, max_concurrent: int = 2
-) -> SweepMonitor:
+def make_monitor(*records: TrialRecord, clock: FakeClock | None = None, cap: int = 1_000) -> SweepMonitor:
     return SweepMonitor(
         "mine",
         records,
         caps=dict.fromkeys([record.trial_id for record in records], cap),
-        max_concurrent=max_concurrent,
         clock=clock or FakeClock(),
     )
 
@@ -88,19 +88,19 @@ def test_the_best_so_far_is_chosen_by_the_rule_that_will_choose_the_winner() -> 
 def test_the_rate_is_of_the_last_seconds() -> None:
     clock = FakeClock()
     monitor = make_monitor(make_trial(0), clock=clock, cap=1_000_000)
-    assert monitor.estimate().env_steps_per_s is None
+    assert monitor.env_steps_per_s() is None
     for second in range(1, 11):
         clock.now += 1.0
         monitor.update(make_trial(0, "running", steps=200 * second))
-    assert monitor.estimate().env_steps_per_s == pytest.approx(200)
+    assert monitor.env_steps_per_s() == pytest.approx(200)
     # Then it gets faster, and half a minute later that is all that counts.
     for second in range(1, 31):
         clock.now += 1.0
         monitor.update(make_trial(0, "running", steps=2_000 + 1_000 * second))
-    assert monitor.estimate().env_steps_per_s == pytest.approx(1_000)
+    assert monitor.env_steps_per_s() == pytest.approx(1_000)
     # Nothing more comes: the rate falls.
     clock.now += 60.0
-    assert present(monitor.estimate().env_steps_per_s) < 400
+    assert present(monitor.env_steps_per_s()) < 400
 
 
 def test_the_start_of_ray_is_no_part_of_the_rate() -> None:
@@ -111,7 +111,7 @@ def test_the_start_of_ray_is_no_part_of_the_rate() -> None:
         monitor.update(make_trial(0, "running"))
     clock.now += 1.0
     monitor.update(make_trial(0, "running", steps=500))
-    assert monitor.estimate().env_steps_per_s == pytest.approx(500)
+    assert monitor.env_steps_per_s() == pytest.approx(500)
 
 
 def test_steps_of_an_earlier_run_are_no_part_of_the_rate() -> None:
@@ -119,55 +119,26 @@ def test_steps_of_an_earlier_run_are_no_part_of_the_rate() -> None:
     monitor = make_monitor(make_trial(0, "paused", steps=50_000), clock=clock, cap=1_000_000)
     clock.now += 1.0
     monitor.update(make_trial(0, "running", steps=50_300))
-    assert monitor.estimate().env_steps_per_s == pytest.approx(300)
+    assert monitor.env_steps_per_s() == pytest.approx(300)
     assert monitor.num_env_steps == 50_300
 
 
-def test_time_left_is_what_ended_trials_took() -> None:
-    """Two at once; those that ended took 10 s each. 4 s of one are done, four have not begun."""
-    clock = FakeClock()
-    monitor = make_monitor(*(make_trial(index) for index in range(7)), clock=clock)
-    clock.now += 10.0
-    monitor.update(make_trial(0, "completed", steps=1_000, time_s=8.0))
-    monitor.update(make_trial(1, "completed", steps=400, time_s=12.0))
-    monitor.update(make_trial(2, "running", steps=10, time_s=4.0))
-    assert monitor.estimate().time_left_s == pytest.approx((6.0 + 4 * 10.0) / 2)
-    # One that runs longer than the others took is about to end, and is no time won.
-    monitor.update(make_trial(2, "running", steps=10, time_s=30.0))
-    assert monitor.estimate().time_left_s == pytest.approx(4 * 10.0 / 2)
-
-
-def test_the_last_trials_run_side_by_side_only_as_far_as_there_are_any() -> None:
-    monitor = make_monitor(*(make_trial(index) for index in range(2)), max_concurrent=8)
-    monitor.update(make_trial(0, "completed", steps=1_000, time_s=10.0))
-    monitor.update(make_trial(1, "running", steps=10, time_s=4.0))
-    assert monitor.estimate().time_left_s == pytest.approx(6.0)
-
-
-def test_before_a_trial_has_ended_time_left_is_what_the_caps_allow() -> None:
-    clock = FakeClock()
-    monitor = make_monitor(*(make_trial(index) for index in range(3)), clock=clock)
-    assert monitor.estimate().time_left_s is None
-    clock.now += 1.0
-    monitor.update(make_trial(0, "running", steps=100))
-    clock.now += 1.0
-    monitor.update(make_trial(0, "running", steps=200))
-    rate = present(monitor.estimate().env_steps_per_s)
-    assert rate == pytest.approx(100)
-    assert monitor.estimate().time_left_s == pytest.approx((800 + 1_000 + 1_000) / rate)
-
-
-def test_trials_that_failed_or_ended_before_tell_nothing_of_the_time() -> None:
-    """A trial that was ended early, or in an earlier run on another machine, is not how long a trial takes."""
-    monitor = make_monitor(make_trial(0, "completed", steps=1_000, time_s=500.0), make_trial(1), make_trial(2))
-    monitor.update(make_trial(1, "failed", steps=10, time_s=1.0))
-    assert monitor.estimate().time_left_s is None
-
-
-def test_a_sweep_that_is_done_has_no_time_left() -> None:
-    monitor = make_monitor(make_trial(0))
-    monitor.update(make_trial(0, "stopped", steps=10, time_s=1.0))
-    assert monitor.estimate().time_left_s == 0.0
+def test_the_time_left_is_the_one_that_status_tells() -> None:
+    """Of an earlier run the table's own clock knows nothing; the records do."""
+    trials = [
+        make_trial(0, "completed", steps=400, time_s=40.0),
+        make_trial(1, "running", steps=300, time_s=30.0),
+        make_trial(2),
+    ]
+    monitor = make_monitor(*trials)
+    seen = forecast(trials, {trial.trial_id: 1_000 for trial in trials})
+    assert seen.time_left_s == pytest.approx((100 + 400) / 10)
+    assert monitor.progress() == seen
+    console = Console(width=120)
+    with console.capture() as captured:
+        console.print(render(monitor))
+    assert "left: about 50 s" in captured.get()
+    assert "about 50 s left" in summary_line(monitor)
 
 
 def test_elapsed_time_is_the_clocks() -> None:

@@ -194,9 +194,9 @@ def run_trials_of(
         spec, trials = stored_spec(record), store.read_trials()
         caps = caps_of(spec, trials)
         if shared.monitor is None:
-            shared.monitor = SweepMonitor(store.name, trials, caps=caps, max_concurrent=plan.max_concurrent)
+            shared.monitor = SweepMonitor(store.name, trials, caps=caps)
         else:
-            shared.monitor.begin_stage(told, trials, caps, plan.max_concurrent)
+            shared.monitor.begin_stage(told, trials, caps)
         try:
             _run_trials(store, plan, todo, shared, run, address=address, machine=machine, progress=progress)
         finally:

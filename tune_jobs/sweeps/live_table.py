@@ -82,7 +82,7 @@ def _head(monitor: SweepMonitor, width: int) -> RenderableType:
 
 
 def _facts(monitor: SweepMonitor) -> RenderableType:
-    estimate = monitor.estimate()
+    speed = monitor.env_steps_per_s()
     progress = monitor.progress()
     grid = Table.grid(padding=(0, 2))
     counts = monitor.counts()
@@ -91,7 +91,7 @@ def _facts(monitor: SweepMonitor) -> RenderableType:
     steps = f"{progress.num_env_steps:,}"
     if progress.num_env_steps < progress.max_env_steps:
         steps += f" of at most {progress.max_env_steps:,}"
-    rate = "" if estimate.env_steps_per_s is None else f"   {estimate.env_steps_per_s:,.0f} a second"
+    rate = "" if speed is None else f"   {speed:,.0f} a second"
     grid.add_row("env steps", f"{steps}{rate}")
     time = Text(duration(monitor.elapsed_s, tenths=False))
     if monitor.phase:
@@ -106,7 +106,7 @@ def _facts(monitor: SweepMonitor) -> RenderableType:
 def _time_left(monitor: SweepMonitor) -> str:
     if monitor.stopping or all(record.status in FINISHED for record in list(monitor.records.values())):
         return ""
-    seconds = monitor.estimate().time_left_s
+    seconds = monitor.progress().time_left_s
     if seconds is None:
         return "   left: not known yet"
     return f"   left: about {duration(seconds, tenths=False, none=PLAIN_NONE)}"
@@ -192,7 +192,7 @@ def summary_line(monitor: SweepMonitor) -> str:
     best = monitor.best()
     if best is not None:
         words.append(f"best {return_text(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial, 60)})")
-    seconds = monitor.estimate().time_left_s
+    seconds = progress.time_left_s
     if seconds:
         words.append(f"about {duration(seconds, tenths=False, none=PLAIN_NONE)} left")
     return "; ".join(words)

@@ -7,19 +7,11 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from analysis.records import FINISHED, TrialRecord, TrialStatus
+from analysis.records import TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, Selection, select_best
 from tune_jobs.sweeps.forecast import Forecast, forecast
 
 _RATE_WINDOW_S = 20.0
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """The speed of a sweep and the time that is left."""
-
-    env_steps_per_s: float | None
-    time_left_s: float | None
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,6 @@ class SweepMonitor:
         name: The sweep's name.
         records: Its trials at the start.
         caps: The env steps after which each trial ends at the latest, by its id.
-        max_concurrent: How many trials run at once.
         clock: A monotonic clock, in seconds.
     """
 
@@ -49,12 +40,10 @@ class SweepMonitor:
         records: Iterable[TrialRecord],
         *,
         caps: Mapping[str, int],
-        max_concurrent: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = name
         self.records: dict[str, TrialRecord] = {record.trial_id: record for record in records}
-        self.max_concurrent = max_concurrent
         self.stopping = False
         self.stage = ""
         self.phase = ""
@@ -62,26 +51,21 @@ class SweepMonitor:
         self._caps = caps
         self._clock = clock
         self._start = clock()
-        self._finished_before = {r.trial_id for r in self.records.values() if r.status in FINISHED}
         self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
         self._history: deque[tuple[float, int]] = deque([(self._start, self._num_env_steps)])
         self._selection: Selection | None = None
         # It needs all records; with a thousand trials, that takes too long to do at every report.
         self._selection_is_old = True
 
-    def begin_stage(
-        self, told: str, records: Iterable[TrialRecord], caps: Mapping[str, int], max_concurrent: int
-    ) -> None:
+    def begin_stage(self, told: str, records: Iterable[TrialRecord], caps: Mapping[str, int]) -> None:
         """Take the trials of a further stage of the same run.
 
         Args:
             told: What they are for; it is shown behind the sweep's name.
             records: All trials of the sweep.
             caps: As for a new monitor.
-            max_concurrent: As for a new monitor.
         """
         self.stage = told
-        self.max_concurrent = max_concurrent
         # The caps come first: a table that is drawn meanwhile asks for that of each record.
         self._caps = caps
         self.records = {record.trial_id: record for record in records}
@@ -104,7 +88,7 @@ class SweepMonitor:
         return self._num_env_steps
 
     def progress(self) -> Forecast:
-        """Return how far the trials are, in env steps."""
+        """Return how far the trials are, in env steps, and how long the others take: what `status` tells, too."""
         return forecast(list(self.records.values()), self._caps)
 
     def update(self, record: TrialRecord) -> None:
@@ -171,23 +155,8 @@ class SweepMonitor:
             for scored in point.trial_scores
         ]
 
-    def estimate(self) -> Estimate:
-        """Return the rate over the last seconds, and the time left if other trials take as long as those that ended."""
-        now = self._clock()
+    def env_steps_per_s(self) -> float | None:
+        """Return the env steps of all trials a second, over the last seconds; None: there were none."""
         first_time, first_steps = self._history[0]
-        span = now - first_time
-        rate = (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
-        records = list(self.records.values())
-        left = [record for record in records if record.status not in FINISHED]
-        ended = [r for r in records if r.status == "completed" and r.trial_id not in self._finished_before]
-        if not left:
-            return Estimate(rate, 0.0)
-        if ended:
-            seconds = sum(record.time_s for record in ended) / len(ended)
-            work = sum(max(0.0, seconds - record.time_s) for record in left)
-            return Estimate(rate, work / max(1, min(self.max_concurrent, len(left))))
-        if rate:
-            return Estimate(
-                rate, sum(max(0, self._caps[record.trial_id] - record.num_env_steps) for record in left) / rate
-            )
-        return Estimate(rate, None)
+        span = self._clock() - first_time
+        return (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
