@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
-from policies.errors import NotFoundError, TuneJobsError
+from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.sweeps.status import SweepStatus, status_of
@@ -148,9 +148,15 @@ def _read(sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Trials | N
     records, scores = [], {}
     for trial_id, stamp in stamps.items():
         if known is not None and known.stamps.get(trial_id) == stamp:
+            if trial_id not in before:
+                continue  # it was damaged, and still is
             record, scores[trial_id] = before[trial_id], known.scores[trial_id]
         else:
-            record = sweep.trial(trial_id).read_record()
+            try:
+                record = sweep.trial(trial_id).read_record()
+            except CheckpointError as error:
+                leave_out(error)
+                continue
             scored = score_trial(record)
             scores[trial_id] = None if scored is None else scored.score
         records.append(record)

@@ -21,20 +21,37 @@ from tune_jobs.store.results_file import Scored
 _LOG = logging.getLogger(__name__)
 
 
+def readable_trials(store: Sweep) -> list[TrialRecord]:
+    """Read the records of all trials, by index; a warning names each that is damaged, and the others are returned.
+
+    This is for those that only look: `Sweep.read_trials` refuses the sweep, so that none is trained or chosen then.
+
+    Raises:
+        CheckpointError: The trials cannot be listed.
+    """
+    records = []
+    for trial_id in store.trial_stamps():
+        try:
+            records.append(store.trial(trial_id).read_record())
+        except CheckpointError as error:
+            leave_out(error)
+    return sorted(records, key=lambda record: record.index)
+
+
 def read_trials(store: Sweep) -> list[TrialRecord]:
-    """Read the trials, by index, with those checkpoints on disk that may be chosen.
+    """Read the trials, by index, with those checkpoints on disk that may be chosen; see `readable_trials`.
 
     The checkpoints in the records are not used, because those of a killed driver may be older than what is on disk.
 
     Raises:
-        CheckpointError: The record of the sweep or of a trial is damaged.
+        CheckpointError: The record of the sweep is damaged.
     """
     sweep = store.read_record()
     records = [
         record.model_copy(
             update={**_place_of(record, sweep), "checkpoints": tuple(candidates(store.trial(record.trial_id)))}
         )
-        for record in store.read_trials()
+        for record in readable_trials(store)
     ]
     return sorted(records, key=lambda record: record.index)
 
@@ -42,7 +59,7 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
 def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
     """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
     found = {}
-    for record in store.read_trials():
+    for record in readable_trials(store):
         try:
             found[record.trial_id] = store.trial(record.trial_id).read_iterations()
         except CheckpointError as error:

@@ -67,6 +67,8 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
         EnvError: The environment raised an error, hung, or ended its process.
     """
     sweep = _trusted(store).read_record()
+    # Of a sweep with a damaged trial nothing is chosen anew: the trial may be the one that would win.
+    store.read_trials()
     spec = stored_spec(sweep)
     trials = read_trials(store)
     chosen = choose_policy(store, spec, trials)
@@ -353,7 +355,7 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
     if why_no_best is None:
         try:
             best = _known_best(store)
-        except (EnvError, NoUsableTrialError) as error:
+        except (EnvError, NoUsableTrialError, CheckpointError) as error:
             why_no_best = error
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None

@@ -168,8 +168,10 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
 
 
 def _status(store: Sweep) -> SweepStatus:
+    from tune_jobs.store.candidates import readable_trials
+
     record = store.read_record()
-    return status_of(store, record, store.read_trials())
+    return status_of(store, record, readable_trials(store))
 
 
 def status_of(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> SweepStatus:

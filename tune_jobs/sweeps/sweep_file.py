@@ -18,6 +18,7 @@ from analysis.importance import what_mattered
 from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord
 from analysis.selection import score_trial
 from policies.errors import NotFoundError, SpecError
+from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.curves import Columns, Curve
 from tune_jobs.sweeps.gathered import sweep_data
@@ -60,7 +61,7 @@ def sweep_file(store: Sweep) -> bytes:
 def _document(store: Sweep) -> dict[str, Any]:
     data, record = sweep_data(store), store.read_record()
     # As status and page have them.
-    trials = sorted(store.read_trials(), key=lambda trial: trial.index)
+    trials = sorted(readable_trials(store), key=lambda trial: trial.index)
     status = status_of(store, record, trials)
     mattered = what_mattered(record, data.trials, data.results, threshold=data.threshold)
     return {
