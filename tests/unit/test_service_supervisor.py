@@ -21,7 +21,7 @@ from synthetic_sweep import make_sweep_record
 from tests.narrowing import present
 from tune_jobs.service import supervisor as module
 from tune_jobs.service.database.opening import open_database, sqlite_url
-from tune_jobs.service.job_files import KEPT_S, SERVICE_FOLDER, Holder, JobFiles
+from tune_jobs.service.job_files import KEPT_S, SERVICE_FOLDER, Ended, Holder, JobFiles
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
@@ -147,6 +147,22 @@ def test_a_sweep_that_ends_its_process_again_and_again_fails(place: Place, servi
     assert job.message is not None
     assert job.message.startswith(f"The process that ran the sweep died {module.MAX_ATTEMPTS} times.")
     assert len(place.begins("a")) == module.MAX_ATTEMPTS
+
+
+def test_a_service_that_was_drained_often_leaves_a_sweep_as_many_deaths_as_before(place: Place) -> None:
+    job = place.submit("a", seconds=0.5)
+    for _ in range(module.MAX_ATTEMPTS):
+        job = present(place.queue.claim(2.0))
+        place.queue.give_back(job.id)
+    files = JobFiles(place.service_folder, job.uid)
+    os.close(present(files.take()))
+    files.write_ended(Ended(attempt=job.num_attempts, outcome="interrupted"))
+    service = place.new_service()
+    service.start()
+    os.kill(place.until_it_runs(job), signal.SIGKILL)
+    (job,) = place.until_all_end()
+    service.close()
+    assert (job.outcome, job.num_attempts) == ("completed", module.MAX_ATTEMPTS + 2)
 
 
 def test_a_driver_that_a_signal_ends_is_no_end_of_its_sweep(place: Place, service: Supervisor) -> None:

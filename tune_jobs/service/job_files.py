@@ -158,11 +158,22 @@ class JobFiles:
 
     def read_ended(self, attempt: int) -> Ended | None:
         """Return how an attempt ended; None: it has not, or its process died before it could say."""
+        ended = self._last_ended()
+        return ended if ended is not None and ended.attempt == attempt else None
+
+    def num_deaths(self, num_attempts: int) -> int:
+        """Return how many processes died one after the other, the last of so many attempts among them.
+
+        An attempt that ended in order, as when the service was drained, is none, and those before it are over.
+        """
+        ended = self._last_ended()
+        return num_attempts - (0 if ended is None else ended.attempt)
+
+    def _last_ended(self) -> Ended | None:
         try:
-            ended = Ended.model_validate_json(self._ended.read_bytes())
+            return Ended.model_validate_json(self._ended.read_bytes())
         except (OSError, ValidationError):
             return None
-        return ended if ended.attempt == attempt else None
 
     def last_lines(self, count: int = 20) -> str:
         """Return the end of what the driver printed."""

@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 
 TICK_S = 0.25
 MAX_ATTEMPTS = 5
-"""How many driver processes may die of one job before it counts as failed."""
+"""How many driver processes of one job may die, one after the other, before it counts as failed."""
 _LOOKING = "The queue can't be looked at"
 
 
@@ -241,12 +241,13 @@ class Supervisor:
 
     def _died(self, job: Job, files: JobFiles) -> None:
         """Let another driver go on, after a while, or give up."""
-        if job.num_attempts >= MAX_ATTEMPTS:
+        num_deaths = files.num_deaths(job.num_attempts)
+        if num_deaths >= MAX_ATTEMPTS:
             self._on_death()
             said = files.last_lines()
-            message = f"The process that ran the sweep died {job.num_attempts} times." + (f"\n{said}" if said else "")
+            message = f"The process that ran the sweep died {num_deaths} times." + (f"\n{said}" if said else "")
             self._finish(job, "failed", message)
-        elif self._retry_at.setdefault(job.id, time.monotonic() + _wait_s(job.num_attempts)) <= time.monotonic():
+        elif self._retry_at.setdefault(job.id, time.monotonic() + _wait_s(num_deaths)) <= time.monotonic():
             del self._retry_at[job.id]
             self._on_death()
             _log.warning(
@@ -355,6 +356,6 @@ class Supervisor:
         return self._storage.sweep(name)
 
 
-def _wait_s(num_attempts: int) -> float:
+def _wait_s(num_deaths: int) -> float:
     """Return how long to wait before the next attempt: what killed the last one may still be there."""
-    return min(30.0, 0.5 * 2.0 ** (num_attempts - 1))
+    return min(30.0, 0.5 * 2.0 ** (num_deaths - 1))
