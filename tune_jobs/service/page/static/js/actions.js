@@ -53,7 +53,10 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
             hint: "Random draws for each combination of the grids.",
           },
         ],
-        act: (values) => post("extend", values),
+        act: async (values) => {
+          await post("extend", values);
+          toast(`${name()}: the new points are trained when their turn has come.`);
+        },
       }),
     inject: () =>
       inDialog(
@@ -92,7 +95,10 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
             hint: "How many more seeds a setting gets at most.",
           },
         ],
-        act: (values) => post("replicate", values),
+        act: async (values) => {
+          await post("replicate", values);
+          toast(`${name()}: the leaders are trained again when their turn has come.`);
+        },
       }),
     edit: () => {
       const { note, tags, job } = state();

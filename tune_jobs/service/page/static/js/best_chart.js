@@ -38,7 +38,7 @@ export class BestChart extends Chart {
   }
 
   paint(context, places) {
-    this.paintGoal(context, places);
+    this.paintGoal(context, places, true);
     if (!this.line) return;
     paintStrong(context, places, this.line, false);
     for (const step of this.steps) paintDot(context, places, step.spent, step.best, 2.5);

@@ -91,7 +91,8 @@ export class Chart {
     this.plot.setRange({ x: [0, right || 1], y: withAir(low, high) });
   }
 
-  paintGoal(context, places) {
+  // Its name is on the left, where learning curves are still low; lines of the best rise there: it is on their right.
+  paintGoal(context, places, isStepped = false) {
     if (this.goal === null) return;
     context.strokeStyle = colour("accent");
     context.lineWidth = places.ratio;
@@ -102,15 +103,17 @@ export class Chart {
     context.stroke();
     context.setLineDash([]);
     // Below it, where it would leave the plot; with a rim, as lines go through it.
-    const isHigh = places.y(this.goal) - places.top < 18 * places.ratio;
+    const isHigh = isStepped || places.y(this.goal) - places.top < 18 * places.ratio;
     context.font = `${12 * places.ratio}px ${FONT_FAMILY}`;
-    context.textAlign = "left";
+    context.textAlign = isStepped ? "right" : "left";
     context.textBaseline = isHigh ? "top" : "bottom";
     context.lineWidth = 4 * places.ratio;
     context.strokeStyle = colour("card");
     context.fillStyle = colour("accent");
     const text = `goal ${returnText(this.goal)}`;
-    const place = [places.left + 6 * places.ratio, places.y(this.goal) + (isHigh ? 4 : -3) * places.ratio];
+    const inset = 6 * places.ratio;
+    const left = isStepped ? places.left + places.width - inset : places.left + inset;
+    const place = [left, places.y(this.goal) + (isHigh ? 4 : -3) * places.ratio];
     context.strokeText(text, ...place);
     context.fillText(text, ...place);
   }

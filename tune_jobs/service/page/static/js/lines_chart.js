@@ -24,7 +24,7 @@ export class LinesChart extends Chart {
 
   paint(context, places) {
     const { near } = this;
-    this.paintGoal(context, places);
+    this.paintGoal(context, places, Boolean(this.lines?.[0]?.isStepped));
     // The first lies over the others.
     for (const line of this.lines?.toReversed() ?? [])
       paintStrong(context, places, line, near !== null && near !== line.key);

@@ -37,7 +37,8 @@ export class Plot {
         width: Math.max(50, box.clientWidth),
         height,
         legend: { show: false },
-        padding: [10, 12, 0, 0],
+        // Half a label of the last tick is beside the plot.
+        padding: [10, 20, 0, 0],
         scales: { x: { time: false, auto: false, range }, y: { auto: false, range } },
         axes: [
           {
