@@ -119,6 +119,8 @@ class _Play(StreamingResponse):
 @router.get(
     "/play",
     response_class=_Play,
+    # FastAPI would look for it in the arguments of the class.
+    status_code=200,
     responses=problems({429: "As many episodes are played as may, or too many wrong tokens came from this address."}),
 )
 async def play(
