@@ -109,6 +109,23 @@ def test_after_a_lost_connection_what_came_meanwhile_comes_once(live: Live) -> N
         listener.thread.join(20)
 
 
+def test_connections_that_end_in_quiet_are_no_absence(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Proxies end streams after a while, however long a sweep waits for its turn; each time the service was there."""
+    monkeypatch.setattr("tune_jobs.service.http.event_stream.HEARTBEAT_S", 0.05)
+    make_sweep_folder(live.storage / "done")
+    with Client(live.url) as direct, cutting_proxy(live.url) as proxy, Client(proxy.url, patience_s=1.0) as client:
+        listener = Listener(client.events("done"))
+        listener.wait_for(lambda: listener.of("status"))
+        for _ in range(6):
+            proxy.cut_all()
+            time.sleep(0.5)
+        assert listener.error is None
+        direct.change("done", note="later")
+        listener.wait_for(lambda: listener.of("status")[-1]["note"] == "later")
+        direct.delete("done")
+        listener.thread.join(20)
+
+
 def test_events_that_are_known_no_more_are_told(live: Live) -> None:
     make_sweep_folder(live.storage / "done")
     with Client(live.url) as client:

@@ -104,6 +104,8 @@ def follow(connection: Connection, path: str, *, last_id: str | None, patience_s
         try:
             for event in _connected(connection, path, parser):
                 away_since, wait_s = None, _WAIT_S
+                if event is None:
+                    continue
                 yield event
                 if event.kind == "deleted" and path != "/api/v1/events":
                     return
@@ -122,7 +124,8 @@ def follow(connection: Connection, path: str, *, last_id: str | None, patience_s
         wait_s = min(_MOST_WAIT_S, 2 * wait_s)
 
 
-def _connected(connection: Connection, path: str, parser: Parser) -> Iterator[Event]:
+def _connected(connection: Connection, path: str, parser: Parser) -> Iterator[Event | None]:
+    """Give the events of one connection, and None for whatever else shows that the service is there."""
     headers = {"Accept": _EVENT_STREAM, "Cache-Control": "no-store"}
     if parser.last_id:
         headers["Last-Event-ID"] = parser.last_id
@@ -138,6 +141,7 @@ def _connected(connection: Connection, path: str, parser: Parser) -> Iterator[Ev
                 chunk = next(chunks, None)
             if chunk is None:
                 return
+            yield None
             try:
                 yield from parser.feed(chunk)
             except ValueError as error:
