@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,6 +68,7 @@ class Submitter:
 
     def __init__(self, config: ServiceConfig, queue: Queue, storage: Storage) -> None:
         self._config, self._queue, self._storage = config, queue, storage
+        self._beginning = threading.Lock()
 
     @allowed_again()
     @guarding(start=True)
@@ -81,8 +83,22 @@ class Submitter:
 
     @allowed_again()
     @guarding(start=True)
-    def submit(self, submission: Submission, *, owner: str, key: str | None = None) -> tuple[Job, bool]:
+    def submit(
+        self,
+        submission: Submission,
+        *,
+        owner: str,
+        key: str | None = None,
+        check_room: Callable[[], None] = lambda: None,
+    ) -> tuple[Job, bool]:
         """Write a sweep and let it wait; return its job, and whether it is new.
+
+        Args:
+            submission: The sweep.
+            owner: Who asks.
+            key: The idempotency key; None: the request has none.
+            check_room: Raises an error if the owner may have no further one; of a request that was repeated it is not
+                asked, as that makes none.
 
         Raises:
             SpecError: The sweep is wrong or not allowed here, its name is taken, or the key was used for another one.
@@ -92,12 +108,20 @@ class Submitter:
         keyed = None if key is None else (key, submission.digest)
         if keyed is not None and (known := self._queue.known(owner, *keyed)) is not None:
             return known, False
+        # To plan takes a while, which is spared.
+        check_room()
         spec, plan = self._planned(submission)
         name = self._free_name(submission, spec)
-        # The job comes first: a sweep whose job was never written would be begun twice where the request is repeated.
-        job, is_new = self._queue.begin(
-            name, "drive", {}, owner=owner, priority=submission.priority, key=keyed, state="creating"
-        )
+        # Of many that come at once, each sees those before it.
+        with self._beginning:
+            if keyed is not None and (known := self._queue.known(owner, *keyed)) is not None:
+                return known, False
+            check_room()
+            # The job comes first: a sweep whose job was never written would be begun twice where the request is
+            # repeated.
+            job, is_new = self._queue.begin(
+                name, "drive", {}, owner=owner, priority=submission.priority, key=keyed, state="creating"
+            )
         if not is_new:
             return job, False
         try:

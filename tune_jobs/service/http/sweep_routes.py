@@ -61,11 +61,17 @@ def submit(
     ] = None,
 ) -> Submitted:
     """Write a sweep, and let it wait for its turn."""
-    _check_room(service, caller.name)
-    job, is_new = service.submitter.submit(new.submission(), owner=caller.name, key=idempotency_key)
+    job, is_new = service.submitter.submit(
+        new.submission(),
+        owner=caller.name,
+        key=idempotency_key,
+        check_room=lambda: _check_room(service, caller.name),
+    )
     set_audit_target(request, job.sweep)
-    if is_new:
+    # The request that made it may have been killed before it could say whose the sweep is.
+    if is_new or service.labels.of(job.sweep).owner is None:
         service.labels.change(job.sweep, owner=caller.name, note=new.note, tags=new.tags)
+    if is_new:
         service.supervisor.wake()
     else:
         response.status_code = 200
