@@ -245,3 +245,10 @@ def test_the_best_so_far_rises_in_the_order_of_time() -> None:
     assert [item.spent for item in untimed.improvements] == [200, 300]
     none = best_so_far([trial(0, 10.0)], {}, evaluated=False)
     assert (none.improvements, none.spent) == ((), 0)
+
+
+def test_a_sweep_whose_process_was_killed_is_interrupted_as_in_the_list(tmp_path: Path) -> None:
+    made = [make_sweep_folder(tmp_path / name) for name in ("one", "two")]
+    made[1].write_record(made[1].read_record().model_copy(update={"state": "running"}))
+    facts = {fact.title: fact.cells for fact in module.side_by_side(made).facts}
+    assert facts["state"] == ("completed", "interrupted")

@@ -20,6 +20,7 @@ from policies import random_streams
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.spec.differences import Difference, differences
 from tune_jobs.sweeps.compare import wanted_sweep
+from tune_jobs.sweeps.status import status_of
 
 if TYPE_CHECKING:
     from tune_jobs.store.contract import Sweep
@@ -115,7 +116,7 @@ def side_by_side(stores: Sequence[Sweep]) -> SideBySide:
     )
     return SideBySide(
         comparison=comparison,
-        facts=(*_own_facts(stores, wanted), *(Fact(title, tuple(cells)) for title, cells in fact_rows(comparison))),
+        facts=(*_own_facts(stores), *(Fact(title, tuple(cells)) for title, cells in fact_rows(comparison))),
         verdicts=tuple(Verdict(verdict, tuple(lines)) for verdict, lines in pair_lines(comparison)),
         goal=thresholds.pop() if len(thresholds) == 1 else None,
         returns="evaluation" if evaluated else "training",
@@ -132,11 +133,11 @@ def side_by_side(stores: Sequence[Sweep]) -> SideBySide:
     )
 
 
-def _own_facts(stores: Sequence[Sweep], wanted: Sequence[Wanted]) -> list[Fact]:
+def _own_facts(stores: Sequence[Sweep]) -> list[Fact]:
     """Return what `compare` doesn't tell: how far each sweep is, and how its policy to deploy fares."""
     policies = tuple(_policy_text(store) for store in stores)
     return [
-        Fact("state", tuple(item.sweep.state for item in wanted)),
+        Fact("state", tuple(status_of(store, store.read_record(), ()).state for store in stores)),
         *([Fact("policy to deploy", policies)] if any(text != PLAIN_NONE for text in policies) else []),
     ]
 
