@@ -52,3 +52,17 @@ def test_the_client_has_the_number_again(live: Live, odd: SweepStore) -> None:
     best = Client(live.url).status("odd").best
     assert best is not None
     assert best.score == math.inf
+
+
+def test_trials_are_sorted_by_what_may_be_no_number(live: Live, odd: SweepStore) -> None:
+    found, cursor = [], None
+    while True:
+        query = {"sort": "time_s", "limit": "1"} | ({} if cursor is None else {"cursor": cursor})
+        page = live.get("/sweeps/odd/trials", params=query).json()
+        found += [row["trial_id"] for row in page["trials"]]
+        cursor = page["next_cursor"]
+        if cursor is None:
+            break
+    assert sorted(found) == ["t0000", "t0001", "t0002", "t0003"]
+    # What is no number comes last.
+    assert found[2:] == ["t0002", "t0001"]

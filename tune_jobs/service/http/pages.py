@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import math
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
@@ -30,7 +31,7 @@ def page_of(
     Raises:
         SpecError: The cursor is not one of this list.
     """
-    with_key = [(key(item), identity(item), item) for item in items]
+    with_key = [(_sortable(key(item)), identity(item), item) for item in items]
     known = sorted((entry for entry in with_key if entry[0] is not None), key=lambda entry: _place(entry[:2]))
     if descending:
         known.reverse()
@@ -42,6 +43,11 @@ def page_of(
     page = ordered[:limit]
     more = len(ordered) > limit
     return [entry[2] for entry in page], _encoded(page[-1][:2]) if more and page else None
+
+
+def _sortable(value: Any) -> Any:
+    # What is no number is neither before nor after any other: sorted by it, pages would leave items out.
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _is_after(entry: tuple[Any, str], last: tuple[Any, str], *, descending: bool) -> bool:
