@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from databases import database_url, postgresql  # noqa: F401 (fixtures)
 from sqlalchemy import Engine, text
+from sqlalchemy.exc import SQLAlchemyError
 
 from policies.errors import CannotRunError, NotFoundError
+from tune_jobs.service.database import opening
 from tune_jobs.service.database.opening import open_database, sqlite_url
 from tune_jobs.service.database.tables import metadata
 from tune_jobs.service.jobs import Job
@@ -301,4 +303,26 @@ def test_a_reader_is_let_in_while_another_process_writes(tmp_path: Path) -> None
     with sqlite3.connect(tmp_path / "service.db") as other:
         assert json.loads(other.execute("SELECT arguments FROM jobs").fetchone()[0]) == {}
     assert queue.job(job.id) == job
+    engine.dispose()
+
+
+def test_a_crowd_of_threads_waits_for_its_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opening, "BUSY_TIMEOUT_S", 0.5)
+    engine = open_database(sqlite_url(tmp_path / "service.db"))
+    queue, refused = Queue(engine), list[Exception]()
+
+    def submit(number: int) -> None:
+        for turn in range(10):
+            try:
+                add(queue, f"{number}-{turn}")
+            except SQLAlchemyError as error:
+                refused.append(error)
+
+    threads = [threading.Thread(target=submit, args=(number,)) for number in range(40)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert refused == []
+    assert len(queue.jobs("waiting")) == 400
     engine.dispose()

@@ -13,9 +13,10 @@ from alembic import command
 from alembic.config import Config
 from alembic.script import ScriptDirectory
 from alembic.util.exc import CommandError
-from sqlalchemy import Engine, create_engine, event, inspect, text
+from sqlalchemy import URL, Engine, create_engine, event, inspect, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from policies.errors import CannotRunError
 from tune_jobs.service.logs import Redaction
@@ -58,7 +59,10 @@ def open_database(url: str) -> Engine:
                 f"{told}: the service keeps its queue in SQLite or PostgreSQL, not in {parsed.get_backend_name()}.",
                 "Give sqlite:///FILE or postgresql://USER@HOST/NAME.",
             )
-        engine = create_engine(parsed, pool_pre_ping=True, hide_parameters=True)
+        # SQLite lets one transaction at a time write, and whoever waits for it looks now and then, and may find it
+        # taken each time: threads of this process queue for one connection instead.
+        one: dict[str, Any] = {"pool_size": 1, "max_overflow": 0, "pool_timeout": 2 * BUSY_TIMEOUT_S}
+        engine = create_engine(parsed, pool_pre_ping=True, hide_parameters=True, **(one if _is_in_file(parsed) else {}))
     except (ArgumentError, NoSuchModuleError, ValueError) as error:
         raise CannotRunError(
             f"{Redaction()(url)!r} is no database URL.", "Give sqlite:///FILE or postgresql://USER@HOST/NAME."
@@ -72,7 +76,7 @@ def open_database(url: str) -> Engine:
         event.listen(engine, "begin", _begin_at_once)
     try:
         _migrate(engine, told)
-        if parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:"):
+        if _is_in_file(parsed):
             _hold_to_file(engine, Path(str(parsed.database)))
     except SQLAlchemyError as error:
         engine.dispose()
@@ -85,6 +89,10 @@ def open_database(url: str) -> Engine:
         engine.dispose()
         raise
     return engine
+
+
+def _is_in_file(url: URL) -> bool:
+    return url.get_backend_name() == "sqlite" and url.database not in (None, "", ":memory:")
 
 
 def _set_pragmas(connection: Any, _record: Any) -> None:
@@ -155,5 +163,7 @@ def _migrate(engine: Engine, told: str) -> None:
 
 def reason_of(error: SQLAlchemyError) -> str:
     """Return why a database can't be used, in its own words, on one line."""
+    if isinstance(error, PoolTimeoutError):
+        return "others have used it all the time"
     said = str(error.orig) if isinstance(error, DBAPIError) else str(error)
     return " ".join(said.split())[:300].rstrip(".")
