@@ -17,7 +17,7 @@ NODE: Any = ray._private.node.Node
 
 def test_those_are_not_started_and_another_ray_of_this_process_has_them(monkeypatch: pytest.MonkeyPatch) -> None:
     before = [getattr(NODE, name) for name in UNUSED]  # a Ray in which they have other names is noticed here
-    started = []
+    started: list[object] = []
 
     def init(**_: Any) -> None:
         node = NODE.__new__(NODE)

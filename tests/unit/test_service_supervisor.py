@@ -330,8 +330,12 @@ def test_a_warm_process_ends_with_a_service_that_is_killed(place: Place) -> None
 
 
 def test_no_more_run_at_once_than_there_are_cpus(place: Place, service: Supervisor) -> None:
-    for index in range(5):
+    for job in [place.submit(name, seconds=100) for name in ("s0", "s1")]:
+        place.until_it_runs(job)
+    for index in range(2, 6):
         place.submit(f"s{index}", seconds=0.2)
+    for name in ("s0", "s1"):
+        place.queue.request_stop(name)
     place.until_all_end()
     at_once = most = 0
     for line in place.journal():
