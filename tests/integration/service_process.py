@@ -18,7 +18,7 @@ def main(folder: Path, url: str, beat: Path) -> None:
     """Run the queue until killed, and say each moment that it lives."""
     # Two on one folder would be no test of a restart, as `service.opened` refuses the second.
     supervisor.TICK_S, supervisor.MAX_ATTEMPTS = 0.02, 1_000
-    supervisor._wait_s = lambda num_attempts: 0.0 * num_attempts
+    supervisor._wait_s = lambda num_deaths: 0.0 * num_deaths
     made = Supervisor(
         Queue(open_database(url)), open_storage(folder),
         Surroundings(folder, folder / SERVICE_FOLDER, None, 2.0, ()),
