@@ -155,7 +155,7 @@ class Client(Looking):
 
         Args:
             name: The sweep.
-            force: Also one that has not finished.
+            force: Also one that has not finished, or is damaged.
 
         Raises:
             ConflictError: It waits or runs, or has not finished.

@@ -114,6 +114,9 @@ class Statuses:
     def _look(self, sweep: Sweep, stamp: tuple[int, ...], known: Seen | None, *, is_same: bool) -> Seen:
         began = self._clock()
         record, stamps = sweep.read_record(), sweep.trial_stamps()
+        if record.name != sweep.name:
+            # Somebody has renamed its folder: by that name it is listed and asked for.
+            record = record.model_copy(update={"name": sweep.name})
         trials = None if known is None else known.trials
         if trials is None or trials.stamps != stamps:
             trials = _read(sweep, stamps, trials)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from analysis.records import TrialRecord
-from policies.errors import NotFoundError
+from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.service.http.caller import AChanger, ASubmitter, TheService, set_audit_target
 from tune_jobs.service.http.models import (
     Change,
@@ -169,19 +169,27 @@ def delete(
     name: str,
     service: TheService,
     _: AChanger,
-    force: Annotated[bool, Query(description="Also one that has not finished.")] = False,  # noqa: FBT002
+    force: Annotated[bool, Query(description="Also one that has not finished, or is damaged.")] = False,  # noqa: FBT002
 ) -> None:
     """Delete a sweep with all that it has made."""
-    seen = service.statuses.see(name)
-    if seen.status.alive or service.queue.jobs("waiting", "running", "creating", sweep=name):
+    stored = service.storage.sweep(name)
+    try:
+        seen = service.statuses.see(name)
+    except CheckpointError as error:
+        # Nothing says how far it got; to remove it, nothing of it has to be read.
+        if not force:
+            raise CheckpointError(error.message, f"{error.hint} With force=true, this deletes the sweep.") from error
+        seen = None
+    if stored.is_driven() or service.queue.jobs("waiting", "running", "creating", sweep=name):
         raise NotNowError(f"Sweep {name} waits or runs.", "Stop it first.")
-    if seen.status.state != "completed" and not force:
+    if seen is not None and seen.status.state != "completed" and not force:
         raise NotNowError(
             f"Sweep {name} has not finished: it is {seen.status.state}.", "Resume it, or delete it with force=true."
         )
-    service.storage.sweep(name).delete()
-    # It may have been run from a terminal, and nobody has asked for metrics since.
-    service.env_steps.saw(seen)
+    stored.delete()
+    if seen is not None:
+        # It may have been run from a terminal, and nobody has asked for metrics since.
+        service.env_steps.saw(seen)
     service.queue.remove_sweep(name)
     service.labels.forget(name)
     service.statuses.forget(name)
