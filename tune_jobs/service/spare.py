@@ -87,10 +87,15 @@ class Driver:
             log: The file for what it prints.
 
         Raises:
-            CannotRunError: It died before.
+            CannotRunError: It died before, or the file can't be written.
         """
-        log.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise CannotRunError(
+                f"The service can't write {log}: {error.strerror}.", "Check the storage folder."
+            ) from error
         try:
             socket.send_fds(self._socket, [json.dumps(request).encode()], [lock, descriptor])
         except OSError as error:

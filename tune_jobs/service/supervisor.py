@@ -87,6 +87,7 @@ class Supervisor:
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
         self._retry_at: dict[int, float] = {}
+        self._not_started: dict[int, str] = {}
         self._interrupted: set[int] = set()
         self._wake, self._end = threading.Event(), threading.Event()
         self._draining = threading.Event()
@@ -243,17 +244,21 @@ class Supervisor:
         """Let another driver go on, after a while, or give up."""
         num_deaths = files.num_deaths(job.num_attempts)
         if num_deaths >= MAX_ATTEMPTS:
+            said, why = files.last_lines(), self._not_started.get(job.id)
+            message = f"The process that ran the sweep died {num_deaths} times."
+            if why is not None:
+                message = f"The sweep can't be started, after {num_deaths} attempts: {why}"
+            self._finish(job, "failed", message + (f"\n{said}" if said else ""))
             self._on_death()
-            said = files.last_lines()
-            message = f"The process that ran the sweep died {num_deaths} times." + (f"\n{said}" if said else "")
-            self._finish(job, "failed", message)
         elif self._retry_at.setdefault(job.id, time.monotonic() + _wait_s(num_deaths)) <= time.monotonic():
+            # First of all: where the queue can't be written, nothing goes on, and it is tried again at each look.
+            again = self._queue.again(job.id)
             del self._retry_at[job.id]
             self._on_death()
             _log.warning(
                 "The driver of job %d (sweep %s) died; another one goes on.", job.id, job.sweep, extra=job.log_fields
             )
-            self._start(self._queue.again(job.id))
+            self._start(again)
 
     def _interrupt(self, job: Job, files: JobFiles) -> None:
         """Let a driver save and end, once."""
@@ -272,13 +277,14 @@ class Supervisor:
             os.kill(holder.pid, signal.SIGHUP)
 
     def _finish(self, job: Job, outcome: Outcome, message: str | None = None) -> None:
-        told = (job.id, job.verb, job.sweep, outcome)
-        _log.info("Job %d (%s of sweep %s) has ended: %s.", *told, extra=job.log_fields)
         # First it is told: whoever is killed in between tells it twice, and not never.
         now = time.time()
         ended = {"state": "ended", "outcome": outcome, "message": message, "ended_at": now}
         self._on_end(job.model_copy(update=ended))
         self._queue.end(job.id, outcome, message, at=now)
+        told = (job.id, job.verb, job.sweep, outcome)
+        _log.info("Job %d (%s of sweep %s) has ended: %s.", *told, extra=job.log_fields)
+        self._not_started.pop(job.id, None)
         # All that they said is in the queue now.
         if outcome != "failed":
             self._files(job).remove()
@@ -290,7 +296,16 @@ class Supervisor:
         remove_ended(self._where.service_folder, open_uids, time.time())
 
     def _start(self, job: Job) -> None:
-        files = self._files(job)
+        try:
+            self._give(job, self._files(job))
+            self._not_started.pop(job.id, None)
+        except (TuneJobsError, OSError) as error:
+            # It is looked at again, as one whose driver died; other jobs and the queue have nothing to do with it.
+            self._not_started[job.id] = str(error)
+            _log.warning("Job %d can't be started: %s", job.id, error, extra=job.log_fields)
+
+    def _give(self, job: Job, files: JobFiles) -> None:
+        """Give a job to a driver."""
         lock = files.take()
         if lock is None:
             # A driver of an earlier life of the service runs it: it is watched like any other.
@@ -307,13 +322,15 @@ class Supervisor:
                 "arguments": job.arguments,
                 "address": self._where.address,
             }
-            driver.give(request, lock, files.log)
+            try:
+                driver.give(request, lock, files.log)
+            except BaseException:
+                # It has no job, and waits for one: the next attempt takes it, if it lives.
+                self._spare = driver
+                raise
             self._children[driver.pid] = driver
             told = (job.id, job.verb, job.sweep, driver.pid)
             _log.info("Job %d (%s of sweep %s) is run by process %d.", *told, extra=job.log_fields)
-        except TuneJobsError as error:
-            # It is looked at again, as one whose driver died.
-            _log.warning("Job %d can't be started: %s", job.id, error, extra=job.log_fields)
         finally:
             os.close(lock)
 
