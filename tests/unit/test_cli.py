@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 from fake_sweeps import SWEEP, TRIALS, FakeSweeps, RunCommand, evaluation
 
+from analysis.records import ReplicationRecord
 from policies.errors import CannotRunError, NotFoundError, TrialsFailedError
 from tune_jobs.cli.commands import cli
 from tune_jobs.sweeps.interrupted import SweepInterrupted
@@ -184,7 +185,7 @@ def test_the_status_tells_progress_the_best_and_the_time_left(run: RunCommand, s
 @pytest.mark.parametrize(
     ("state", "alive", "words"),
     [
-        ("running", True, "not known before the first env steps are reported"),
+        ("running", True, "not known before the trials that are left report env steps"),
         ("completed", True, "the trials are done; the best is being confirmed and filmed, and the report written"),
         ("interrupted", False, "nothing runs; `tune-jobs resume mine --storage 'my sweeps'` continues it"),
         ("created", False, "nothing runs; `tune-jobs resume mine --storage 'my sweeps'` starts it"),
@@ -197,6 +198,26 @@ def test_time_left_is_told_in_words_where_there_is_no_number(
     record = SWEEP.model_copy(update={"state": state})
     sweeps.answers["status"] = dataclasses.replace(RUNNING, sweep=record, alive=alive, time_left_s=None)
     assert facts(run("status", "mine", "--storage", "my sweeps").stdout).get("time left") == words
+
+
+def test_why_the_time_left_is_not_known(run: RunCommand, sweeps: FakeSweeps) -> None:
+    def told(*, steps: int, **record: Any) -> str:
+        update = {"state": "running", "spec": {"env": "CartPole-v1", "algorithm": "ppo", "num_samples": 2}, **record}
+        known = SWEEP.model_copy(update=update)
+        sweeps.answers["status"] = dataclasses.replace(RUNNING, sweep=known, num_env_steps=steps, time_left_s=None)
+        return facts(run("status", "mine").stdout)["time left"]
+
+    race = (ReplicationRecord(num_points=2, points=(0, 1), by="confirm"),)
+    assert told(steps=0) == "not known before the first env steps are reported"
+    leaders = "not known before the leaders that get more seeds report env steps"
+    assert told(steps=5_000, num_trials=4, replications=race) == leaders
+    # Points that came after the race are what runs.
+    assert (
+        told(steps=5_000, num_trials=6, replications=race)
+        == "not known before the trials that are left report env steps"
+    )
+    # What another version wrote is no reason to say nothing.
+    assert told(steps=5_000, spec={}, replications=race) == "not known before the trials that are left report env steps"
 
 
 def test_a_status_without_scores_steps_or_a_known_spec_says_so(run: RunCommand, sweeps: FakeSweeps) -> None:

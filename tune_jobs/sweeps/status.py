@@ -104,8 +104,26 @@ class SweepStatus:
         if self.sweep.state == "completed":
             return "the trials are done; the best is being confirmed and filmed, and the report written"
         if self.time_left_s is None:
-            return "not known before the first env steps are reported"
+            return self._why_unknown()
         return f"about {duration(self.time_left_s, tenths=False, none=PLAIN_NONE)}"
+
+    def _why_unknown(self) -> str:
+        """Say why there is no estimate, though the sweep runs."""
+        if not self.num_env_steps:
+            return "not known before the first env steps are reported"
+        # Those that ended say nothing of how many run at once from now on.
+        trials = "leaders that get more seeds" if self._is_replicating() else "trials that are left"
+        return f"not known before the {trials} report env steps"
+
+    def _is_replicating(self) -> bool:
+        """Whether the last trials that the sweep got are more seeds of points that it had."""
+        from tune_jobs.sweeps.confirm import recent_rounds
+
+        try:
+            return bool(self.sweep.replications and recent_rounds(self.sweep))
+        except CheckpointError:
+            # The status of a sweep of another version is still told.
+            return False
 
     def _run_time(self) -> str:
         before, started = self.sweep.run_time_s, self.sweep.started_at
