@@ -4,6 +4,7 @@ import { pointDialog, takesPoints } from "./chosen_point.js";
 import { askInDialog } from "./dialogs.js";
 import { el, toast } from "./dom.js";
 import { counted } from "./format.js";
+import { toldExtension, toldRace } from "./growth.js";
 import { isLive, isWaiting } from "./states.js";
 import { mayChange } from "./who.js";
 
@@ -53,6 +54,7 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
             hint: "Random draws for each combination of the grids.",
           },
         ],
+        tell: ({ num_samples: more }) => toldExtension(data.spec, more),
         act: async (values) => {
           await post("extend", values);
           toast(`${name()}: the new points are trained when their turn has come.`);
@@ -95,6 +97,7 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
             hint: "How many more seeds a setting gets at most.",
           },
         ],
+        tell: (values) => toldRace(new Set(data.trials.map((trial) => trial.point_index)).size, values),
         act: async (values) => {
           await post("replicate", values);
           toast(`${name()}: the leaders are trained again when their turn has come.`);

@@ -36,6 +36,8 @@ function fieldOf(spec) {
           autocomplete: "off",
         });
   input.value = spec.value ?? "";
+  // A number that is typed replaces the one that stands there, which would else become a part of it.
+  if (spec.type === "number") input.addEventListener("focus", () => input.select());
   return el("div", { class: "field" }, el("label", { for: id }, spec.label), input, hint);
 }
 
@@ -51,7 +53,9 @@ function valuesOf(form, fields) {
 }
 
 // Show a dialog; `act(values)` does what it asks for, and what it throws is shown in the dialog, which stays open.
-export function askInDialog({ title, text, fields = [], label, isDangerous = false, act }) {
+// `tell(values)` says what would come of them, as they are typed.
+export function askInDialog({ title, text, fields = [], label, isDangerous = false, tell = null, act }) {
+  const told = tell ? el("p", { class: "told", role: "status" }) : null;
   const problem = el("div", { class: "problem", role: "alert" });
   const submit = el("button", { type: "submit", class: isDangerous ? "danger" : "primary" }, label);
   const cancel = el("button", { type: "button" }, "Cancel");
@@ -62,6 +66,7 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
     heading,
     text ? el("p", { class: "quiet" }, text) : null,
     ...fields.map(fieldOf),
+    told,
     problem,
     el("div", { class: "buttons" }, cancel, submit),
   );
@@ -90,8 +95,11 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
       submit.disabled = false;
     }
   });
+  const retell = () => setText(told, form.checkValidity() ? tell(valuesOf(form, fields)) : "");
+  if (tell) form.addEventListener("input", retell);
   document.body.append(dialog);
   dialog.showModal();
+  if (tell) retell();
   // A dangerous one begins where nothing happens.
   (form.querySelector("input, select, textarea") ?? (isDangerous ? cancel : submit)).focus();
   return dialog;

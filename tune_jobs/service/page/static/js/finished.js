@@ -2,7 +2,7 @@
 import { el } from "./dom.js";
 import { counted, pointText, returnText } from "./format.js";
 import { playLink } from "./play_links.js";
-import { stateOf } from "./states.js";
+import { isLive, isWaiting, stateOf } from "./states.js";
 
 const CAPTIONS = { before_mp4: "Before: a random policy", after_mp4: "After: the best policy" };
 const SCORES = {
@@ -20,25 +20,22 @@ export class Finished {
     this.stamp = "";
   }
 
-  // Asked for once each time the sweep has come to an end.
+  // Asked for once each time the sweep has come to an end, or goes on: what it came to before is shown until then.
   async follow(sweep) {
     const stamp = `${stateOf(sweep).group} ${sweep.state} ${sweep.ended_at} ${sweep.job?.ended_at}`;
     if (stamp === this.stamp) return;
     this.stamp = stamp;
-    if (sweep.state !== "completed") {
-      this.card.hidden = true;
-      return;
-    }
     try {
       const { files, best } = await this.source.outcome();
-      if (stamp === this.stamp) this.show(files, best);
+      if (stamp === this.stamp) this.show(files, best, toldAsEarlier(sweep));
     } catch {
       // The next look asks again.
       this.stamp = "";
     }
   }
 
-  show(files, best) {
+  // `earlier` says that all this may be of before, if so.
+  show(files, best, earlier) {
     const hasReport = files.has("report/index.html");
     this.card.hidden = best === null && !hasReport;
     this.card.replaceChildren(
@@ -48,6 +45,7 @@ export class Finished {
         el("h2", {}, "Result"),
         hasReport ? this.reportLinks() : null,
       ),
+      earlier ? el("p", { class: "notice" }, earlier) : "",
       el(
         "div",
         { class: "answers" },
@@ -97,6 +95,14 @@ export class Finished {
     video.muted = true;
     return el("figure", {}, video, el("figcaption", {}, CAPTIONS[name]));
   }
+}
+
+// What to say of a result that may not be the last one; empty: it is.
+function toldAsEarlier(sweep) {
+  if (sweep.state === "completed")
+    return isLive(sweep) ? "A new result is being made. Until it is here, an earlier one may be shown." : "";
+  const next = isLive(sweep) || isWaiting(sweep) ? "A new one comes when they have." : "Resume the sweep for a new one.";
+  return `An earlier result, from before the trials that have not ended yet. ${next}`;
 }
 
 function settingAnswer({ objective, num_may_be_best: numAsGood, ranking: [setting] }) {
