@@ -27,7 +27,7 @@ export class Finished {
     this.stamp = stamp;
     try {
       const { files, best } = await this.source.outcome();
-      if (stamp === this.stamp) this.show(files, best, toldAsEarlier(sweep));
+      if (stamp === this.stamp) this.show(files, best, toldAsEarlier(sweep, this.source.isFile));
     } catch {
       // The next look asks again.
       this.stamp = "";
@@ -98,11 +98,14 @@ export class Finished {
 }
 
 // What to say of a result that may not be the last one; empty: it is.
-function toldAsEarlier(sweep) {
+function toldAsEarlier(sweep, isFile) {
   if (sweep.state === "completed")
     return isLive(sweep) ? "A new result is being made. Until it is here, an earlier one may be shown." : "";
+  const text = "An earlier result, from before the trials that have not ended yet.";
+  // A file stays as it is.
+  if (isFile) return text;
   const next = isLive(sweep) || isWaiting(sweep) ? "A new one comes when they have." : "Resume the sweep for a new one.";
-  return `An earlier result, from before the trials that have not ended yet. ${next}`;
+  return `${text} ${next}`;
 }
 
 function settingAnswer({ objective, num_may_be_best: numAsGood, ranking: [setting] }) {
