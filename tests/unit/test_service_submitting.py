@@ -24,6 +24,11 @@ def database_url(tmp_path: Path) -> str:
     return sqlite_url(tmp_path / "service.db")
 
 
+def away(*_: Any, **__: Any) -> None:
+    """What a database does that can't be reached."""
+    raise OperationalError("UPDATE", {}, Exception("server closed the connection"))
+
+
 def submit(client: TestClient, **options: Any) -> int:
     answer = client.post("/api/v1/sweeps", json={"spec": FAKE, "note": "mine", "tags": ["a"]}, **options)
     return answer.status_code
@@ -53,9 +58,6 @@ def test_of_many_at_once_only_as_many_are_taken_as_may_be(
 def test_a_sweep_whose_owner_could_not_be_written_has_one_once_it_is_asked_for_again(
     client: TestClient, service: Service
 ) -> None:
-    def away(*_: Any, **__: Any) -> None:
-        raise OperationalError("UPDATE", {}, Exception("server closed the connection"))
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(service.labels, "change", away)
         assert submit(client, headers=KEY) == 503
@@ -63,3 +65,50 @@ def test_a_sweep_whose_owner_could_not_be_written_has_one_once_it_is_asked_for_a
     (job,) = service.queue.jobs()
     label = service.labels.of(job.sweep)
     assert (label.owner, label.note, label.tags) == (job.owner, "mine", ("a",))
+
+
+@pytest.mark.parametrize("lost_after", [False, True])
+def test_a_sweep_that_the_queue_was_not_told_of_waits_once_it_is_asked_for_again(
+    client: TestClient, service: Service, monkeypatch: pytest.MonkeyPatch, *, lost_after: bool
+) -> None:
+    created = service.queue.created
+
+    def lost(job_id: int, *, num_cpus: float) -> None:
+        if lost_after:
+            created(job_id, num_cpus=num_cpus)
+        away()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(service.queue, "created", lost)
+        assert submit(client, headers=KEY) == 503
+        # It is still away.
+        assert submit(client, headers=KEY) == 503
+    assert submit(client, headers=KEY) == 200
+    (job,) = service.queue.jobs()
+    assert (job.state, job.num_cpus > 0) == ("waiting", True)
+    assert [sweep.name for sweep in service.storage.sweeps()] == [job.sweep]
+
+
+def test_a_sweep_that_the_queue_was_not_told_of_waits_at_the_next_look(client: TestClient, service: Service) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service.queue, "created", away)
+        assert submit(client) == 503
+    assert [job.state for job in service.queue.jobs()] == ["creating"]
+    # So that it starts no driver here.
+    service.supervisor._draining.set()
+    for _ in range(2):
+        service.supervisor._look()
+    assert [job.state for job in service.queue.jobs()] == ["waiting"]
+
+
+def test_a_sweep_that_could_not_be_written_while_the_queue_was_away_is_made_anew(
+    client: TestClient, service: Service
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tune_jobs.service.submitting.write_new", away)
+        patch.setattr(service.queue, "forget", away)
+        assert submit(client, headers=KEY) == 503
+    assert service.storage.sweeps() == []
+    assert submit(client, headers=KEY) == 201
+    (job,) = service.queue.jobs()
+    assert job.state == "waiting"

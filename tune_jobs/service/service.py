@@ -89,9 +89,11 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                 with contextlib.suppress(TuneJobsError):
                     env_steps.saw(statuses.see(job.sweep))
 
+            submitter = Submitter(config, queue, storage)
             supervisor = Supervisor(
                 queue, storage, where,
                 spare_idle_s=config.spare_idle_s, on_end=on_end, on_death=metrics.driver_died, outages=gate.outages,
+                settle=submitter.settle,
             )  # fmt: skip
             metrics.add(
                 StateCollector(
@@ -118,7 +120,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     queue=queue,
                     labels=labels,
                     statuses=statuses,
-                    submitter=Submitter(config, queue, storage),
+                    submitter=submitter,
                     supervisor=supervisor,
                     watching=watching,
                     derived=Derived(storage, statuses),

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from policies.envs.modules import allow_modules, allowed_again
-from policies.errors import CannotRunError, SpecError
+from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
@@ -68,7 +69,8 @@ class Submitter:
 
     def __init__(self, config: ServiceConfig, queue: Queue, storage: Storage) -> None:
         self._config, self._queue, self._storage = config, queue, storage
-        self._beginning = threading.Lock()
+        self._beginning, self._settling = threading.Lock(), threading.Lock()
+        self._unsettled: dict[int, float | None] = {}
 
     @allowed_again()
     @guarding(start=True)
@@ -106,7 +108,7 @@ class Submitter:
             CannotRunError: It cannot be written.
         """
         keyed = None if key is None else (key, submission.digest)
-        if keyed is not None and (known := self._queue.known(owner, *keyed)) is not None:
+        if (known := self._known(owner, keyed)) is not None:
             return known, False
         # To plan takes a while, which is spared.
         check_room()
@@ -114,7 +116,7 @@ class Submitter:
         name = self._free_name(submission, spec)
         # Of many that come at once, each sees those before it.
         with self._beginning:
-            if keyed is not None and (known := self._queue.known(owner, *keyed)) is not None:
+            if (known := self._known(owner, keyed)) is not None:
                 return known, False
             check_room()
             # The job comes first: a sweep whose job was never written would be begun twice where the request is
@@ -141,9 +143,44 @@ class Submitter:
                 sweep.discard()
                 raise
         except BaseException:
-            self._queue.forget(job.id)
+            with self._noting(job.id, None):
+                self._queue.forget(job.id)
             raise
-        return self._queue.created(job.id, num_cpus=num_cpus_of(plan)), True
+        num_cpus = num_cpus_of(plan)
+        with self._noting(job.id, num_cpus):
+            return self._queue.created(job.id, num_cpus=num_cpus), True
+
+    def settle(self) -> None:
+        """Tell the queue what it could not be told before: which sweeps are written by now, and which never will be.
+
+        After a restart, `Supervisor.reconcile` does it.
+        """
+        with self._settling:
+            for job_id, num_cpus in list(self._unsettled.items()):
+                if num_cpus is None:
+                    self._queue.forget(job_id)
+                else:
+                    with contextlib.suppress(NotFoundError):
+                        self._queue.created(job_id, num_cpus=num_cpus)
+                del self._unsettled[job_id]
+
+    @contextlib.contextmanager
+    def _noting(self, job_id: int, num_cpus: float | None) -> Iterator[None]:
+        """Keep in mind what the queue can't be told of a job: the CPUs of its sweep, or that it has none."""
+        try:
+            yield
+        except BaseException:
+            self._unsettled[job_id] = num_cpus
+            raise
+
+    def _known(self, owner: str, keyed: tuple[str, str] | None) -> Job | None:
+        """Return the job that an earlier request with this key made; None: there was none, or it has no key."""
+        if keyed is None or (known := self._queue.known(owner, *keyed)) is None:
+            return None
+        if known.id not in self._unsettled:
+            return known
+        self.settle()
+        return self._queue.known(owner, *keyed)
 
     def _planned(self, submission: Submission) -> tuple[SweepSpec, SweepPlan]:
         allow_modules(self._config.modules)

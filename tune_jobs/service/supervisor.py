@@ -61,6 +61,7 @@ class Supervisor:
         on_death: Called when a driver has died before its job had ended.
         make_driver: Starts a driver process.
         outages: Where it is noted that the queue can't be looked at.
+        settle: Called before each look at the queue, to tell it what it could not be told before.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Supervisor:
         on_death: Callable[[], None] = lambda: None,
         make_driver: Callable[[Mapping[str, Any]], Driver] = Driver,
         outages: Outages | None = None,
+        settle: Callable[[], None] = lambda: None,
     ) -> None:
         self._queue, self._storage, self._where = queue, storage, where
         self._spare_idle_s, self._on_end, self._on_death, self._make_driver = (
@@ -82,7 +84,7 @@ class Supervisor:
             on_death,
             make_driver,
         )
-        self._outages = Outages() if outages is None else outages
+        self._outages, self._settle = Outages() if outages is None else outages, settle
         self._idle_since = time.monotonic()
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
@@ -203,6 +205,7 @@ class Supervisor:
             self._wake.clear()
 
     def _look(self) -> None:
+        self._settle()
         for pid in [pid for pid, child in self._children.items() if child.poll() is not None]:
             del self._children[pid]
         for job in self._queue.jobs("running"):
