@@ -59,6 +59,7 @@ TAKES = {
     # Any text is a name, an address or an id as far as its kind goes.
     "name": {"text", "none", "empty text", "no path"},
     "address": {"text", "none", "empty text", "no path"},
+    "race": {"text", "none", "empty text", "no path"},
     "env_id": {"text", "none", "empty text", "no path"},
     "rl_module": {"text", "none", "empty text", "no path", "class"},
     "overrides": {"texts", "empty list"},

@@ -53,7 +53,16 @@ def test_a_sweep_that_may_not_be_looked_at_does_not_hide_the_others(
         sweeps.status("other", storage=storage)
 
 
-@pytest.mark.parametrize("part", ["trials", "trials/t0001", "trials/t0001/checkpoints"])
+def test_a_trial_that_may_not_be_looked_at_does_not_hide_the_others(
+    storage: Path, closed: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    closed(storage / "mine" / "trials" / "t0001")
+    assert [trial.trial_id for trial in sweeps.trials("mine", storage=storage)] == ["t0000", "t0002", "t0003"]
+    assert f"{storage}/mine/trials/t0001/trial.json cannot be read: Permission denied" in caplog.text
+    assert sweeps.status("mine", storage=storage).counts == {"completed": 3}
+
+
+@pytest.mark.parametrize("part", ["trials", "trials/t0001/checkpoints"])
 def test_a_part_of_a_sweep_that_may_not_be_looked_at_is_named(
     storage: Path, closed: Callable[..., Any], part: str
 ) -> None:

@@ -220,7 +220,7 @@ def test_downloads_of_a_folder_that_somebody_renamed(tmp_path: Path, name: str) 
         assert client.get("/api/v1/sweeps").status_code == 200
 
 
-def test_a_folder_whose_name_is_no_text_hides_no_other(tmp_path: Path) -> None:
+def test_a_folder_whose_name_is_no_text_hides_no_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with opened(ServiceConfig(storage=tmp_path / "sweeps", spare_idle_s=0)) as service:
         service.supervisor.close()
         make_sweep_folder(tmp_path / "sweeps" / "good")
@@ -228,7 +228,8 @@ def test_a_folder_whose_name_is_no_text_hides_no_other(tmp_path: Path) -> None:
         client = place(service).client()
         answer = client.get("/api/v1/sweeps")
         assert answer.status_code == 200, answer.text
-        assert "good" in [item["name"] for item in answer.json()["sweeps"]]
+        assert [item["name"] for item in answer.json()["sweeps"]] == ["good"]
+        assert "'bad\\udcff' is no text" in caplog.text
 
 
 def quoted(name: str) -> str:

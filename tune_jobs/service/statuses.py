@@ -90,8 +90,13 @@ class Statuses:
         """Return a sweep as it is, or was a moment ago.
 
         Raises:
-            NotFoundError: There is none, or it is damaged.
+            NotFoundError: There is none, it is damaged, or its name is nothing that JSON and addresses can have.
         """
+        if not _is_text(name):
+            raise CheckpointError(
+                f"The name of the folder {name!a} is no text in UTF-8, so no page can link it.",
+                "Rename the folder.",
+            )
         sweep = self._storage.sweep(name)
         with self._lock:
             lock = self._locks.setdefault(name, threading.Lock())
@@ -143,6 +148,15 @@ class Statuses:
         self._seen.pop(name, None)
         with self._lock:
             self._locks.pop(name, None)
+
+
+def _is_text(name: str) -> bool:
+    """Whether a name can be encoded: Linux takes any bytes for one, and Python makes halves of surrogates of them."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _read(sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Trials | None) -> Trials:

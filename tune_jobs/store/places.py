@@ -128,9 +128,12 @@ def _unseen(path: Path, error: OSError) -> CheckpointError:
 
 
 def stamp_of(path: str | Path) -> tuple[int, ...]:
-    """Return what changes whenever a file is replaced or written; empty: it does not exist, or can't be seen."""
+    """Return what changes whenever a file is replaced or written; empty: it does not exist."""
     try:
         found = os.lstat(path)
+    except PermissionError:
+        # It counts as one that exists: whoever reads it is told.
+        return (0,)
     except OSError:
         return ()
     return found.st_ino, found.st_size, found.st_mtime_ns
