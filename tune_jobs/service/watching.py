@@ -28,6 +28,8 @@ MOST_UNWATCHED = 32
 _MOST_WAIT_S = 5.0
 _SHARE = 0.05
 """The share of a core that following one thing takes, unless it would be too old then."""
+_FOR_EACH_S = 0.01
+"""By so much each client that watches lets them all wait longer, in seconds: to send to each takes its time, too."""
 
 
 class Follower:
@@ -101,7 +103,8 @@ class Follower:
                 _log.exception("%s could not be looked at; it is tried again.", self._what)
                 wait_s = _MOST_WAIT_S
             else:
-                wait_s = min(_MOST_WAIT_S, max(self._view.interval_s, (time.monotonic() - began) / _SHARE))
+                least_s = max(self._view.interval_s, self.log.num_listeners * _FOR_EACH_S)
+                wait_s = min(_MOST_WAIT_S, max(least_s, (time.monotonic() - began) / _SHARE))
         self.end()
 
 

@@ -80,7 +80,9 @@ class EventStream(Response):
             if has_ended:
                 return True
             try:
-                await asyncio.wait_for(wake.wait(), HEARTBEAT_S)
+                # Not `wait_for`, which makes a task each time; there may be a thousand of these.
+                async with asyncio.timeout(HEARTBEAT_S):
+                    await wake.wait()
             except TimeoutError:
                 if not await _sent(send, b":\n\n"):
                     return False
@@ -105,7 +107,8 @@ async def _wait_for_the_end(receive: Receive, wake: asyncio.Event) -> None:
 async def _sent(send: Send, body: bytes) -> bool:
     """Whether the client took it in time."""
     try:
-        await asyncio.wait_for(send({"type": "http.response.body", "body": body, "more_body": True}), SLOW_S)
+        async with asyncio.timeout(SLOW_S):
+            await send({"type": "http.response.body", "body": body, "more_body": True})
     except TimeoutError:
         return False
     return True
