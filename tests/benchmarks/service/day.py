@@ -71,8 +71,14 @@ def _resident_bytes(pid: int) -> int:
 
 
 def _delete(served: Served, name: str) -> None:
-    served.wait(lambda: served.ask("GET", f"sweeps/{name}")["state"] == "completed", f"{name} never ends")
+    # Its job ends a moment after its record says so.
+    served.wait(lambda: _ended(served, name), f"{name} never ends")
     served.ask("DELETE", f"sweeps/{name}?force=true")
+
+
+def _ended(served: Served, name: str) -> bool:
+    seen = served.ask("GET", f"sweeps/{name}")
+    return seen["state"] == "completed" and seen["job"]["state"] == "ended"
 
 
 def _unended(served: Served) -> list[Any]:

@@ -111,7 +111,8 @@ function toldAsEarlier(sweep, isFile) {
 function settingAnswer({ objective, num_may_be_best: numAsGood, ranking: [setting] }) {
   const hasRange = setting.lower !== null && setting.upper !== null;
   const range = hasRange ? ` (95 % interval ${returnText(setting.lower)} to ${returnText(setting.upper)})` : "";
-  const score = `${returnText(setting.expected)} expected ${SCORES[objective] ?? "score"}${range}`;
+  // The number of the report and of the command line: the mean over its seeds.
+  const score = `${returnText(setting.score)} ${SCORES[objective] ?? "score"}${range}`;
   const others = numAsGood - 1;
   return el(
     "div",
