@@ -78,7 +78,7 @@ def _delete(served: Served, name: str) -> None:
 
 def _ended(served: Served, name: str) -> bool:
     seen = served.ask("GET", f"sweeps/{name}")
-    return seen["state"] == "completed" and seen["job"]["state"] == "ended"
+    return bool(seen["state"] == "completed" and seen["job"]["state"] == "ended")
 
 
 def _unended(served: Served) -> list[Any]:
