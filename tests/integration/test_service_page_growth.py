@@ -9,6 +9,8 @@ from page_sweeps import write_sweep
 from selenium.webdriver.common.keys import Keys
 from synthetic_sweep import make_sweep
 
+from analysis.page.scores import interval_of, score_text
+from analysis.records import Objective, SettingRecord, SettingsRecord
 from tune_jobs.store.sweep_store import SweepStore
 
 pytestmark = IN_A_BROWSER
@@ -92,3 +94,28 @@ def test_the_result_stays_and_is_told_as_an_earlier_one_until_there_is_a_new_one
         store.write_record(record)
     page.wait("return document.querySelector('.finished .notice') === null")
     assert page.text(".finished .score") == score
+
+
+@pytest.mark.parametrize(
+    ("objective", "score", "expected", "lower", "upper"),
+    [("final", 197.04, 195.4, 181.3, 212.6), ("steps_to_threshold", -51_200.0, -53_000.0, -60_000.0, -44_000.0)],
+)
+def test_the_score_of_the_setting_is_that_of_the_report(
+    page: Page, live: Live, *, objective: Objective, score: float, expected: float, lower: float, upper: float
+) -> None:
+    store = SweepStore(live.storage / "mine")
+    best = store.read_best()
+    setting = SettingRecord(
+        point_index=0, point=best.point, trial_ids=("t0000",), scores=(score,), num_failed=0, score=score,
+        expected=expected, lower=lower, upper=upper,
+    )  # fmt: skip
+    settings = SettingsRecord(objective=objective, num_settings=3, num_may_be_best=1, ranking=(setting,))
+    try:
+        store.write_best(best.model_copy(update={"settings": settings}))
+        page.open("#/sweeps/mine")
+        page.says(".finished h2", "Result")
+        told = page.text(".finished .answers")
+        assert f"{score_text(settings, score)} " in told
+        assert f"(95 % interval {interval_of(settings, setting)}), from 1 seed" in told
+    finally:
+        store.write_best(best)

@@ -87,9 +87,8 @@ class PostgreSQL:
         return f"postgresql://postgres@/{name}?host={self.folder}"
 
 
-@pytest.fixture(scope="session")
-def postgresql() -> Iterator[PostgreSQL]:
-    """A server for the session."""
+def started_or_skip() -> PostgreSQL:
+    """A server of its own; where none can be started, the test is skipped."""
     programs = postgresql_programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed")
@@ -98,7 +97,13 @@ def postgresql() -> Iterator[PostgreSQL]:
             pwd.getpwnam("postgres")
         except KeyError:
             pytest.skip("PostgreSQL can't be run by root, and there is no user postgres")
-    server = PostgreSQL(programs)
+    return PostgreSQL(programs)
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[PostgreSQL]:
+    """A server for the session."""
+    server = started_or_skip()
     yield server
     server.stop()
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from live_service import Live, live, serving  # noqa: F401 (a fixture)
 from services import FAKE
 from sweep_folders import make_sweep_folder
@@ -14,7 +15,6 @@ from test_service_downloads import FILM, make_finished
 from policies.errors import CannotRunError, CheckpointError, EnvError, NotFoundError, SpecError
 from tests.narrowing import present
 from tune_jobs.client import Client, ConflictError, answers
-from tune_jobs.client import connection as connection_module
 from tune_jobs.service.http import models
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.summaries import SweepSummary
@@ -43,13 +43,6 @@ def looking(site: Live) -> Iterator[Client]:
 def client(live: Live) -> Iterator[Client]:
     with Client(live.url) as made:
         yield made
-
-
-@pytest.fixture(autouse=True)
-def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_module, "_WAITS_S", (0.01, 0.01, 0.01, 0.01))
-    for name in ("TUNE_JOBS_TOKEN", "HTTP_PROXY", "http_proxy"):
-        monkeypatch.delenv(name, raising=False)
 
 
 # -- looking

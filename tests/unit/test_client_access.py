@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from fake_sweeps import RunCommand
 from live_service import serving
 from services import FAKE
@@ -17,15 +18,6 @@ from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.client import Client, NoServiceError
-from tune_jobs.client import connection as connection_module
-
-
-@pytest.fixture(autouse=True)
-def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_module, "_WAITS_S", (0.01, 0.01, 0.01, 0.01))
-    for name in ("TUNE_JOBS_TOKEN", "HTTP_PROXY", "http_proxy"):
-        monkeypatch.delenv(name, raising=False)
-
 
 # -- what is no service, or lets nobody in
 

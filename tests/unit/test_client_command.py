@@ -8,6 +8,7 @@ from typing import get_args
 
 import click
 import pytest
+from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from fake_results import COMPARISON, IMPORTANCE
 from fake_sweeps import RunCommand
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
@@ -15,12 +16,11 @@ from sweep_folders import make_sweep_folder
 from test_service_downloads import FILM, PAGE, make_finished
 
 from tune_jobs.cli.commands import cli
-from tune_jobs.cli.remote import FILMS
 from tune_jobs.cli.server import THERE
-from tune_jobs.client import Client, event_stream
+from tune_jobs.client import Client
 from tune_jobs.client.answers import FileOfSweep
 from tune_jobs.service.http.download_routes import Film
-from tune_jobs.service.views import SweepView
+from tune_jobs.store.names import FILMS
 from tune_jobs.store.sweep_store import SweepStore
 
 YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\nconfirm: none\n"
@@ -42,14 +42,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
         trial.write_record(trial.read_record().model_copy(update={"status": "paused", "num_env_steps": 3}))
         stopped.write_record(stopped.read_record().model_copy(update={"state": "interrupted", "run_time_s": 71.5}))
         yield made
-
-
-@pytest.fixture(autouse=True)
-def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("TUNE_JOBS_SERVER", "TUNE_JOBS_TOKEN", "TUNE_JOBS_TOKEN_FILE", "HTTP_PROXY", "http_proxy"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(event_stream, "_WAIT_S", 0.02)
-    monkeypatch.setattr(SweepView, "interval_s", 0.05)
 
 
 # -- the same output
@@ -166,7 +158,7 @@ def test_films_of_other_names_are_not_downloaded(
 
     monkeypatch.setattr(Client, "files", more)
     printed = json.loads(run("--server", site.url, "video", "mine", "--json").stdout)
-    assert tuple(printed) == get_args(Film) == FILMS
+    assert tuple(printed) == get_args(Film) == tuple(FILMS)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(printed.values())
 
 

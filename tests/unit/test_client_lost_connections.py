@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from cutting_proxy import cutting_proxy
 from live_service import Live, live, serving  # noqa: F401 (a fixture)
 from services import FAKE
@@ -23,13 +24,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     with serving(tmp_path_factory.mktemp("cut") / "sweeps") as made:
         make_finished(made.storage / "mine")
         yield made
-
-
-@pytest.fixture(autouse=True)
-def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_module, "_WAITS_S", (0.01, 0.01, 0.01, 0.01))
-    for name in ("TUNE_JOBS_TOKEN", "HTTP_PROXY", "http_proxy"):
-        monkeypatch.delenv(name, raising=False)
 
 
 def test_what_only_looks_is_asked_again(site: Live) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from cutting_proxy import cutting_proxy
 from fake_sweeps import RunCommand
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
@@ -13,21 +14,11 @@ from sweep_folders import make_sweep_folder
 from test_service_downloads import make_finished
 
 from tune_jobs.cli import remote_runs
-from tune_jobs.client import event_stream
-from tune_jobs.service.views import SweepView
 from tune_jobs.store.sweep_store import SweepStore
 
 # ruff: noqa: F811 - fixtures are named as arguments
 
 YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\nconfirm: none\n"
-
-
-@pytest.fixture(autouse=True)
-def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("TUNE_JOBS_SERVER", "TUNE_JOBS_TOKEN", "TUNE_JOBS_TOKEN_FILE", "HTTP_PROXY", "http_proxy"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(event_stream, "_WAIT_S", 0.02)
-    monkeypatch.setattr(SweepView, "interval_s", 0.05)
 
 
 class Queue:

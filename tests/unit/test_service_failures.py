@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from databases import PostgreSQL, postgresql_programs
+from databases import PostgreSQL, started_or_skip
 from fake_sweeps import RunCommand
 from fastapi.testclient import TestClient
 from services import FAKE, client, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
-from tests.narrowing import present
 from tune_jobs.service.database import opening
 from tune_jobs.service.database.opening import open_database, sqlite_url
 from tune_jobs.service.driver import _ended
@@ -197,9 +196,7 @@ class TestPostgreSQL:
 
     @pytest.fixture
     def server(self) -> Iterator[PostgreSQL]:
-        if postgresql_programs() is None:
-            pytest.skip("PostgreSQL is not installed")
-        made = PostgreSQL(present(postgresql_programs()))
+        made = started_or_skip()
         yield made
         made.stop()
 

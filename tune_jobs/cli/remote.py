@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.client import Client, ConflictError
+from tune_jobs.store.names import FILMS
 
 if TYPE_CHECKING:
     from analysis.comparison.compare import Comparison
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sweep_spec import SweepSpec
     from tune_jobs.sweeps.status import SweepStatus
 
-FILMS = ("before_mp4", "after_mp4", "after_gif", "before_after_mp4")
 _FILMS, _ONE_FILE = "films/", ".tunejobs"
 
 

@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from analysis.objectives import reached_goal
 from analysis.racing import Race, race_within
 from analysis.records import ReplicationRecord, SweepRecord, TrialRecord
-from policies.guard.guarded import check_env
 from policies.portable.file import BASELINE_KINDS
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.forecast import caps_of
-from tune_jobs.sweeps.settings import ranked
+from tune_jobs.sweeps.settings import ranked, threshold_for
 
 
 def may_confirm(spec: SweepSpec) -> bool:
@@ -41,9 +40,7 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
     rounds = recent_rounds(record)
     if not may_confirm(spec) or any(item.by != "confirm" for item in rounds):
         return ()
-    threshold = None
-    if spec.objective.type == "steps_to_threshold":
-        threshold = check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
+    threshold = threshold_for(spec)
     trials, results = read_trials(store), read_results(store)
     before = trials_before(trials, rounds)
     contenders = [item.point_index for item in ranked(spec, before, results, threshold)]

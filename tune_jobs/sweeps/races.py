@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from analysis.objectives import SettingScores
 from analysis.racing import Race
 from analysis.records import ReplicationRecord, SweepRecord
-from policies.guard.guarded import check_env
 from tune_jobs.plan.points import num_points_of
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.confirm import recent_rounds
-from tune_jobs.sweeps.settings import ranked
+from tune_jobs.sweeps.settings import ranked, threshold_for
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,4 @@ def ranking_of(store: Sweep) -> list[SettingScores]:
         EnvFailedError: As for `next_round`.
     """
     spec = stored_spec(store.read_record())
-    threshold = None
-    if spec.objective.type == "steps_to_threshold":
-        threshold = check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
-    return ranked(spec, read_trials(store), read_results(store), threshold)
+    return ranked(spec, read_trials(store), read_results(store), threshold_for(spec))

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from analysis.objectives import SettingScores, rank_settings
 from analysis.records import BestRecord, IterationRecord, SettingsRecord, TrialRecord
 from analysis.settings import judge_settings
+from policies.guard.guarded import check_env
 from policies.portable.file import read_policy
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -43,6 +44,18 @@ def ranked(
     """Return all settings of a sweep with their scores, best first; the arguments are those of `judged`."""
     goal = goal_of(spec, threshold)
     return rank_settings(trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal)
+
+
+def threshold_for(spec: SweepSpec) -> float | None:
+    """Return the env's own threshold where the objective is about it; None: it is not, or the env has none.
+
+    Raises:
+        EnvError: The env cannot be made.
+        EnvFailedError: As for EnvError, and it failed.
+    """
+    if spec.objective.type != "steps_to_threshold":
+        return None
+    return check_env(spec.env.id, spec.env.wrapped_args, timeout_s=spec.iteration_timeout_s).threshold
 
 
 def goal_of(spec: SweepSpec, threshold: float | None) -> float | None:
