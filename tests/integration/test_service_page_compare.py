@@ -63,6 +63,15 @@ def test_sweeps_are_chosen_on_the_list_and_compared(page: Page) -> None:
     page.says(".compare-bar", "2 sweeps chosen")
 
 
+def test_another_address_shows_nothing_of_the_comparison_before(page: Page) -> None:
+    page.open(BOTH)
+    page.says(".verdicts", "P(A > B)")
+    # The next answer never comes.
+    page.run("window.fetch = () => new Promise(() => {})")
+    page.run("location.hash = arguments[0]", "#/compare?sweeps=other-0,other-1")
+    page.wait("return document.querySelector('.compare-grid').hidden")
+
+
 def test_at_most_six_are_chosen(page: Page) -> None:
     page.open("#/?compare=cartpole-ppo,cartpole-seeds,other-0,other-1,other-2,other-3")
     page.says(".compare-bar", "6 sweeps chosen")

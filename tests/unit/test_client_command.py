@@ -19,9 +19,9 @@ from tune_jobs.cli.commands import cli
 from tune_jobs.cli.server import THERE
 from tune_jobs.client import Client
 from tune_jobs.client.answers import FileOfSweep
-from tune_jobs.service.http.download_routes import Film
 from tune_jobs.store.names import FILMS
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.outcome import Film
 
 YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\nconfirm: none\n"
 

@@ -1,5 +1,6 @@
 """What following sweeps takes: what is read again, what is kept of events and curves."""
 
+import contextlib
 import itertools
 import threading
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from sweep_folders import make_sweep_folder
 from tune_jobs.service import statuses as module
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.statuses import Statuses
+from tune_jobs.service.watching import Follower
 from tune_jobs.store.local_storage import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
@@ -239,3 +241,41 @@ def test_listeners_are_woken_and_forgotten() -> None:
         assert woken.is_set()
     assert log.num_listeners == 0
     assert log.has_ended
+
+
+class Quiet:
+    """A view in which nothing changes."""
+
+    interval_s = 0.5
+
+    def changes(self) -> list[Any]:
+        return []
+
+
+class Pauses:
+    """An event that is set when it has been waited for twice, and knows for how long."""
+
+    def __init__(self) -> None:
+        self.asked_s: list[float] = []
+
+    def wait(self, timeout_s: float) -> bool:
+        self.asked_s.append(timeout_s)
+        return len(self.asked_s) > 1
+
+    def set(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("num_clients", "wait_s"), [(1, 0.5), (100, 1.0), (1_000, 5.0)])
+def test_whoever_watches_waits_a_little_longer_the_more_do(
+    num_clients: int, wait_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follower, pauses = Follower("it", Quiet(), EventLog("s")), Pauses()
+    monkeypatch.setattr(follower, "_over", pauses)
+    with contextlib.ExitStack() as stack:
+        for _ in range(num_clients):
+            # Each a function of its own.
+            stack.enter_context(follower.log.listening(threading.Event().set))
+        follower.begin()
+        follower.join()
+    assert pauses.asked_s == [0.5, wait_s]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import time
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,19 @@ def test_a_sweeps_environments_find_their_process_there_and_it_ends_with_the_dri
             assert _children() - others == kept
     assert not _children() - others
     assert "tune_jobs.ray_tune.run_trials" in sys.modules
+
+
+def test_it_is_warm_only_when_all_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def import_slowly() -> None:
+        time.sleep(0.5)
+        done.append("all")
+
+    monkeypatch.setattr("tune_jobs.service.driver._import_all", import_slowly)
+    with contextlib.ExitStack() as stack:
+        warm_up(stack, _settings(tmp_path, warm=True))
+        assert done == ["all"]
 
 
 def test_a_driver_that_is_not_kept_starts_no_process(tmp_path: Path) -> None:

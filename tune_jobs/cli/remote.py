@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.client import Client, ConflictError
-from tune_jobs.store.names import FILMS
+from tune_jobs.sweeps.outcome import Film
 
 if TYPE_CHECKING:
     from analysis.comparison.compare import Comparison
@@ -88,7 +88,7 @@ class RemoteVerbs:
             )
         there = {file.path for file in self._client.files(source)}
         # Only names that are known here: others might lead out of the folder.
-        known = [film for film in FILMS if _FILMS + film in there]
+        known = [film for film in get_args(Film) if _FILMS + film in there]
         if output is None or _is_folder(output):
             wanted = {film: Path(output or ".") / f"{source}-{'.'.join(film.rsplit('_', 1))}" for film in known}
             names = {film: film for film in known}

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from analysis.notebook import brief_repr, facts_html
 from analysis.records import BestRecord, SweepRecord, TrialRecord
 from analysis.wording import counted
+
+Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
+"""What a film of a sweep's best policy is called; before is a random policy."""
 
 
 @dataclass(frozen=True)

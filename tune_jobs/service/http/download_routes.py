@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
@@ -16,11 +16,10 @@ from tune_jobs.service.http.downloads import NO_SCRIPTS, SANDBOX, Archive, Downl
 from tune_jobs.service.http.models import FileOfSweep
 from tune_jobs.service.service import Service
 from tune_jobs.store.contract import Sweep
+from tune_jobs.sweeps.outcome import Film
 from tune_jobs.sweeps.plain import to_json
 
 router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["downloads"])
-
-Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
 _PAGE_SUFFIX = ".html"
 _MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8", ".csv": "text/csv; charset=utf-8", ".svg": "image/svg+xml",
