@@ -37,7 +37,7 @@ _SCRIPTS = ("report.js", "vendor/echarts/echarts.min.js", "charts.js")
 
 
 def build_report(
-    folder: Path,
+    place: str,
     *,
     target: Path,
     sweep: SweepRecord,
@@ -51,7 +51,7 @@ def build_report(
     """Write the report of a sweep.
 
     Args:
-        folder: The sweep folder, as the report names it.
+        place: The sweep's folder or URL, as the report names it.
         target: The folder that the report is written to.
         sweep: The sweep's record.
         trials: All trials, in any status.
@@ -74,7 +74,7 @@ def build_report(
     if settings is None and best is not None:
         settings = best.settings
     results = bounded(results)
-    source = Source(folder, sweep, trials, results, best, goal, why_no_best, settings)
+    source = Source(place, sweep, trials, results, best, goal, why_no_best, settings)
     page = _render(
         source=source,
         figures=draw_figures(source, target / "figures"),

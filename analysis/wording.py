@@ -83,8 +83,12 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def shown_path(path: Path) -> str:
-    """Return a path as a user would type it: relative if it is below the current folder."""
+def shown_path(path: str | Path) -> str:
+    """Return a place as a user would type it: relative if it is below the current folder; a URL as it is."""
+    if isinstance(path, str):
+        if "://" in path:
+            return path
+        path = Path(path)
     try:
         here = Path.cwd()
     except FileNotFoundError:  # the current folder was deleted

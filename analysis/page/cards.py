@@ -93,9 +93,9 @@ def section(source: Source, films: Mapping[str, Path]) -> Cards:
     # The winner comes first.
     shown = sorted(films.items(), key=lambda item: item[0] == "before")
     return Cards(
-        policy=None if best is None else winner_card(best, source.trials, source.sweep, source.folder),
+        policy=None if best is None else winner_card(best, source.trials, source.sweep, source.place),
         setting=setting_card(source),
-        why_no_policy=source.why_no_best or why_no_best(source.trials, source.folder) if best is None else None,
+        why_no_policy=source.why_no_best or why_no_best(source.trials, source.place) if best is None else None,
         films=[_embed(name, path, titles) for name, path in shown if path.is_file()],
     )
 
@@ -116,7 +116,7 @@ def _url(media_type: str, data: bytes) -> str:
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRecord, folder: Path) -> dict[str, Any]:
+def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRecord, place: str) -> dict[str, Any]:
     """Return the winner's data: its point, both scores, its rivals, the random baseline, and how to load it."""
     confirmation, random, choice = best.confirmation, best.random, best.choice
     rng = random_streams.fixed()
@@ -127,7 +127,8 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
             interval = mean_with_ci(confirmation.returns, rng=rng)
         if _have_mean(random.returns) and random.seeds == confirmation.seeds:
             gain = paired_difference(confirmation.returns, random.returns, rng=rng)
-    policy = shown_path(folder / "best" / "policy.json")
+    # Of a sweep in an object store the sweep is what can be named: its best is what is evaluated.
+    policy = shown_path(place if "://" in place else Path(place, "best", "policy.json"))
     return {
         "trial_id": best.checkpoint.trial_id,
         "iteration": best.checkpoint.iteration,
@@ -182,7 +183,7 @@ def _solved_badge(setting: SettingRecord) -> tuple[str, str] | None:
     return (f"solved with {setting.num_solved:,} of {counted(num_seeds, 'seed')}", kind)
 
 
-def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
+def why_no_best(trials: Sequence[TrialRecord], place: str) -> tuple[str, str]:
     """Return message and hint for a sweep that has no confirmed winner."""
     try:
         selection = select_best(trials)
@@ -190,7 +191,7 @@ def why_no_best(trials: Sequence[TrialRecord], folder: Path) -> tuple[str, str]:
         return error.message, error.hint
     return (
         f"{selection.trial.trial_id} leads with {return_text(selection.score)}, not confirmed on fresh seeds yet.",
-        f"Run: tune-jobs best {shlex.quote(shown_path(folder))}",
+        f"Run: tune-jobs best {shlex.quote(shown_path(place))}",
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from analysis import report_data
@@ -22,8 +21,8 @@ from analysis.wording import number, shown_path
 class Source:
     """The data that a report is made from; every section of the page is a function of it."""
 
-    folder: Path
-    """The sweep folder, as the report names it."""
+    place: str
+    """The sweep's folder or URL, as the report names it."""
     sweep: SweepRecord
     trials: Sequence[TrialRecord]
     results: Mapping[str, Sequence[IterationRecord]]
@@ -53,8 +52,8 @@ class Source:
 
     @property
     def path(self) -> str:
-        """The sweep folder as a user would type it."""
-        return shown_path(self.folder)
+        """The sweep's place as a user would type it."""
+        return shown_path(self.place)
 
     @property
     def is_trained(self) -> bool:

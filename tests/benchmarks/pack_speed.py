@@ -12,7 +12,6 @@ import pstats
 import statistics
 import time
 from collections import defaultdict
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -49,7 +48,7 @@ def tasks(algorithm: str, num_members: int) -> list[TrialTask]:
         points = [dqn.settings()[1].model_dump(mode="json")] * num_members
     return [
         TrialTask(
-            sweep_folder=Path(),
+            sweep_place=".",
             trial_id=f"t{index:04d}",
             seed=1024 * index,
             algorithm=algorithm,

@@ -33,7 +33,7 @@ def make_result(name: str = "mine") -> SweepResult:
         num_trials=0,
         created_at=0.0,
     )
-    return SweepResult(Path(name), sweep, [])
+    return SweepResult(name, sweep, [])
 
 
 @run_alone

@@ -50,7 +50,7 @@ class Page(HTMLParser):
 def report(tmp_path: Path, synthetic: Synthetic, videos: dict[str, Path] | None = None) -> tuple[Path, str, Page]:
     """Write the report of a sweep; its path, its HTML and what is on the page."""
     path = build_report(
-        tmp_path,
+        str(tmp_path),
         target=tmp_path / "report",
         sweep=synthetic.sweep,
         trials=synthetic.trials,

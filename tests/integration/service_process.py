@@ -11,7 +11,7 @@ from tune_jobs.service.job_files import SERVICE_FOLDER
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
 from tune_jobs.service.supervisor import Supervisor, Surroundings
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 
 
 def main(folder: Path, url: str, beat: Path) -> None:

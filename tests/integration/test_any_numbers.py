@@ -56,7 +56,7 @@ def made(request: pytest.FixtureRequest) -> Synthetic:
 
 def test_the_report_and_the_tables_are_made(made: Synthetic, tmp_path: Path) -> None:
     path = build_report(
-        tmp_path, target=tmp_path / "report", sweep=made.sweep, trials=made.trials, results=made.results,
+        str(tmp_path), target=tmp_path / "report", sweep=made.sweep, trials=made.trials, results=made.results,
         best=made.best, videos={},
     )  # fmt: skip
     assert "winner" in path.read_text().lower()
@@ -119,7 +119,7 @@ def test_a_trial_with_returns_of_nan_and_infinity_goes_on_and_is_reported(tmp_pa
     assert repr([record.episode_returns[0] for record in results]) == repr([VALUES[i % 4] for i in range(1, 13)])
     made = make_sweep(points=[{"lr": 0.1}])
     report = build_report(
-        tmp_path, target=tmp_path / "report", sweep=made.sweep, trials=made.trials, results={"t0000": results},
+        str(tmp_path), target=tmp_path / "report", sweep=made.sweep, trials=made.trials, results={"t0000": results},
         best=made.best, videos={},
     )  # fmt: skip
     assert report.is_file()

@@ -92,7 +92,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
     found = types.SimpleNamespace(machine=None, checked=[])
     joined = contextlib.nullcontext(found)
     monkeypatch.setattr("tune_jobs.sweeps.dry_run.connected", lambda address, here: joined)
-    monkeypatch.setattr("tune_jobs.sweeps.dry_run._check_nodes", lambda folder: found.checked.append(folder.is_dir()))
+    check = "tune_jobs.sweeps.dry_run._check_nodes"
+    monkeypatch.setattr(check, lambda place: found.checked.append(Path(place).is_dir()))
     return found
 
 

@@ -43,7 +43,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def run_sweep(store: SweepStore, plan: SweepPlan, **settings: Any) -> SweepResult:
         seen.append((store.read_record(), store.read_trials(), plan, settings))
-        return SweepResult(store.folder, store.read_record(), store.read_trials())
+        return SweepResult(store.place, store.read_record(), store.read_trials())
 
     monkeypatch.setattr("tune_jobs.sweeps.verbs.run_sweep", run_sweep)
     monkeypatch.setattr("tune_jobs.sweeps.resume.run_sweep", run_sweep)

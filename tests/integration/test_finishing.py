@@ -71,7 +71,7 @@ def sweep_of(tmp_path: Path) -> Callable[..., SweepStore]:
 
 
 def finished(store: SweepStore) -> SweepResult:
-    return finish_sweep(store, SweepResult(store.folder, store.read_record(), store.read_trials()))
+    return finish_sweep(store, SweepResult(store.place, store.read_record(), store.read_trials()))
 
 
 @pytest.mark.parametrize(

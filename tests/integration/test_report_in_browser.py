@@ -44,7 +44,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for shade in range(0, 250, 10):
             film.add(Image.new("RGB", (64, 48), (shade, 0, 0)))
     return build_report(
-        folder, target=folder / "report", sweep=made.sweep, trials=made.trials, results=made.results,
+        str(folder), target=folder / "report", sweep=made.sweep, trials=made.trials, results=made.results,
         best=present(made.best), videos={"after": folder / "after.mp4"},
     )  # fmt: skip
 

@@ -102,7 +102,7 @@ def test_hostile_text_is_never_html(tmp_path: Path) -> None:
 
 def test_a_winner_the_selection_has_moved_from_is_called_out(tmp_path: Path) -> None:
     synthetic = make_sweep(points=[{"lr": 1e-3}, {"lr": 3e-3}])
-    assert not winner_card(present(synthetic.best), synthetic.trials, synthetic.sweep, tmp_path)["stale"]
+    assert not winner_card(present(synthetic.best), synthetic.trials, synthetic.sweep, str(tmp_path))["stale"]
     old = CheckpointRecord(trial_id="t0000", iteration=1, num_env_steps=1)
     synthetic.best = present(synthetic.best).model_copy(update={"checkpoint": old})
     _, _, page = report(tmp_path, synthetic)
@@ -113,7 +113,7 @@ def test_returns_that_are_not_finite_cost_only_their_interval(tmp_path: Path) ->
     synthetic = make_sweep()
     broken = present(synthetic.best).confirmation.model_copy(update={"returns": (float("nan"),) * 100})
     best = present(synthetic.best).model_copy(update={"confirmation": broken})
-    card = winner_card(best, synthetic.trials, synthetic.sweep, tmp_path)
+    card = winner_card(best, synthetic.trials, synthetic.sweep, str(tmp_path))
     assert card["interval"] is None
     assert card["gain"] is None
 

@@ -34,7 +34,7 @@ EVALUATION_SEEDS = tuple(range(1000, 1020))
 
 def task_of(spec: SweepSpec, index: int, folder: Path) -> TrialTask:
     return TrialTask(
-        sweep_folder=folder,
+        sweep_place=str(folder),
         trial_id=f"t{index:04d}",
         seed=1024 * (index + 1),
         algorithm=spec.algorithm,

@@ -41,7 +41,7 @@ def make_tasks(folder: Path) -> list[TrialTask]:
     }  # fmt: skip
     return [
         TrialTask(
-            sweep_folder=folder,
+            sweep_place=str(folder),
             trial_id=f"lr{lr:g}-seed{seed}",
             seed=1024 * seed,
             algorithm="ppo",

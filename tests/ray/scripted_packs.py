@@ -95,9 +95,9 @@ def scripted_trainable(scripts: dict[str, dict[str, Any]], pause_s: float) -> ty
             for trial_id, task in self.tasks.items():
                 self.iterations[trial_id] += 1
                 iteration, script = self.iterations[trial_id], scripts.get(trial_id, {})
-                while "after" in script and not (task.sweep_folder / script["after"]).exists():
+                while "after" in script and not (Path(task.sweep_place) / script["after"]).exists():
                     time.sleep(0.01)
-                marker = task.sweep_folder / f"{trial_id}.kills"
+                marker = Path(task.sweep_place) / f"{trial_id}.kills"
                 kills = int(marker.read_text()) if marker.exists() else 0
                 if iteration == script.get("kill_at") and kills < script.get("kills", 1):
                     marker.write_text(str(kills + 1))
@@ -160,7 +160,7 @@ def run_packs(
         num_packs=num_packs, slots=slots, cpus_per_pack=1.0, gpus_per_pack=0.0, trial_ids=trial_ids or todo,
         env_kind="scalar", env_step_us=None, num_env_processes=0,
     )  # fmt: skip
-    job = RunJob(store.folder, todo, 1.0, 0.0, 2, packs=packs)
+    job = RunJob(store.place, todo, 1.0, 0.0, 2, packs=packs)
     with mock.patch("tune_jobs.ray_tune.run_trials.PackTrainable", scripted_trainable(scripts or {}, pause_s)):
         run_trials(job, listener or (lambda record: None))
     return store.read_trials()

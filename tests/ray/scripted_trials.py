@@ -53,7 +53,7 @@ def run_scripted(
     tune.Tuner(
         tune.with_resources(Scripted, {"CPU": 1}),
         param_space={
-            "sweep_folder": str(folder),
+            "sweep_place": str(folder),
             "trial_id": tune.grid_search([f"t{index:04d}" for index in range(len(scores))]),
         },
         tune_config=tune.TuneConfig(

@@ -57,7 +57,7 @@ def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path: Path) -> None:
 
     before = everything()
     with pytest.raises(OwnershipLostError):
-        run_trials(RunJob(store.folder, ("t0000",), 1.0, 0.0, 1, run=run.token), lambda record: None)
+        run_trials(RunJob(store.place, ("t0000",), 1.0, 0.0, 1, run=run.token), lambda record: None)
     assert everything() == before
 
 
@@ -71,7 +71,7 @@ def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(
     for name in damaged:
         (store.trial("t0000").folder / "damaged" / name).mkdir(parents=True)
     trainable = TrialTrainable.__new__(TrialTrainable)
-    trainable._trial = (store.folder, "t0000")
+    trainable._trial = (store.place, "t0000")
     if fits:
         trainable.load_checkpoint(str(tmp_path))
     else:

@@ -23,12 +23,12 @@ OPENED = {
 from tune_jobs.ray_tune.trainable import TrialLog, TrialTrainable
 trial = TrialTrainable.__new__(TrialTrainable)
 trial._log, trial._evaluators, trial._engine, trial._run = TrialLog(), {}, None, None
-trial._open(Path(folder), "t0000")
+trial._open(folder, "t0000")
 """,
     "pack": """
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 pack = PackTrainable.__new__(PackTrainable)
-pack._config = {"sweep_folder": folder, "engine": "packed", "env_kind": "scalar", "num_env_processes": 0}
+pack._config = {"sweep_place": folder, "engine": "packed", "env_kind": "scalar", "num_env_processes": 0}
 pack._owner, pack._file = None, open(Path(folder) / "trials/t0000/log.txt", "ab")
 pack._open()
 """,

@@ -38,7 +38,7 @@ ITERATIONS = 3
 Trained = tuple[Path, TrialTask, PortablePolicy, dict[str, Any]]
 
 
-def task_of(folder: Path, trial_id: str = "t0000", **values: Any) -> TrialTask:
+def task_of(folder: str | Path, trial_id: str = "t0000", **values: Any) -> TrialTask:
     # 1.2 updates a phase: some are due and not made.
     return make_task(folder, "dqn", trial_id=trial_id, **{**SMALL, "updates_per_env_step": 0.3, **values})
 
@@ -116,7 +116,7 @@ def test_a_trial_goes_on_from_its_checkpoint_and_fills_its_memory_first(trained:
         for layer, other in zip(engine.policy("t0000").network.layers, policy.network.layers, strict=True):
             np.testing.assert_array_equal(layer.weight, other.weight)
         if beside_others:
-            engine.add(task_of(task.sweep_folder, "t0001", **values), None)
+            engine.add(task_of(task.sweep_place, "t0001", **values), None)
         counts = []
         for _ in range(3):
             stats = engine.train_iteration()["t0000"]

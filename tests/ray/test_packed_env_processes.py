@@ -46,7 +46,7 @@ def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(
     write_new(store, spec, plan, None)
     pids.unlink()
     job = RunJob(
-        store.folder, ("t0000",), plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent, packs=packs
+        store.place, ("t0000",), plan.cpus_per_trial, plan.gpus_per_trial, plan.max_concurrent, packs=packs
     )  # fmt: skip
     run_trials(job, lambda record: None)
     (record,) = store.read_trials()

@@ -217,7 +217,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory, ray_session: None) -> S
         normalize_observations=True, activation="silu", hidden_sizes=[12],
     )  # fmt: skip
     engine.add(task, None)
-    engine.add(make_task(task.sweep_folder, trial_id="t0001", use_kl_loss=True, normalize_observations=True), None)
+    engine.add(make_task(task.sweep_place, trial_id="t0001", use_kl_loss=True, normalize_observations=True), None)
     for _ in range(3):
         engine.train_iteration()
     folder = tmp_path_factory.mktemp("checkpoints") / "000003"

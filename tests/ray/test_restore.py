@@ -39,7 +39,7 @@ def trained(
     task = make_task(tmp_path_factory.mktemp("sweep"), request.param)
     engine = RLlibEngine()
     progress = run_trial(task, engine)
-    yield task.sweep_folder / progress.checkpoints[-1].path, engine.algorithm
+    yield Path(task.sweep_place) / progress.checkpoints[-1].path, engine.algorithm
     engine.close()
 
 

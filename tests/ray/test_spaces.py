@@ -52,7 +52,7 @@ def train_packed(engine: PackedEngine, task: TrialTask) -> Path:
     for _ in range(2):
         (result,) = engine.train_iteration().values()
         assert not isinstance(result, Exception), result
-    folder = task.sweep_folder / "packed"
+    folder = Path(task.sweep_place) / "packed"
     folder.mkdir()
     save_policy(engine.policy(task.trial_id), folder)
     engine.save(task.trial_id, folder)

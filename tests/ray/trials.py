@@ -22,12 +22,12 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
-def make_task(folder: Path, algorithm: str = "ppo", **changes: Any) -> TrialTask:
+def make_task(folder: str | Path, algorithm: str = "ppo", **changes: Any) -> TrialTask:
     """A trial of a few iterations; hyperparameters by name, other fields of `TrialTask` too."""
     fields = {name: changes.pop(name) for name in list(changes) if name in TrialTask.__dataclass_fields__}
     return TrialTask(
         **{
-            "sweep_folder": Path(folder),
+            "sweep_place": str(folder),
             "trial_id": "t0000",
             "seed": TRIAL_SEED,
             "algorithm": algorithm,

@@ -122,6 +122,6 @@ def make_task(folder: Path, **changes: Any) -> TrialTask:
     } | changes
     values = {name: sections[name](**value) if name in sections else value for name, value in values.items()}
     return TrialTask(
-        sweep_folder=folder, trial_id="t0000", seed=1024, algorithm="ppo", env_id="CartPole-v1",
+        sweep_place=str(folder), trial_id="t0000", seed=1024, algorithm="ppo", env_id="CartPole-v1",
         env_args={}, evaluation_seeds=(1, 2), **values,
     )  # fmt: skip

@@ -1,6 +1,5 @@
 """What the sections of a report are made from, of sweeps that look like real ones."""
 
-from pathlib import Path
 from typing import Any
 
 from synthetic_sweep import Synthetic
@@ -15,7 +14,7 @@ def source_of(synthetic: Synthetic, settings: SettingsRecord | None = None) -> S
     if settings is None and best is not None:
         settings = best.settings
     goal = goal_of(synthetic.sweep, best)
-    return Source(Path("sweep"), synthetic.sweep, synthetic.trials, synthetic.results, best, goal, None, settings)
+    return Source("sweep", synthetic.sweep, synthetic.trials, synthetic.results, best, goal, None, settings)
 
 
 def setting(index: int, seeds: list[str], num_solved: int | None, **fields: Any) -> SettingRecord:

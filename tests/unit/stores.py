@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from tune_jobs.store.contract import Storage, Sweep
-from tune_jobs.store.local_storage import open_storage, open_sweep
+from tune_jobs.store.opening import open_storage, open_sweep
 
 
 class Harness(Protocol):
@@ -17,7 +17,7 @@ class Harness(Protocol):
         """The storage, opened anew: what another process sees."""
 
     def by_place(self, sweep: Sweep) -> Sweep:
-        """A sweep, opened anew by what its `folder` says."""
+        """A sweep, opened anew by its place."""
 
     def keys(self, sweep: str) -> set[str]:
         """What is kept of a sweep, hidden names too."""
@@ -42,7 +42,7 @@ class LocalHarness:
         return open_storage(self._folder)
 
     def by_place(self, sweep: Sweep) -> Sweep:
-        return open_sweep(sweep.folder)
+        return open_sweep(sweep.place)
 
     def keys(self, sweep: str) -> set[str]:
         root = self._folder / sweep

@@ -155,7 +155,7 @@ def make_task(folder: Path, algorithm: Algorithm = "random", **changes: Any) -> 
         "checkpoints": CheckpointSpec(every_iterations=2),
     } | changes
     return TrialTask(
-        sweep_folder=folder, trial_id="t0000", seed=5 * 1024, algorithm=algorithm, env_args={},
+        sweep_place=str(folder), trial_id="t0000", seed=5 * 1024, algorithm=algorithm, env_args={},
         evaluation_seeds=(1, 2), **values,
     )  # fmt: skip
 

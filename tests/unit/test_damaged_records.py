@@ -11,7 +11,7 @@ from sweep_folders import make_sweep_folder
 from policies.errors import CheckpointError
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.store.candidates import _warn
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
 

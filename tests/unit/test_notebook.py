@@ -74,14 +74,14 @@ LARGE_BEST = BEST.model_copy(
 SO_FAR = BestSoFar("t0001", 1, 5, LARGE[0].point, 7, 1.0)
 STATUS = SweepStatus(LARGE_SWEEP, {"failed": 1_000}, alive=True, best=SO_FAR)
 RESULT = SweepResult(
-    Path(f"/a/{EVIL}"), LARGE_SWEEP, LARGE, LARGE_BEST, EVIL * 1_000, {EVIL: Path(EVIL)}, notes=(EVIL * 100,) * 100
+    f"/a/{EVIL}", LARGE_SWEEP, LARGE, LARGE_BEST, EVIL * 1_000, {EVIL: Path(EVIL)}, notes=(EVIL * 100,) * 100
 )
 
 
 @pytest.mark.parametrize(
     "shown",
     [
-        RESULT, STATUS, LARGE_BEST, Trials(LARGE), Sweeps([STATUS] * 1_000), CreatedSweep(EVIL, Path(f"/a/{EVIL}")),
+        RESULT, STATUS, LARGE_BEST, Trials(LARGE), Sweeps([STATUS] * 1_000), CreatedSweep(EVIL, f"/a/{EVIL}"),
         Films({EVIL: Path(f"/a/{EVIL}.mp4")}),
     ],
 )  # fmt: skip
@@ -117,13 +117,13 @@ def test_a_list_says_how_many_it_does_not_show() -> None:
 
 
 def test_a_result_tells_what_a_person_asks_first() -> None:
-    result = SweepResult(Path("sweeps/mine"), SWEEP, TRIALS, BEST, None, {"report": Path("report/index.html")})
+    result = SweepResult("sweeps/mine", SWEEP, TRIALS, BEST, None, {"report": Path("report/index.html")})
     text = read(result._repr_html_()).text
     for part in ("Sweep mine: completed", "2 trials: 1 failed, 1 completed", "t0000: ValueError", "sweeps/mine"):
         assert part in text
     for part in ("lr 3e-05", "200.0 mean evaluation return", "195.0 over 2 fresh episodes; gap +5.0", "21.0", "solved"):
         assert part in text
-    assert repr(result).startswith("SweepResult(folder=PosixPath('sweeps/mine'), state='completed', ")
+    assert repr(result).startswith("SweepResult(place='sweeps/mine', state='completed', ")
     assert "best='t0001 scored 200.0'" in repr(result)
 
 

@@ -27,7 +27,7 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SweepStore:
         for trial in store.read_trials():
             if trial.status not in FINISHED:
                 train(store, trial.trial_id, 6, scores=partial(score, trial))
-        return SweepResult(store.folder, store.read_record(), store.read_trials(), interrupted=False)
+        return SweepResult(store.place, store.read_record(), store.read_trials(), interrupted=False)
 
     monkeypatch.setattr(stages, "run_trials_of", run_trials)
     monkeypatch.setattr(stages, "finish_sweep", lambda store, result, *_, **__: result)

@@ -1,7 +1,5 @@
 """What the report says of what mattered."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from synthetic_sweep import make_points, make_sweep
@@ -16,7 +14,7 @@ from analysis.wording import NONE
 def mattered(num_samples: int, objective: str = "final") -> Mattered:
     made = make_sweep(points=make_points(num_samples, np.random.default_rng(1)), failed=[2])
     made.sweep.spec["objective"] = {"type": objective}
-    return section(Source(Path("s"), made.sweep, made.trials, made.results, made.best, goal=195.0))
+    return section(Source("s", made.sweep, made.trials, made.results, made.best, goal=195.0))
 
 
 @pytest.fixture(scope="module")
@@ -70,5 +68,5 @@ def test_names_in_a_sentence() -> None:
 def test_a_sweep_without_a_space_says_nothing() -> None:
     made = make_sweep(points=[{}, {}])
     made.sweep.spec["space"] = {}
-    assert section(Source(Path("s"), made.sweep, made.trials, made.results, made.best, goal=None)).sentences == []
+    assert section(Source("s", made.sweep, made.trials, made.results, made.best, goal=None)).sentences == []
     assert sentences(what_mattered(made.sweep, made.trials, made.results)) != []

@@ -10,7 +10,7 @@ from sweep_folders import make_sweep_folder
 from tune_jobs.service import derived as module
 from tune_jobs.service.derived import Derived
 from tune_jobs.service.statuses import Statuses
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 
 NAMES = ("a", "b", "c")
 

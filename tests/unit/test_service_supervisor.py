@@ -26,7 +26,7 @@ from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
 from tune_jobs.service.supervisor import Supervisor, Surroundings
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 
 PATIENCE_S = 60.0

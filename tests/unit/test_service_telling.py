@@ -22,7 +22,7 @@ from tune_jobs.service.events import Watch
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.statuses import Seen, Statuses
 from tune_jobs.service.telling import COMMAND, WAITS_S, Teller, signature
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 
 # ruff: noqa: F811 - fixtures are named as arguments
 

@@ -15,7 +15,7 @@ from tune_jobs.service import statuses as module
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.watching import Follower
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.sweeps.curves import Curves

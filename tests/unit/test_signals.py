@@ -4,7 +4,6 @@ import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from signal import Signals
 
 import pytest
@@ -34,7 +33,7 @@ def make_result() -> SweepResult:
         num_trials=0,
         created_at=0.0,
     )
-    return SweepResult(Path("mine"), sweep, [])
+    return SweepResult("mine", sweep, [])
 
 
 @pytest.fixture(autouse=True)

@@ -107,10 +107,10 @@ def test_a_sweep_of_the_same_points_again_is_not_extended(
     store = create_store("mine", "x", tmp_path)
     write_new(store, spec, make_plan(spec, Machine(1)), None)
     store.write_record(store.read_record().model_copy(update={"state": "completed"}))
-    before = {path: path.read_bytes() for path in store.folder.rglob("*.json")}
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
     with pytest.raises(SpecError, match=f"cannot be extended: {why}.*\n.*seeds_per_point"):
         sweeps.extend("mine", 1, storage=tmp_path)
-    assert {path: path.read_bytes() for path in store.folder.rglob("*.json")} == before
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
 
 
 @pytest.mark.parametrize(

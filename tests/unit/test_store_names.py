@@ -28,7 +28,7 @@ HANDED_OUT = {
     for module in (contract, trial_contract)
     for node in ast.walk(ast.parse(Path(present(module.__file__)).read_text()))
     if isinstance(node, ast.FunctionDef) and node.returns is not None and "Path" in ast.unparse(node.returns)
-} | {"sweep_folder", "storage"}
+} | {"folder", "place", "sweep_place", "storage"}
 ADDING = {"joinpath", "with_name", "with_stem", "with_suffix", "glob", "rglob", "iterdir", "relative_to", "parent"}
 
 
@@ -61,6 +61,8 @@ def known(source: str) -> Iterator[tuple[int, str]]:
                 yield node.lineno, ast.unparse(node)
             case ast.Call(func=ast.Attribute(attr="join"), args=[ast.AST() as first, *_]) if is_handed_out(first):
                 yield node.lineno, ast.unparse(node)
+            case ast.Call(func=ast.Name(id="Path"), args=[ast.Attribute(attr="place" | "sweep_place"), *_]):
+                yield node.lineno, ast.unparse(node)  # a URL is none
             case ast.Name(id=name) if name in imported and node not in in_texts:
                 yield node.lineno, name
             case ast.ImportFrom(module="tune_jobs.store.places"):
@@ -91,8 +93,9 @@ def is_handed_out(node: Any) -> bool:
         'FILMS = {"before": "before.mp4"}',
         'store.best_folder / "x"',
         "store.folder / name",
-        'Path(config["sweep_folder"]) / name',
-        'os.path.join(job.sweep_folder, "x")',
+        'Path(config["sweep_place"]) / name',
+        'os.path.join(job.sweep_place, "x")',
+        "Path(store.place)",
         "store.checkpoint_folder(record) / name",
         "list(store.folder.iterdir())",
         "(trial.checkpoint_folder(3) / 'x').parent",

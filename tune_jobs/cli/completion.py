@@ -117,7 +117,7 @@ def _sweep_names(ctx: click.Context, incomplete: str) -> list[str]:
     server = server_to_complete_from(ctx)
     if server is not None:
         return _asked(server, lambda client: _names_there(client, incomplete))
-    from tune_jobs.store.local_storage import open_storage
+    from tune_jobs.store.opening import open_storage
     from tune_jobs.sweeps.storage import storage_folder
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):
@@ -170,7 +170,7 @@ def _asked(server: Server, names: Callable[[Client], list[str]]) -> list[str]:
 
 def _of_sweep(ctx: click.Context, sweep: str, names: Callable[[Sweep], list[str]]) -> list[str]:
     from policies.errors import TuneJobsError
-    from tune_jobs.store.local_storage import open_storage
+    from tune_jobs.store.opening import open_storage
     from tune_jobs.sweeps.storage import storage_folder
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):

@@ -50,7 +50,8 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
     else:
         from analysis.wording import shown_path
 
-        paths = {name: shown_path(path) for name, path in {"sweep": result.folder, **result.artifacts}.items()}
+        made = {name: shown_path(path) for name, path in result.artifacts.items()}
+        paths = {"sweep": shown_path(result.place), **made}
         print_outcome(
             result.sweep, result.trials, best=result.best, why_no_best=result.why_no_best, paths=paths,
             notes=result.notes,

@@ -40,7 +40,7 @@ from tune_jobs.ray_tune.connected_ray import (
 from tune_jobs.ray_tune.environment import prepare_environment, provide_token
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.probe import answer
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
@@ -244,13 +244,13 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def check_storage(folder: Path) -> None:
-    """Check, by a worker on every node, that the node reads and writes the same folder as this process.
+def check_storage(sweep_place: str) -> None:
+    """Check, by a worker on every node, that the node reads and writes the same sweep as this process.
 
     Raises:
         CannotRunError: A node does not, or has another version of tune-jobs; the message names the node.
     """
-    with open_sweep(folder).probing() as probe:
+    with open_sweep(sweep_place).probing() as probe:
         tasks = {}
         for node in alive_nodes():
             strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
@@ -258,7 +258,7 @@ def check_storage(folder: Path) -> None:
             name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"
             tasks[name] = (remote.remote(probe.place, node["NodeID"]), node["NodeID"])
         for name, (task, node_id) in tasks.items():
-            _check_answer(name, task, folder, functools.partial(probe.is_same, machine=node_id))
+            _check_answer(name, task, sweep_place, functools.partial(probe.is_same, machine=node_id))
 
 
 def _answer(place: str, node_id: str) -> tuple[str, str]:
@@ -266,7 +266,7 @@ def _answer(place: str, node_id: str) -> tuple[str, str]:
     return answer(place, node_id), version("tune-jobs")
 
 
-def _check_answer(name: str, task: Any, folder: Path, is_same: Callable[[str], bool]) -> None:
+def _check_answer(name: str, task: Any, place: str, is_same: Callable[[str], bool]) -> None:
     storage_hint = "Choose storage that every node reaches (a network file system) with --storage."
     try:
         question, their_version = ray.get(task, timeout=_PROBE_TIMEOUT_S)
@@ -283,12 +283,12 @@ def _check_answer(name: str, task: Any, folder: Path, is_same: Callable[[str], b
                 "Install the same version on every node, or use its image.",
             ) from error
         if isinstance(cause, FileNotFoundError):
-            raise CannotRunError(f"Node {name} does not see the sweep folder {folder}.", storage_hint) from error
+            raise CannotRunError(f"Node {name} does not see the sweep folder {place}.", storage_hint) from error
         raise CannotRunError(
-            f"Node {name} cannot use the sweep folder {folder}: {_last_line(cause)}", storage_hint
+            f"Node {name} cannot use the sweep folder {place}: {_last_line(cause)}", storage_hint
         ) from error
     if not is_same(question):
-        raise CannotRunError(f"Node {name} sees another folder under the name {folder}.", storage_hint)
+        raise CannotRunError(f"Node {name} sees another folder under the name {place}.", storage_hint)
     if their_version != version("tune-jobs"):
         raise CannotRunError(
             f"Node {name} has tune-jobs {their_version}, {socket.gethostname()} has {version('tune-jobs')}.",

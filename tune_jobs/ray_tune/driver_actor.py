@@ -8,6 +8,7 @@ when a client is killed, Ray ends the actor only half a minute later, and until 
 from __future__ import annotations
 
 import contextlib
+import shlex
 import threading
 import time
 from typing import Any
@@ -18,7 +19,7 @@ from ray.exceptions import RayActorError
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError
 from tune_jobs.ray_tune.run_trials import RunJob, run_trials
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.record_keeper import Listener
 
 _POLL_INTERVAL_S = 0.5
@@ -39,7 +40,7 @@ class RemoteDriver:
         Raises:
             CannotRunError: Another driver runs this sweep.
         """
-        with open_sweep(job.sweep_folder).driver_lock():
+        with open_sweep(job.sweep_place).driver_lock():
             run_trials(job, self._take)
 
     def _take(self, record: TrialRecord) -> None:
@@ -72,9 +73,10 @@ def run_trials_remotely(job: RunJob, listener: Listener) -> None:
         ray.get(running)
     except (RayActorError, ConnectionError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        go_on = f"tune-jobs resume {shlex.quote(job.sweep_place)}"
         raise CannotRunError(
             f"The sweep's driver on the cluster was lost: {reason}",
-            f"What is done is kept; continue with `tune-jobs resume {job.sweep_folder}` once the cluster works again.",
+            f"What is done is kept; continue with `{go_on}` once the cluster works again.",
         ) from error
     finally:
         with contextlib.suppress(Exception):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import traceback
 from collections.abc import Sequence
-from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from ray import tune
@@ -26,7 +25,7 @@ from tune_jobs.ray_tune.trainable import (
     this_node,
     watchdog,
 )
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.training.pack_loop import PackLoop
 from tune_jobs.training.protocol import PackEngine
 from tune_jobs.training.registry import make_pack_engine
@@ -37,12 +36,12 @@ if TYPE_CHECKING:
 
 
 class PackTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs a pack; `config` holds `sweep_folder`, `pack_id`, `engine`, `env_kind` and `num_env_processes`."""
+    """Runs a pack; `config` holds `sweep_place`, `pack_id`, `engine`, `env_kind` and `num_env_processes`."""
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error is raised there."""
         self._config = config
-        self._files = open_sweep(Path(config["sweep_folder"])).pack(config["pack_id"])
+        self._files = open_sweep(config["sweep_place"]).pack(config["pack_id"])
         run = owner_of_run(config)
         self._owner = self._files.take(run)
         end_with_driver(config, self._owner)
@@ -86,7 +85,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         return evaluate_many(evaluator, policies)
 
     def _open(self) -> PackLoop:
-        self._reader = reader = TaskReader(Path(self._config["sweep_folder"]))
+        self._reader = reader = TaskReader(self._config["sweep_place"])
         spec = reader.spec
         allow_modules(reader.sweep.allowed_modules)
         self._is_scheduled = spec.scheduler.type != "none"

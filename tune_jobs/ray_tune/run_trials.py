@@ -10,7 +10,6 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ray import tune
@@ -36,7 +35,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 
@@ -48,7 +47,8 @@ STOP_GRACE_S = 20.0
 class RunJob:
     """The trials that a run has to run."""
 
-    sweep_folder: Path
+    sweep_place: str
+    """The sweep's place, for `open_sweep`."""
     trial_ids: tuple[str, ...]
     cpus_per_trial: float
     gpus_per_trial: float
@@ -71,7 +71,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         CannotRunError: A part of Ray died; the records are written.
     """
     prepare_environment()
-    store = open_sweep(job.sweep_folder)
+    store = open_sweep(job.sweep_place)
     owner = store.take() if job.run is None else store.owner(job.run)
     with owner.held():
         store.clear_tune_folder()
@@ -105,7 +105,7 @@ class _Run:
         self._watch = watch
         self._store = self.store = store
         # The settings of every process: its sweep, its run, and the driver with which it ends.
-        self._config = {"sweep_folder": str(store.folder), "run": owner.token, "driver": this_process()}
+        self._config = {"sweep_place": store.place, "run": owner.token, "driver": this_process()}
         self._record = store.read_record()
         self._spec = stored_spec(self._record)
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)

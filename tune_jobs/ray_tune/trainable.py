@@ -1,6 +1,6 @@
 """The Ray Tune Trainable of single trials: one warm process that runs one trial after another.
 
-Tune gives it only a sweep folder and a trial id; everything else is read from the sweep folder, so a trial that is
+Tune gives it only a sweep's place and a trial id; everything else is read from the sweep, so a trial that is
 started again on any node continues from what is on disk.
 """
 
@@ -32,8 +32,8 @@ from tune_jobs.ray_tune.tune_scheduler import METRIC
 from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Ownership
-from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.logs import begin_log
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.progress import Progress
 from tune_jobs.training.protocol import TrainingEngine, TrialTask
 from tune_jobs.training.registry import make_engine
@@ -77,14 +77,14 @@ class TaskReader:
     """Reads trials to run from a sweep folder; it reads the sweep's own record only once.
 
     Args:
-        sweep_folder: The sweep's folder.
+        sweep_place: The sweep's place.
 
     Raises:
         NotFoundError: There is no sweep there.
     """
 
-    def __init__(self, sweep_folder: Path) -> None:
-        self.store = open_sweep(sweep_folder)
+    def __init__(self, sweep_place: str) -> None:
+        self.store = open_sweep(sweep_place)
         self.sweep = self.store.read_record()
         self.spec = stored_spec(self.sweep)
 
@@ -97,7 +97,7 @@ class TaskReader:
         """
         spec, trial = self.spec, self.store.trial(trial_id).read_record()
         return TrialTask(
-            sweep_folder=self.store.folder,
+            sweep_place=self.store.place,
             trial_id=trial_id,
             seed=trial.seed,
             algorithm=spec.algorithm,
@@ -143,7 +143,7 @@ def compared_by(progress: Progress) -> dict[str, Any]:
 
 def owner_of_run(config: Mapping[str, Any]) -> Ownership | None:
     """Return the ownership of the run that a process was started for; None if it was started for none."""
-    return open_sweep(Path(config["sweep_folder"])).owner(config["run"]) if config.get("run") else None
+    return open_sweep(config["sweep_place"]).owner(config["run"]) if config.get("run") else None
 
 
 def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> None:
@@ -162,7 +162,7 @@ def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> Non
 
 
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs trials; `config` holds `sweep_folder` and `trial_id`, and from the driver `run` and `driver`."""
+    """Runs trials; `config` holds `sweep_place` and `trial_id`, and from the driver `run` and `driver`."""
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the trial; it is built in the first step, so that every error is raised there."""
@@ -185,7 +185,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
     def _take(self, config: Mapping[str, Any]) -> None:
         if self._loop is not None:
             end_tally(self._loop.task.trial_id)
-        self._trial = (Path(config["sweep_folder"]), str(config["trial_id"]))
+        self._trial = (str(config["sweep_place"]), str(config["trial_id"]))
         self._loop = None
 
     def step(self) -> dict[str, Any]:
@@ -194,10 +194,10 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         Raises:
             Exception: Any error of the trial; it is in the trial's log too.
         """
-        folder, trial_id = self._trial
+        place, trial_id = self._trial
         try:
             if self._loop is None:
-                self._loop = self._open(folder, trial_id)
+                self._loop = self._open(place, trial_id)
             progress = self._watched(self._loop)
         except Exception as error:
             # print_exc would fail where standard error of Ray's processes cannot encode the text.
@@ -212,8 +212,8 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             self._log.close()
         return self._report(progress)
 
-    def _open(self, folder: Path, trial_id: str) -> TrialLoop:
-        reader = TaskReader(folder)
+    def _open(self, place: str, trial_id: str) -> TrialLoop:
+        reader = TaskReader(place)
         self._file = self._log.open(reader.store.trial(trial_id).log_path)
         begin_log(f"trial {trial_id}")
         task = reader.read(trial_id)
@@ -251,10 +251,10 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save when Tune pauses the trial: the checkpoint goes to the sweep folder, and Tune gets a pointer to it."""
-        folder, trial_id = self._trial
+        place, trial_id = self._trial
         if self._loop is not None:
             self._loop.pause()
-        pointer = {"sweep_folder": str(folder), "trial_id": trial_id, "iteration": _latest_iteration(folder, trial_id)}
+        pointer = {"sweep_place": place, "trial_id": trial_id, "iteration": _latest_iteration(place, trial_id)}
         (Path(checkpoint_dir) / _POINTER).write_text(json.dumps(pointer), encoding="utf-8")
 
     def load_checkpoint(self, checkpoint: str) -> None:
@@ -267,11 +267,11 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             CheckpointError: The checkpoint of the pause is not there.
         """
         pointer = json.loads((Path(checkpoint) / _POINTER).read_text(encoding="utf-8"))
-        folder, trial_id = self._trial
-        latest = _latest_iteration(folder, trial_id)
+        place, trial_id = self._trial
+        latest = _latest_iteration(place, trial_id)
         # It is newer if the trial continued after a pause and its process died: Tune uses the pause's pointer again.
         # It is older if that checkpoint was damaged, and the trial has continued from the one before.
-        known = max(latest, open_sweep(folder).trial(trial_id).latest_damaged())
+        known = max(latest, open_sweep(place).trial(trial_id).latest_damaged())
         if pointer["trial_id"] == trial_id and known < pointer["iteration"]:
             raise CheckpointError(
                 f"Trial {trial_id} was paused at iteration {pointer['iteration']}; its latest checkpoint is {latest}.",
@@ -288,6 +288,6 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         self._log.close()
 
 
-def _latest_iteration(folder: Path, trial_id: str) -> int:
+def _latest_iteration(place: str, trial_id: str) -> int:
     """Return the latest iteration of a trial's checkpoints on disk, damaged or not; 0 if it has none."""
-    return max(open_sweep(folder).trial(trial_id).checkpoint_iterations(), default=0)
+    return max(open_sweep(place).trial(trial_id).checkpoint_iterations(), default=0)

@@ -25,6 +25,7 @@ from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
+from tune_jobs.store.urls import name_of_place
 
 _log = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ def _do(request: Mapping[str, Any], lock: int, log: int) -> None:
     os.dup2(log, 2)
     os.close(log)
     files = JobFiles(Path(request["service"]), request["job"])
-    sweep = Path(request["sweep"]).name
+    sweep = name_of_place(request["sweep"])
     files.say_who(Holder(pid=os.getpid(), sweep=sweep))
     # The end of this log is shown to people who want to know why a job failed.
     logs.configure("text", process={"job": request["number"], "sweep": sweep}, level=logging.WARNING, anew=True)
@@ -143,38 +144,36 @@ def _ended(request: Mapping[str, Any]) -> Ended:
 def _done(request: Mapping[str, Any]) -> Any:
     from tune_jobs.sweeps import verbs
 
-    folder, arguments = request["sweep"], request["arguments"]
+    place, arguments = request["sweep"], request["arguments"]
     common: dict[str, Any] = {"address": request["address"], "progress": "none"}
     match request["verb"]:
         case "extend":
             from tune_jobs.spec.file import stored_spec
-            from tune_jobs.store.local_storage import open_sweep
+            from tune_jobs.store.opening import open_sweep
 
             # The job says how many samples there are to be in all, so that an attempt that follows a killed one adds
             # none twice.
-            known = stored_spec(open_sweep(Path(folder)).read_record()).num_samples
+            known = stored_spec(open_sweep(place).read_record()).num_samples
             missing = arguments["to_num_samples"] - known
             if missing > 0:
-                return verbs.extend(folder, missing, **common)
-            return verbs.resume(folder, **common)
-        case "inject" if not _has_point(folder, arguments["point"]):
-            return verbs.inject(folder, arguments["point"], **common)
+                return verbs.extend(place, missing, **common)
+            return verbs.resume(place, **common)
+        case "inject" if not _has_point(place, arguments["point"]):
+            return verbs.inject(place, arguments["point"], **common)
         case "replicate":
             # The race has the job's name, so that an attempt that follows a killed one begins no other.
-            return verbs.replicate(
-                folder, top=arguments["top"], seeds=arguments["seeds"], race=request["job"], **common
-            )
+            return verbs.replicate(place, top=arguments["top"], seeds=arguments["seeds"], race=request["job"], **common)
         case "retry":
-            return verbs.resume(folder, retry_failed=True, **common)
+            return verbs.resume(place, retry_failed=True, **common)
         case _:
-            return verbs.resume(folder, **common)
+            return verbs.resume(place, **common)
 
 
-def _has_point(folder: str, point: Mapping[str, Any]) -> bool:
+def _has_point(place: str, point: Mapping[str, Any]) -> bool:
     """Whether an attempt before this one has added a point that somebody chose; what is missing of it is run, then."""
-    from tune_jobs.store.local_storage import open_sweep
+    from tune_jobs.store.opening import open_sweep
 
-    return any(item.point == point for item in open_sweep(Path(folder)).read_record().chosen_points)
+    return any(item.point == point for item in open_sweep(place).read_record().chosen_points)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from tune_jobs.service.supervisor import Supervisor, Surroundings
 from tune_jobs.service.telling import Teller
 from tune_jobs.service.watching import Watching
 from tune_jobs.store.contract import Storage
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 
 
 @dataclass(frozen=True)

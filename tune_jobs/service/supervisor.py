@@ -320,7 +320,7 @@ class Supervisor:
                 "job": job.uid,
                 "number": job.id,
                 "attempt": job.num_attempts,
-                "sweep": str(self._sweep(job.sweep).folder),
+                "sweep": self._sweep(job.sweep).place,
                 "verb": job.verb,
                 "arguments": job.arguments,
                 "address": self._where.address,

@@ -48,8 +48,11 @@ class Sweep(Protocol):
     """One sweep. Only its driver writes here, except for requests to stop."""
 
     @property
-    def folder(self) -> Path:
-        """The place of the sweep, for users, other processes and `open_sweep`. Callers append nothing to it."""
+    def place(self) -> str:
+        """The place of the sweep, for users, other processes and `open_sweep`: an absolute folder, or a URL.
+
+        Callers append nothing to it, and make no `Path` of it.
+        """
         ...
 
     @property
@@ -322,6 +325,11 @@ class Sweep(Protocol):
 
 class Storage(Protocol):
     """A place that stores sweeps by name."""
+
+    @property
+    def place(self) -> str:
+        """The place of the storage, for users, other processes and `open_storage`: an absolute folder, or a URL."""
+        ...
 
     def sweep(self, name: str) -> Sweep:
         """Return the sweep of a name, which need not exist yet.

@@ -5,26 +5,8 @@ from __future__ import annotations
 from pathlib import Path, PurePath
 
 from policies.errors import NotFoundError
-from tune_jobs.store.contract import Storage, Sweep
-from tune_jobs.store.names import TRIALS_FOLDER
+from policies.files import absolute
 from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores, name_taken
-
-
-def open_storage(folder: Path) -> Storage:
-    """Return the storage in a folder."""
-    return LocalStorage(folder)
-
-
-def open_sweep(folder: Path) -> Sweep:
-    """Return the sweep in a folder, which need not exist yet."""
-    return SweepStore(folder)
-
-
-def sweep_of_trial(folder: Path) -> Sweep | None:
-    """Return the sweep that a trial's folder is in; None: it is in none."""
-    sweep = SweepStore(folder.parent.parent)
-    return sweep if folder.parent.name == TRIALS_FOLDER and sweep.exists() else None
-
 
 _MAX_NAME_BYTES = 255
 
@@ -38,6 +20,11 @@ class LocalStorage:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+
+    @property
+    def place(self) -> str:
+        """The folder, as an absolute path."""
+        return str(absolute(self._folder))
 
     def sweep(self, name: str) -> SweepStore:
         """Return the sweep of a name, which need not exist yet."""

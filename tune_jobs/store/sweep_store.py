@@ -51,6 +51,11 @@ class SweepStore:
         self._made: list[Path] = []
 
     @property
+    def place(self) -> str:
+        """The folder, as a text."""
+        return str(self.folder)
+
+    @property
     def best_folder(self) -> Path:
         """The folder with the winner's policy, its evaluation and films; it has no links in it."""
         return refuse_links_in(self.folder / names.BEST_FOLDER)

@@ -26,8 +26,8 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.local_storage import open_storage, open_sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
+from tune_jobs.store.opening import open_storage, open_sweep
 from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
 from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.storage import expanded, storage_folder
@@ -305,7 +305,7 @@ def make_videos(store: Sweep, seed: int | None = None) -> dict[str, Path]:
     Returns:
         before_mp4, after_mp4, after_gif and before_after_mp4.
     """
-    source = find_policy(store.folder)
+    source = find_policy(store.place)
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
     before = random_policy(source.env_id, source.env_args, source.timeout_s)
@@ -365,7 +365,7 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
     videos = {name: films[key] for name, key in (("before", "before_mp4"), ("after", "after_mp4")) if key in films}
     with store.writing_report() as target:
         return build_report(
-            store.folder,
+            store.place,
             target=target,
             sweep=record,
             trials=trials,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from analysis.notebook import facts_html
@@ -13,9 +13,9 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.ray_tune.address import check_form
 from tune_jobs.spec.sweep_spec import SweepSpec
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.drive import machine_here, write_new
-from tune_jobs.sweeps.storage import choose_store, create_store
+from tune_jobs.sweeps.storage import choose_store, create_store, folder_at, shown_place
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,21 @@ class CreatedSweep:
     """A sweep that has been written but not begun."""
 
     name: str
-    folder: Path
+    place: str = field(metadata={"json": "folder"})
+    """Where it is: its folder, or its URL in an object store."""
+
+    @property
+    def folder(self) -> Path:
+        """The sweep's folder.
+
+        Raises:
+            SpecError: The sweep is in an object store, and has none.
+        """
+        return folder_at(self.place)
 
     def _repr_html_(self) -> str:
-        return facts_html(f"Sweep {self.name}: created", {"folder": self.folder, "run it with": "tune_jobs.drive(...)"})
+        facts = {"folder": shown_place(self.place), "run it with": "tune_jobs.drive(...)"}
+        return facts_html(f"Sweep {self.name}: created", facts)
 
 
 def write_created(spec: SweepSpec, name: str | None, stem: str, storage: Path, address: str | None) -> CreatedSweep:
@@ -54,7 +65,7 @@ def write_created(spec: SweepSpec, name: str | None, stem: str, storage: Path, a
     except BaseException:
         store.discard()
         raise
-    return CreatedSweep(store.name, store.folder)
+    return CreatedSweep(store.name, store.place)
 
 
 def _smallest_machine(spec: SweepSpec, address: str) -> Machine:
@@ -68,7 +79,7 @@ def removed_if_not_begun(created: CreatedSweep) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        store = open_sweep(created.folder)
+        store = open_sweep(created.place)
         with contextlib.suppress(TuneJobsError), store.lock():
             if store.read_record().state == "created":
                 store.discard()

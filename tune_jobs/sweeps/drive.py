@@ -206,7 +206,7 @@ def run_trials_of(
 
     records = read_trials(store)
     interrupted = any(trial.status not in FINISHED for trial in records)
-    return SweepResult(store.folder, store.read_record(), records, interrupted=interrupted)
+    return SweepResult(store.place, store.read_record(), records, interrupted=interrupted)
 
 
 def _run_trials(
@@ -234,7 +234,7 @@ def _run_trials(
         from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
         job = RunJob(
-            store.folder,
+            store.place,
             todo,
             plan.cpus_per_trial,
             plan.gpus_per_trial,

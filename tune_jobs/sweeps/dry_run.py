@@ -38,11 +38,11 @@ def planned(
     with connected(address, None) as connection:
         plan = make_plan(spec, connection.machine)
         with store.rehearsal() as rehearsed:
-            _check_nodes(rehearsed.folder)
+            _check_nodes(rehearsed.place)
         return spec, plan
 
 
-def _check_nodes(folder: Path) -> None:
+def _check_nodes(place: str) -> None:
     from tune_jobs.ray_tune.cluster import check_storage
 
-    check_storage(folder)
+    check_storage(place)

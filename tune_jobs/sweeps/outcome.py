@@ -10,6 +10,7 @@ from typing import Literal
 from analysis.notebook import brief_repr, facts_html
 from analysis.records import BestRecord, SweepRecord, TrialRecord
 from analysis.wording import counted
+from tune_jobs.sweeps.storage import folder_at, shown_place
 
 Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
 """What a film of a sweep's best policy is called; before is a random policy."""
@@ -19,7 +20,8 @@ Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
 class SweepResult:
     """The result of a launch, resume or extend: the trials' records, and the paths of what was made."""
 
-    folder: Path
+    place: str = field(metadata={"json": "folder"})
+    """Where the sweep is: its folder, or its URL in an object store."""
     sweep: SweepRecord
     trials: list[TrialRecord]
     best: BestRecord | None = None
@@ -33,6 +35,15 @@ class SweepResult:
     """Whether no winner could be confirmed, or the environment failed where it was filmed."""
 
     @property
+    def folder(self) -> Path:
+        """The sweep's folder.
+
+        Raises:
+            SpecError: The sweep is in an object store, and has none.
+        """
+        return folder_at(self.place)
+
+    @property
     def exit_code(self) -> int:
         """130 if it was interrupted, 3 if a trial or what comes after the trials failed, else 0."""
         if self.interrupted:
@@ -43,7 +54,7 @@ class SweepResult:
         counts = dict(Counter(trial.status for trial in self.trials))
         best = self.best and f"{self.best.checkpoint.trial_id} scored {self.best.selection_score:.1f}"
         return brief_repr(
-            "SweepResult", folder=self.folder, state=self.sweep.state, trials=counts, best=best,
+            "SweepResult", place=self.place, state=self.sweep.state, trials=counts, best=best,
             why_no_best=self.why_no_best, artifacts=list(self.artifacts), exit_code=self.exit_code,
         )  # fmt: skip
 
@@ -59,7 +70,9 @@ class SweepResult:
         failed = [trial for trial in self.trials if trial.status == "failed"]
         if failed:
             facts["first failure"] = f"{failed[0].trial_id}: {failed[0].error or 'no error recorded'}"
-        facts |= {"folder": self.folder} | {name.replace("_", " "): path for name, path in self.artifacts.items()}
+        facts |= {"folder": shown_place(self.place)} | {
+            name.replace("_", " "): path for name, path in self.artifacts.items()
+        }
         facts |= {f"note {number}": note for number, note in enumerate(self.notes, start=1)}
         state = "interrupted" if self.interrupted else self.sweep.state
         best = "" if self.best is None else self.best._repr_html_()

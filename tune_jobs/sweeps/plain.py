@@ -20,7 +20,8 @@ def to_json(value: Any) -> Any:
         data |= {name: getattr(value, name) for name in _DERIVED if hasattr(type(value), name)}
         return to_json(data)
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
+        named = {field.metadata.get("json", field.name): getattr(value, field.name) for field in fields(value)}
+        return to_json(named)
     if isinstance(value, Mapping):
         return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, float):

@@ -235,7 +235,7 @@ def read_candidates(
         except NotFoundError as error:
             leave_out(error)
             # A record names no place on a machine.
-            left_out.append(_left_out(scored, error.message.replace(f"{store.folder}/", "")))
+            left_out.append(_left_out(scored, error.message.replace(f"{store.place}/", "")))
             continue
         candidate, key = Candidate(scored, policy), _how_it_acts(policy)
         if key in found:

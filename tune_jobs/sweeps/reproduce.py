@@ -30,15 +30,15 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sections import SchedulerSpec, SearchSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.logs import continued_from
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.drive import git_commit, machine_here, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.sources import find_source, find_trial
 from tune_jobs.sweeps.stages import run_sweep
-from tune_jobs.sweeps.storage import expanded
+from tune_jobs.sweeps.storage import expanded, folder_at
 
 _LONG_S = 1e9
 _WEIGHTS = "policy.safetensors"
@@ -92,7 +92,7 @@ def reproduce(
     again.create()
     try:
         _write(again, sweep, spec, trial, repeatable[-1].iteration if repeatable else 1)
-        _train_again(str(again.folder), progress)
+        _train_again(again.place, progress)
         return _compared(store, again, trial, len(repeatable), is_kept=is_kept)
     finally:
         if not is_kept:
@@ -155,9 +155,9 @@ def _write(again: Sweep, sweep: SweepRecord, spec: SweepSpec, trial: TrialRecord
 
 @run_alone
 @guarding(start=True)
-def _train_again(folder: str, progress: str) -> SweepResult:
+def _train_again(place: str, progress: str) -> SweepResult:
     """Run the one trial of a folder, in Ray's processes, as it ran."""
-    store = open_sweep(Path(folder))
+    store = open_sweep(place)
     record = store.read_record()
     allow_modules(record.allowed_modules)
     spec = stored_spec(record)
@@ -224,7 +224,7 @@ def _compared(store: Sweep, again: Sweep, trial: TrialRecord, num_repeatable: in
         causes=tuple(changed),
         notes=tuple(_notes(store, trial, repeated, len(recorded) - len(repeatable), is_known="cpu" in known)),
         knows_cpu="cpu" in known,
-        folder=again.folder if is_kept else None,
+        folder=folder_at(again.place) if is_kept else None,
     )
 
 

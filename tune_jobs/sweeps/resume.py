@@ -95,5 +95,5 @@ def _taken_over(store: Sweep, address: str | None) -> Iterator[tuple[Machine | N
         connection = stack.enter_context(connected(address, None))
         from tune_jobs.ray_tune.cluster import check_storage
 
-        check_storage(store.folder)
+        check_storage(store.place)
         yield None, connection.machine

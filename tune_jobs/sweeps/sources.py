@@ -9,7 +9,7 @@ from policies.errors import NotFoundError
 from policies.suggestions import did_you_mean
 from tune_jobs.store.candidates import read_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.local_storage import sweep_of_trial
+from tune_jobs.store.opening import sweep_of_trial
 from tune_jobs.sweeps.storage import expanded
 
 

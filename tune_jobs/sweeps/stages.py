@@ -68,7 +68,7 @@ def run_sweep(
         with current().shielded():
             current().came = True
             close_if_open(store)
-            return SweepResult(store.folder, store.read_record(), store.read_trials(), interrupted=True)
+            return SweepResult(store.place, store.read_record(), store.read_trials(), interrupted=True)
 
 
 def _run_sweep(

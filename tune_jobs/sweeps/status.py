@@ -18,7 +18,7 @@ from policies.arguments import checked
 from policies.errors import CheckpointError, TuneJobsError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import open_storage
 from tune_jobs.sweeps.forecast import Forecast, caps_of, forecast
 from tune_jobs.sweeps.storage import storage_folder
 

@@ -9,7 +9,7 @@ from policies.errors import SpecError
 from policies.files import absolute
 from tune_jobs.spec.sweep_spec import check_sweep_name
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.local_storage import open_storage
+from tune_jobs.store.opening import is_url, open_storage
 
 DEFAULT_STORAGE = "sweeps"
 
@@ -26,6 +26,25 @@ def expanded(path: str | Path) -> Path:
         return Path(path).expanduser()
     except RuntimeError:
         return Path(path)
+
+
+def folder_at(place: str) -> Path:
+    """Return the folder of a sweep that is in one.
+
+    Raises:
+        SpecError: The sweep is in an object store, and has none.
+    """
+    if is_url(place):
+        raise SpecError(
+            f"The sweep at {place} has no folder: it is in an object store.",
+            "Use `place`, which every command and function takes, and the paths of single results in `artifacts`.",
+        )
+    return Path(place)
+
+
+def shown_place(place: str) -> str | Path:
+    """Return a place for a notebook, which makes a link of a folder."""
+    return place if is_url(place) else Path(place)
 
 
 def choose_store(name: str | None, stem: str, storage: Path) -> Sweep:

@@ -20,11 +20,13 @@ from analysis.selection import score_trial
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import is_url
 from tune_jobs.sweeps.curves import Columns, Curve
 from tune_jobs.sweeps.gathered import sweep_data
 from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.shortened_paths import Shortener
 from tune_jobs.sweeps.status import SweepStatus, status_of
+from tune_jobs.sweeps.storage import folder_at
 
 FORMAT = "tune-jobs sweep"
 FORMAT_VERSION = 1
@@ -47,7 +49,7 @@ def sweep_file(store: Sweep) -> bytes:
         CheckpointError: The record of the sweep or of a trial is damaged.
         SpecError: There is more of it than a reader takes.
     """
-    shorten = Shortener([store.folder])
+    shorten = Shortener([] if is_url(store.place) else [folder_at(store.place)])
     text = json.dumps(shorten(_document(store)), separators=(",", ":"), allow_nan=False)
     if len(text) > MAX_BYTES:
         raise SpecError(

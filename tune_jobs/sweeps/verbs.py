@@ -104,7 +104,7 @@ def drive(
 
     store = find_sweep(sweep, storage)
     where = store.read_record().address if address is None else address
-    return resume(store.folder, address=where, finish=finish, progress=progress)
+    return resume(store.place, address=where, finish=finish, progress=progress)
 
 
 @checked
@@ -148,7 +148,7 @@ def launch(
     # The source may hold classes, and errors in it are raised here.
     created = create(source, overrides=overrides, name=name, storage=storage, address=address, rl_module=rl_module)
     with removed_if_not_begun(created):
-        return drive(created.folder, finish=finish, progress=progress)
+        return drive(created.place, finish=finish, progress=progress)
 
 
 @run_alone
@@ -180,7 +180,7 @@ def _launch_here(
             if address is not None:
                 from tune_jobs.ray_tune.cluster import check_storage
 
-                check_storage(store.folder)
+                check_storage(store.place)
             stack.enter_context(settled(store))
             write_new(store, spec, plan, address)
         except BaseException:

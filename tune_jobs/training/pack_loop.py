@@ -24,7 +24,7 @@ from policies.envs.tallies import Reached, end_tally, tally_of
 from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
 from policies.portable.file import PortablePolicy
 from tune_jobs.store.contract import Ownership
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.training.protocol import IterationStats, PackEngine, TrialTask
@@ -359,9 +359,9 @@ def _outcome(act: Callable[[], Progress | None]) -> Progress | Exception | None:
 
 def _describe(task: TrialTask, error: Exception) -> str:
     message = str(error) if isinstance(error, TuneJobsError) else f"{type(error).__name__}: {said_by(error)}"
-    return f"{message}\n{open_sweep(task.sweep_folder).trial(task.trial_id).log_tail()}".strip()
+    return f"{message}\n{open_sweep(task.sweep_place).trial(task.trial_id).log_tail()}".strip()
 
 
 def _log(task: TrialTask, text: str) -> None:
     """Append to a member's own log; the output of the process goes to the pack's log."""
-    open_sweep(task.sweep_folder).trial(task.trial_id).write_log(text)
+    open_sweep(task.sweep_place).trial(task.trial_id).write_log(text)

@@ -20,7 +20,8 @@ from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 class TrialTask:
     """Everything a process needs to begin or continue one trial."""
 
-    sweep_folder: Path
+    sweep_place: str
+    """The sweep's place, for `open_sweep`."""
     trial_id: str
     seed: int
     algorithm: str

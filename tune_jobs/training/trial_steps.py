@@ -26,9 +26,9 @@ from policies.portable.file import save_policy
 from tune_jobs.process.ran_with import ran_with
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.copies import pending_copy
-from tune_jobs.store.local_storage import open_sweep
 from tune_jobs.store.logs import built_from
 from tune_jobs.store.names import RESULTS
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.recovery import take_up_checkpoints, take_up_copy, take_up_results
@@ -64,7 +64,7 @@ class TrialSteps:
         self._evaluator = evaluator
         self._clock = clock
         self._under = under
-        self._sweep = open_sweep(task.sweep_folder)
+        self._sweep = open_sweep(task.sweep_place)
         self._store = self._sweep.trial(task.trial_id)
         self._window: deque[float] = deque(maxlen=TRAINING_RETURN_EPISODES)
         self._last = IterationRecord(iteration=0, num_env_steps=0, num_episodes=0, time_s=0.0)

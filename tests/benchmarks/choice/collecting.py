@@ -21,7 +21,7 @@ import pandas as pd
 
 import tune_jobs
 from tests.benchmarks.ppo import machine_name
-from tune_jobs.store.local_storage import open_sweep
+from tune_jobs.store.opening import open_sweep
 
 HERE = Path(__file__).parent
 TASKS = HERE / "tasks"
