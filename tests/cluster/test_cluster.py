@@ -4,9 +4,11 @@ import contextlib
 import json
 import os
 import shutil
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -109,9 +111,10 @@ class BadNode:
         if kind == "without_tune_jobs":
             (self.site / "sitecustomize.py").write_text(HIDE_TUNE_JOBS)
         elif kind == "other_version":
-            (self.site / "tune_jobs-99.9.dist-info").mkdir()
-            metadata = "Metadata-Version: 2.1\nName: tune-jobs\nVersion: 99.9\n"
-            (self.site / "tune_jobs-99.9.dist-info" / "METADATA").write_text(metadata)
+            for name, other in OTHER_VERSIONS.items():
+                folder = self.site / f"{name.replace('-', '_')}-{other}.dist-info"
+                folder.mkdir()
+                (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {other}\n")
         elif not self.has_mounts:
             pytest.skip("mount namespaces are not available here: `unshare -m` fails")
         elif kind == "storage_not_shared":
@@ -143,9 +146,10 @@ def bad_node(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iter
     node.stop()
 
 
+OTHER_VERSIONS = {"tune-jobs": "99.9", "torch": "1.0+cu1", "numpy": "1.1"}
 BAD_NODES = {
     "storage_not_shared": "does not see the sweep folder",
-    "storage_read_only": "Read-only file system",
+    "storage_read_only": "cannot write in the sweep folder",
     "without_tune_jobs": "has no working tune-jobs: ModuleNotFoundError: No module named 'tune_jobs'",
     "other_version": "has tune-jobs 99.9",
 }
@@ -164,6 +168,9 @@ class TestANodeThatCannotTakePart:
         assert done.stderr.startswith("error: Node ")
         assert f"node {bad_node.node.node_id[:8]})" in done.stderr.splitlines()[0]
         assert BAD_NODES[kind] in done.stderr
+        if kind == "other_version":
+            assert "has torch 1.0+cu1" in done.stderr
+            assert f"has numpy 1.1, {socket.gethostname()} has {version('numpy')}" in done.stderr
         assert "Traceback" not in done.stderr
         assert list(storage.iterdir()) == []
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
 import gymnasium as gym
@@ -72,6 +72,10 @@ class SweepPlan:
     """Notes on settings that may not be meant, and on trials that are not packed."""
     packs: PackPlan | None = None
     """The packs of the packed trials that have not ended; None: there are none."""
+
+    def with_notes(self, notes: Sequence[str]) -> Self:
+        """Return the plan with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
 
     @property
     def engines(self) -> dict[str, int]:

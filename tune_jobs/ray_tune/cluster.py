@@ -1,36 +1,31 @@
 """Connect to where a sweep runs: this machine, a Ray cluster that it is part of, or one reached as a Ray client.
 
-The same sweep runs on all of them; only joining Ray, and checking that every node reaches the storage, differs.
+The same sweep runs on all of them; only joining Ray, and checking the nodes (`node_checks`), differs.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import os
 import signal
-import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import AuthenticationError, GetTimeoutError
-from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+from ray.exceptions import AuthenticationError
 
 from policies.envs.modules import module_folders
-from policies.errors import CannotRunError, TuneJobsError
+from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
 from tune_jobs.process.streams import quiet
 from tune_jobs.ray_tune.address import recorded_cluster
 from tune_jobs.ray_tune.connected_ray import (
-    alive_nodes,
     check_connected_to,
     cluster_machine,
     connected_machine,
@@ -40,13 +35,9 @@ from tune_jobs.ray_tune.connected_ray import (
 from tune_jobs.ray_tune.environment import prepare_environment, provide_token
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
-from tune_jobs.store.opening import open_sweep
-from tune_jobs.store.probe import answer
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
-# The first process on a node imports torch and RLlib, from a disk that may be slow and cold.
-_PROBE_TIMEOUT_S = 180.0
 _MAX_JOIN_ATTEMPTS = 4
 _QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
 
@@ -242,61 +233,3 @@ def _init_patiently(address: str) -> None:
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
-def check_storage(sweep_place: str) -> None:
-    """Check, by a worker on every node, that the node reads and writes the same sweep as this process.
-
-    Raises:
-        CannotRunError: A node does not, or has another version of tune-jobs; the message names the node.
-    """
-    with open_sweep(sweep_place).probing() as probe:
-        tasks = {}
-        for node in alive_nodes():
-            strategy = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
-            remote = ray.remote(num_cpus=0, max_retries=0)(_answer).options(scheduling_strategy=strategy)
-            name = f"{node['NodeManagerAddress']} ({node['NodeManagerHostname']}, node {node['NodeID'][:8]})"
-            tasks[name] = (remote.remote(probe.place, node["NodeID"]), node["NodeID"])
-        for name, (task, node_id) in tasks.items():
-            _check_answer(name, task, sweep_place, functools.partial(probe.is_same, machine=node_id))
-
-
-def _answer(place: str, node_id: str) -> tuple[str, str]:
-    """Run on a node: return what the node reads of the question, and its version of tune-jobs."""
-    return answer(place, node_id), version("tune-jobs")
-
-
-def _check_answer(name: str, task: Any, place: str, is_same: Callable[[str], bool]) -> None:
-    storage_hint = "Choose storage that every node reaches (a network file system) with --storage."
-    try:
-        question, their_version = ray.get(task, timeout=_PROBE_TIMEOUT_S)
-    except GetTimeoutError as error:
-        raise CannotRunError(
-            f"Node {name} did not answer within {_PROBE_TIMEOUT_S:.0f} s.",
-            "Check the node with `ray status`, and that its file systems respond.",
-        ) from error
-    except Exception as error:
-        cause = getattr(error, "cause", None) or error
-        if isinstance(cause, ImportError) or "ModuleNotFoundError" in str(error):
-            raise CannotRunError(
-                f"Node {name} has no working tune-jobs: {_last_line(error)}",
-                "Install the same version on every node, or use its image.",
-            ) from error
-        if isinstance(cause, FileNotFoundError):
-            raise CannotRunError(f"Node {name} does not see the sweep folder {place}.", storage_hint) from error
-        raise CannotRunError(
-            f"Node {name} cannot use the sweep folder {place}: {_last_line(cause)}", storage_hint
-        ) from error
-    if not is_same(question):
-        raise CannotRunError(f"Node {name} sees another folder under the name {place}.", storage_hint)
-    if their_version != version("tune-jobs"):
-        raise CannotRunError(
-            f"Node {name} has tune-jobs {their_version}, {socket.gethostname()} has {version('tune-jobs')}.",
-            "Install the same version everywhere.",
-        )
-
-
-def _last_line(error: Exception) -> str:
-    if isinstance(error, TuneJobsError):
-        return error.message
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()

@@ -8,7 +8,7 @@ from pathlib import Path
 from policies.arguments import checked
 from tune_jobs.plan.machine import local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
-from tune_jobs.plan.user_code import Source, load_source
+from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.drive import connected
 from tune_jobs.sweeps.storage import choose_store, stem_of, storage_folder
@@ -38,11 +38,7 @@ def planned(
     with connected(address, None) as connection:
         plan = make_plan(spec, connection.machine)
         with store.rehearsal() as rehearsed:
-            _check_nodes(rehearsed.place)
+            from tune_jobs.ray_tune.node_checks import check_nodes
+
+            plan = plan.with_notes(check_nodes(rehearsed.place, modules_of(spec)))
         return spec, plan
-
-
-def _check_nodes(place: str) -> None:
-    from tune_jobs.ray_tune.cluster import check_storage
-
-    check_storage(place)

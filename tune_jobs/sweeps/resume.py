@@ -93,7 +93,7 @@ def _taken_over(store: Sweep, address: str | None) -> Iterator[tuple[Machine | N
             yield machine, machine
             return
         connection = stack.enter_context(connected(address, None))
-        from tune_jobs.ray_tune.cluster import check_storage
+        from tune_jobs.ray_tune.node_checks import check_nodes
 
-        check_storage(store.place)
+        check_nodes(store.place, store.read_record().allowed_modules)
         yield None, connection.machine

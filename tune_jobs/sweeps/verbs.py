@@ -17,7 +17,7 @@ from policies.arguments import PositiveInt, checked
 from policies.envs.modules import allowed_again
 from policies.guard.guard import guarding
 from tune_jobs.plan.sweep_plan import make_plan
-from tune_jobs.plan.user_code import Source, load_source
+from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.process.interruption import can_drive, current
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.compare import compare
@@ -178,9 +178,9 @@ def _launch_here(
         try:
             stack.enter_context(store.lock())
             if address is not None:
-                from tune_jobs.ray_tune.cluster import check_storage
+                from tune_jobs.ray_tune.node_checks import check_nodes
 
-                check_storage(store.place)
+                plan = plan.with_notes(check_nodes(store.place, modules_of(spec)))
             stack.enter_context(settled(store))
             write_new(store, spec, plan, address)
         except BaseException:
