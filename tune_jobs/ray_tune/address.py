@@ -49,6 +49,19 @@ def check_form(address: str) -> None:
         _host_and_port(address, "")
 
 
+def place_of(address: str) -> tuple[str, int]:
+    """Return the host and the port of an address; those of `auto` are the known cluster's.
+
+    Raises:
+        SpecError: The address has another form than `auto`, `host:port` or `ray://host:port`.
+        CannotRunError: With `auto`, no cluster is known on this machine.
+    """
+    where = ""
+    if address == "auto":
+        address, where = _find_cluster()
+    return _host_and_port(address, where)
+
+
 def recorded_cluster() -> str | None:
     """Return the address of the cluster that `ray start` last started or joined on this machine, if it is recorded."""
     try:

@@ -25,6 +25,7 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
 from tune_jobs.process.streams import quiet
 from tune_jobs.ray_tune.address import recorded_cluster
+from tune_jobs.ray_tune.answering import check_is_ray, wrong_token
 from tune_jobs.ray_tune.connected_ray import (
     check_connected_to,
     cluster_machine,
@@ -192,6 +193,7 @@ def _finding_own_modules() -> Iterator[None]:
 
 
 def _join(address: str) -> None:
+    check_is_ray(address)
     # Ray's native code prints a warning for each of its attempts.
     with tempfile.NamedTemporaryFile(prefix="tune-jobs-join-") as file:
         try:
@@ -200,10 +202,7 @@ def _join(address: str) -> None:
         except Exception as error:
             said = Path(file.name).read_text(encoding="utf-8", errors="replace")
             if "InvalidAuthToken" in said or isinstance(error, AuthenticationError):
-                raise CannotRunError(
-                    f"The Ray cluster at {address} does not accept this machine's token.",
-                    "Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the cluster's token.",
-                ) from error
+                raise wrong_token(address) from error
             raise CannotRunError(
                 f"The Ray cluster at {address} cannot be joined: {_first_line(error)}",
                 "Its Ray and Python must be of this machine's versions, and its token (RAY_AUTH_TOKEN) the same. "

@@ -38,7 +38,11 @@ def planned(
     with connected(address, None) as connection:
         plan = make_plan(spec, connection.machine)
         with store.rehearsal() as rehearsed:
-            from tune_jobs.ray_tune.node_checks import check_nodes
-
-            plan = plan.with_notes(check_nodes(rehearsed.place, modules_of(spec)))
+            plan = plan.with_notes(_check_nodes(rehearsed.place, modules_of(spec)))
         return spec, plan
+
+
+def _check_nodes(place: str, modules: Sequence[str]) -> Sequence[str]:
+    from tune_jobs.ray_tune.node_checks import check_nodes
+
+    return check_nodes(place, modules)
