@@ -362,6 +362,13 @@ class ChosenPointRecord(_Record):
     point: dict[str, Any] = Field(description="Its values of the searched hyperparameters.")
 
 
+class JobRecord(_Record):
+    """The job of a Ray cluster that drives a sweep, or was asked to."""
+
+    id: str = Field(description="Its submission id.")
+    address: str = Field(description="The address of the Jobs API that runs it; it never holds a token.")
+
+
 class SweepRecord(_Record):
     """The record of a sweep: sweep.json."""
 
@@ -379,6 +386,7 @@ class SweepRecord(_Record):
     versions: dict[str, str] = Field(default_factory=dict)
     git_commit: str | None = None
     address: str | None = None
+    job: JobRecord | None = Field(None, description="The job that drove it last; None: another process did.")
     allowed_modules: tuple[str, ...] = Field((), description="Modules of the user's own that its trials may import.")
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")

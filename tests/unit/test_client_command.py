@@ -202,7 +202,7 @@ def test_what_goes_with_no_service_is_refused(run: RunCommand, site: Live, argum
 
 def test_all_commands_are_done_there_or_refused_or_about_nothing_there() -> None:
     about_neither = {"presets", "hyperparams", "schema"}
-    refused = {"evaluate", "reproduce", "serve", "token"}
+    refused = {"attach", "evaluate", "reproduce", "serve", "token"}
     assert {*THERE, *about_neither, *refused} == cli.commands.keys()
     assert "--output" in {name for item in cli.commands["report"].params for name in item.opts}
     assert isinstance(cli, click.Group)

@@ -183,7 +183,12 @@ def run_options(command: _Command) -> _Command:
     for option in (
         click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report."),
         click.option("--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."),
-        click.option("--address", metavar="ADDRESS", help="Ray cluster: auto or ray://...; without it, this machine."),
+        click.option("--detach", is_flag=True, help="Let the cluster at http://... drive it, and leave it to that."),
+        click.option(
+            "--address",
+            metavar="ADDRESS",
+            help="Ray cluster: auto, ray://... or http://... (as a job); without it, this machine.",
+        ),
         allow_module_option,
         storage_option,
         json_option,

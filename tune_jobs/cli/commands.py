@@ -12,6 +12,7 @@ import click
 
 from policies.errors import SpecError
 from policies.standard_streams import standard_streams
+from tune_jobs.cli.attach_command import attach
 from tune_jobs.cli.base import (
     DEBUG,
     CommandGroup,
@@ -29,6 +30,7 @@ from tune_jobs.cli.base import (
     sweep_argument,
 )
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
+from tune_jobs.cli.detached_runs import job_facts, refuse_dry_run_of_job
 from tune_jobs.cli.inject_command import inject
 from tune_jobs.cli.result_commands import compare, export, importance, reproduce
 from tune_jobs.cli.running import run_verb
@@ -90,6 +92,7 @@ def launch(
         # The guard's child starts while this process still imports its own modules.
         ctx.with_resource(guarding(start=True))
     if dry_run:
+        refuse_dry_run_of_job(options["address"], detach=options["detach"])
         from tune_jobs.cli import plan_view as cli_plan
 
         with stdout_for(as_json=as_json):
@@ -128,7 +131,8 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
     sweeps = verbs()
     with stdout_for(as_json=as_json):
         state = sweeps.status(sweep, storage=storage)
-    cli_output.show_status(state, storage=storage, program=program(), as_json=as_json)
+        job = job_facts(state)
+    cli_output.show_status(state, storage=storage, program=program(), job=job, as_json=as_json)
 
 
 @cli.command()
@@ -320,7 +324,7 @@ def report(*, sweep: str, output: str | None, storage: str | None, as_json: bool
     cli_output.show_paths({"report": path}, as_json=as_json)
 
 
-for _command in (compare, export, importance, inject, reproduce, serve, token):
+for _command in (attach, compare, export, importance, inject, reproduce, serve, token):
     cli.add_command(_command)
 
 

@@ -41,8 +41,10 @@ def print_json(value: Any) -> None:
 
 def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
     """Print the result of a launch, resume or extend, and the paths of its files."""
-    at = _storage_option(storage)
-    if result.sweep.address is not None:
+    at = storage_option_of(storage)
+    if result.sweep.job is not None:
+        at += f" --address {shlex.quote(result.sweep.job.address)} --detach"
+    elif result.sweep.address is not None:
         at += f" --address {shlex.quote(result.sweep.address)}"
     how_to_resume = f"tune-jobs resume {shlex.quote(result.sweep.name)}{at}"
     if as_json:
@@ -92,7 +94,8 @@ def say_interrupted(sweep: SweepRecord, how_to_resume: str) -> None:
     click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
 
 
-def _storage_option(storage: str | None) -> str:
+def storage_option_of(storage: str | None) -> str:
+    """Return the option by which a command finds a sweep that this one has found."""
     return "" if storage is None else f" --storage {shlex.quote(storage)}"
 
 
@@ -139,12 +142,21 @@ def local_time(unix_time: float) -> str:
         return PLAIN_NONE
 
 
-def show_status(status: SweepStatus, *, storage: str | None = None, program: str = "tune-jobs", as_json: bool) -> None:
-    """Print how far a sweep is, what is best so far, and how long it will take."""
+def show_status(
+    status: SweepStatus,
+    *,
+    storage: str | None = None,
+    program: str = "tune-jobs",
+    job: Mapping[str, str] | None = None,
+    as_json: bool,
+) -> None:
+    """Print how far a sweep is, what is best so far, how long it will take, and the job that drives it, if one does."""
     if as_json:
-        print_json(status)
+        print_json({**to_json(status), **({"job": job} if job else {})})
         return
-    print_facts(make_console(), status.facts(_storage_option(storage), program))
+    told = {"job": f"{job['id']} at {job['address']}: {job['state']}"} if job else {}
+    option = storage_option_of(storage) + (f" --address {shlex.quote(job['address'])} --detach" if job else "")
+    print_facts(make_console(), status.facts(option, program) | told)
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:

@@ -29,6 +29,13 @@ def run_verb(
         from tune_jobs.cli.remote_runs import run_there
 
         ctx.exit(run_there(server, verb, arguments, as_json=as_json, **options))
+    detach = options.pop("detach", False)
+    from tune_jobs.ray_tune.jobs import is_jobs_address
+
+    if detach or is_jobs_address(options["address"]):
+        from tune_jobs.cli.detached_runs import run_as_job
+
+        ctx.exit(run_as_job(verb, arguments, storage=storage, detach=detach, as_json=as_json, **options))
     from tune_jobs.cli import output as cli_output
     from tune_jobs.sweeps import verbs as sweeps
 

@@ -31,6 +31,7 @@ THERE = (
 """The commands that a service does."""
 _ONLY_HERE = {
     "storage": ("--storage", "it names a folder of this machine, and the service has its own"),
+    "detach": ("--detach", "a service runs sweeps without this terminal anyway"),
     "address": ("--address", "the service runs sweeps where its operator has said"),
     "finish": ("--finish or --no-finish", "the service always makes what follows the trials"),
     "allow_module": ("--allow-module", "its operator says which modules sweeps may name (`serve --allow-module`)"),

@@ -16,6 +16,7 @@ from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
 from tune_jobs.sweeps.drive import connected, machine_here, settled
 from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.own_job import note_own_job
 from tune_jobs.sweeps.stages import RACE, MoreSeeds, run_sweep
 
 
@@ -87,6 +88,7 @@ def _taken_over(store: Sweep, address: str | None) -> Iterator[tuple[Machine | N
         # The request was for a process that was killed.
         store.clear_stop_request()
         stack.enter_context(settled(store))
+        note_own_job(store)
         allow_modules(store.read_record().allowed_modules)
         machine = machine_here() if address is None else None
         if machine is not None:

@@ -22,6 +22,7 @@ from tune_jobs.process.interruption import can_drive, current
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.compare import compare
 from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
+from tune_jobs.sweeps.detached import cancel_waiting
 from tune_jobs.sweeps.drive import connected, machine_here, settled, write_new
 from tune_jobs.sweeps.exports import dataframe, export, figure, study
 from tune_jobs.sweeps.outcome import SweepResult
@@ -349,12 +350,12 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
     """Ask the process that runs a sweep to stop; its running trials save a checkpoint first.
 
     Returns:
-        Whether a process runs the sweep.
+        Whether a process runs the sweep, or was about to: a job that has not begun with it is ended.
     """
     from tune_jobs.sweeps.conclude import find_sweep
 
     store = find_sweep(sweep, storage)
     if not store.is_driven():
-        return False
+        return store.read_record().job is not None and cancel_waiting(store)
     store.request_stop()
     return True

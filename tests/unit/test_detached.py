@@ -1,0 +1,227 @@
+"""A sweep that a job drives: what is written and sent, what is undone if it fails, and what its records show then."""
+
+import contextlib
+import json
+import shlex
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from fake_jobs import Head, head
+from sweep_folders import make_sweep_folder
+
+from analysis.records import JobRecord
+from policies.errors import CannotRunError
+from tune_jobs.cli.commands import cli
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import detached
+from tune_jobs.sweeps.own_job import environment_of, note_own_job
+
+__all__ = ["head"]
+
+SWEEP = "env: CartPole-v1\nalgorithm: ppo\nstop: {num_env_steps: 2000}\n"
+NO_STORAGE = "Node 10.0.0.2 cannot read the storage."
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(detached, "_POLL_S", 0.02)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text(SWEEP)
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(cli, words)
+
+
+def launch(head: Head, *words: str) -> Result:
+    return run("launch", "mine.yaml", "--storage", "s", "--address", head.address, *words)
+
+
+def failed(message: str, code: int | None) -> dict[str, Any]:
+    return {"status": "FAILED", "message": message, "driver_exit_code": code}
+
+
+@contextlib.contextmanager
+def driven(folder: Path, ending: str, *, after_s: float = 0.3) -> Iterator[None]:
+    """Drive a sweep in a thread until it ends with a state; the lock of a file is held by what opened it, here too."""
+    store = SweepStore(folder)
+    held = threading.Event()
+
+    def drive() -> None:
+        with store.lock():
+            store.write_record(store.read_record().model_copy(update={"state": "running"}))
+            held.set()
+            time.sleep(after_s)
+            store.write_record(store.read_record().model_copy(update={"state": ending}))
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    held.wait(10)
+    yield
+    thread.join()
+
+
+def test_a_launch_leaves_a_sweep_and_a_job_that_resumes_it(head: Head, tmp_path: Path) -> None:
+    # Ray calls a job failed whose driver ended with 3, as that of a sweep with failed trials does.
+    head.on_submit = lambda body: failed("Job entrypoint command failed with exit code 3", 3)
+    done = launch(head, "--detach", "--json")
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    store, sent = SweepStore(tmp_path / "s" / "mine"), head.submitted[0]
+    assert (told["sweep"], told["job"], told["address"]) == ("mine", sent["submission_id"], head.address)
+    assert told["commands"]["attach"] == "tune-jobs attach mine --storage s"
+    assert shlex.split(sent["entrypoint"]) == ["tune-jobs", "resume", str(store.folder), "--address", "auto"]
+    assert store.read_record().job == JobRecord(id=told["job"], address=head.address)
+    # No module of the user's own is named: nothing travels.
+    assert set(sent["runtime_env"]) == {"env_vars"}
+    assert sent["metadata"]["sweep"] == "mine"
+
+
+def test_no_token_is_sent_or_written(head: Head, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    head.token = "very-secret"
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "very-secret")
+    head.on_submit = lambda body: {"status": "SUCCEEDED"}
+    assert launch(head, "--detach").exit_code == 0
+    assert "very-secret" not in json.dumps(head.submitted)
+    for path in (tmp_path / "s").rglob("*"):
+        assert not path.is_file() or b"very-secret" not in path.read_bytes()
+
+
+def test_modules_of_ones_own_travel(head: Head, tmp_path: Path) -> None:
+    (tmp_path / "travel_envs.py").write_text(
+        "from gymnasium.envs.classic_control import CartPoleEnv\nclass Mine(CartPoleEnv): pass\n"
+    )
+    head.on_submit = lambda body: {"status": "SUCCEEDED"}
+    words = ("--detach", "--set", "env=travel_envs:Mine", "--set", "engine=rllib", "--allow-module", "travel_envs")
+    done = launch(head, *words)
+    assert done.exit_code == 0, done.output
+    (name,) = head.packages
+    assert head.submitted[0]["runtime_env"]["working_dir"] == f"gcs://{name}"
+
+
+@pytest.mark.parametrize(
+    ("becomes", "code", "said"),
+    [
+        (failed(f"exit code 5, last logs:\nerror: {NO_STORAGE}\nMount it.\n", 5), 5, f"{NO_STORAGE}\nMount it."),
+        (
+            failed("exit code 4, last logs:\nerror: No sweep 'x' in y.\nList.\n", 4),
+            5,
+            "the same on this machine and on",
+        ),
+        (failed("exit code 127, last logs:\nsh: tune-jobs: not found\n", 127), 5, "on the cluster's head"),
+        (failed("runtime_env setup failed: no such package", None), 5, "runtime_env setup failed: no such package"),
+        (failed("exit code 2, last logs:\nerror: Bad point.\n", 2), 2, "Bad point."),
+    ],
+)
+def test_a_job_that_fails_at_once_leaves_nothing(
+    head: Head, tmp_path: Path, becomes: dict[str, Any], code: int, said: str
+) -> None:
+    head.on_submit = lambda body: becomes
+    done = launch(head, "--detach")
+    assert (done.exit_code, said in done.stderr) == (code, True), done.stderr
+    assert list((tmp_path / "s").iterdir()) == []
+
+
+def test_a_refused_job_leaves_nothing(head: Head, tmp_path: Path) -> None:
+    def refuse(body: dict[str, Any]) -> dict[str, Any]:
+        raise ValueError("runtime_env is bad")
+
+    head.on_submit = refuse
+    done = launch(head, "--detach")
+    assert done.exit_code == 5
+    assert "ValueError: runtime_env is bad (status 500)" in done.stderr
+    assert list((tmp_path / "s").iterdir()) == []
+
+
+def test_a_bad_sweep_file_is_told_before_anything_is_sent(head: Head) -> None:
+    assert launch(head, "--detach", "--set", "algorithm=sarsa").exit_code == 2
+    assert head.submitted == []
+    assert run("launch", "mine.yaml", "--detach").exit_code == 2
+    assert launch(head, "--dry-run").exit_code == 2
+
+
+def test_a_job_that_waits_is_shown_stopped_and_not_asked_for_twice(
+    head: Head, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(detached.wait_until_begun, "__kwdefaults__", {"timeout_s": 0.1})
+    head.on_submit = lambda body: {"status": "PENDING"}
+    done = launch(head, "--detach")
+    assert "has not begun yet" in done.stdout
+    job = head.submitted[0]["submission_id"]
+    assert f"{job} at {head.address}: pending" in run("status", "mine", "--storage", "s").stdout
+    again = run("resume", "mine", "--storage", "s", "--address", head.address, "--detach")
+    assert (again.exit_code, "is about to run sweep mine" in again.stderr) == (5, True)
+    assert run("stop", "mine", "--storage", "s", "--json").exit_code == 0
+    assert head.stopped == [job]
+
+
+def test_the_verbs_are_jobs_with_their_options(head: Head, tmp_path: Path) -> None:
+    make_sweep_folder(tmp_path / "s" / "mine")
+    head.on_submit = lambda body: {"status": "SUCCEEDED"}
+    at = ("--storage", "s", "--address", head.address, "--detach", "--no-finish")
+    for words in (
+        ("resume", "mine", "--retry-failed"), ("extend", "mine", "--num-samples", "2"),
+        ("replicate", "mine", "--top", "3", "--seeds", "2"), ("inject", "mine", "lr=0.003"),
+    ):  # fmt: skip
+        assert run(*words, *at).exit_code == 0
+        sent = shlex.split(head.submitted[-1]["entrypoint"])
+        assert sent == [
+            "tune-jobs", words[0], str(tmp_path / "s" / "mine"), *words[2:], "--address", "auto", "--no-finish"
+        ]  # fmt: skip
+
+
+def test_a_driver_notes_its_job_and_refuses_that_of_another_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, job = make_sweep_folder(tmp_path / "s" / "mine"), JobRecord(id="mine-1", address="http://head:8265")
+    told = environment_of(job)["TUNE_JOBS_JOB"]
+    monkeypatch.setenv("TUNE_JOBS_JOB", told)
+    note_own_job(store)
+    assert store.read_record().job == job
+    monkeypatch.setenv("TUNE_JOBS_JOB", json.dumps({**json.loads(told), "version": "0.0.1"}))
+    with pytest.raises(CannotRunError, match=r"this sweep was sent by 0\.0\.1"):
+        note_own_job(store)
+    # A sweep that is driven by no job any more names none.
+    monkeypatch.delenv("TUNE_JOBS_JOB")
+    note_own_job(store)
+    assert store.read_record().job is None
+
+
+def test_attach_shows_a_sweep_of_another_process_to_its_end(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    store = make_sweep_folder(tmp_path / "s" / "mine")
+    with driven(store.folder, "completed"):
+        done = run("attach", "mine", "--storage", "s")
+    assert done.exit_code == 0, done.stderr
+    assert "4 trials: 4 completed" in done.stdout
+    assert "100 %, 2,400 env steps; 4 completed" in capfd.readouterr().err
+    with driven(store.folder, "interrupted"):
+        done = run("attach", "mine", "--storage", "s", "--json")
+    assert (done.exit_code, json.loads(done.stdout)["exit_code"]) == (130, 130)
+
+
+def test_attach_tells_of_a_driver_that_died_and_of_a_job_that_failed(head: Head, tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "s" / "mine")
+    with driven(store.folder, "running"):
+        done = run("attach", "mine", "--storage", "s")
+    assert (done.exit_code, "has ended without finishing it" in done.stderr) == (5, True)
+    job = JobRecord(id="mine-1", address=head.address)
+    store.write_record(store.read_record().model_copy(update={"job": job}))
+    head.jobs["mine-1"] = failed(f"exit code 5, last logs:\nerror: {NO_STORAGE}\nMount it.\n", 5)
+    done = run("attach", "mine", "--storage", "s")
+    assert (done.exit_code, NO_STORAGE in done.stderr) == (5, True)
+    assert f"mine-1 at {head.address}: failed" in run("status", "mine", "--storage", "s").stdout
+
+
+def test_status_of_a_sweep_whose_cluster_is_gone_is_told(head: Head, tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "s" / "mine")
+    job = JobRecord(id="mine-1", address="http://127.0.0.1:9")
+    store.write_record(store.read_record().model_copy(update={"job": job}))
+    done = run("status", "mine", "--storage", "s", "--json")
+    assert done.exit_code == 0
+    assert json.loads(done.stdout)["job"]["state"].startswith("not known")
