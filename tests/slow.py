@@ -14,7 +14,10 @@ VARIABLE = "TUNE_JOBS_SLOW"
 _LEARN = "`make learn` trains every preset over five seeds"
 
 SLOW = {
-    "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[rllib]": "the same, packed",
+    "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[rllib-crash]":
+        "the same, packed",
+    "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[packed-drain]":
+        "the same, rllib",
     "tests/learning/test_learning.py::test_dqn_learns_cartpole": _LEARN,
     "tests/learning/test_learning.py::test_ppo_learns_pendulum": _LEARN,
     "tests/learning/test_packed_dqn_learning.py::test_a_pack_of_dqn_trials_solves_cartpole": _LEARN,

@@ -19,6 +19,7 @@ from typing import Any
 BIN = Path(sys.executable).parent
 START_TIMEOUT_S = 180
 STOP_TIMEOUT_S = 60
+_MOST_STARTS = 4
 # The least Ray takes; the weights of these trials are a few kilobytes.
 OBJECT_STORE_BYTES = 100_000_000
 
@@ -136,14 +137,32 @@ class Cluster:
             f"--resources={json.dumps({name: 1})}", f"--object-store-memory={OBJECT_STORE_BYTES}",
             f"--dashboard-agent-listen-port={free_port()}", "--disable-usage-stats", "--block",
         ]  # fmt: skip
-        with log.open("wb") as file:
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                env={**self.environment, **environment}, start_new_session=True,
-            )  # fmt: skip
-        node = self.nodes[name] = Node(name, process, log)
-        node.wait_until_started()
-        return node
+        for _ in range(_MOST_STARTS):
+            with log.open("wb") as file:
+                process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+                    env={**self.environment, **environment}, start_new_session=True,
+                )  # fmt: skip
+            node = self.nodes[name] = Node(name, process, log)
+            try:
+                node.wait_until_started()
+                return node
+            except AssertionError:
+                # Ray gives up after 30 s, which a machine that does much else may take.
+                if "timed out during startup" not in log.read_text():
+                    raise
+                kill_group(process)
+        raise AssertionError(f"node {name} did not start:\n{log.read_text()}")
+
+    def drain(self, node: Node, within_s: int = 60) -> None:
+        """Tell Ray that a node is about to be taken away, as the notice of a spot machine does."""
+        command = [
+            BIN / "ray", "drain-node", "--address", self.address, "--node-id", node.node_id,
+            "--reason", "DRAIN_NODE_REASON_PREEMPTION", "--reason-message", "a test",
+            "--deadline-remaining-seconds", str(within_s),
+        ]  # fmt: skip
+        done = self.run(command)
+        assert done.returncode == 0, done.stderr
 
     def run(
         self, command: Sequence[str | Path], *, timeout_s: float = 400, **environment: str

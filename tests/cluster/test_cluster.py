@@ -211,10 +211,11 @@ SLOW: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("engine", ["rllib", "packed"])
+@pytest.mark.parametrize("case", ["rllib-crash", "packed-crash", "packed-drain", "rllib-drain"])
 def test_a_trial_goes_on_elsewhere_when_its_node_is_lost(
-    cluster: Cluster, worker: Node, tmp_path: Path, storage: Path, engine: str
+    cluster: Cluster, worker: Node, tmp_path: Path, storage: Path, case: str
 ) -> None:
+    engine, _, how = case.partition("-")
     # Each of the two ways in which a machine of the cluster joins it.
     address = {"rllib": "auto", "packed": cluster.address}[engine]
     doomed = cluster.start_worker("doomed")
@@ -222,11 +223,16 @@ def test_a_trial_goes_on_elsewhere_when_its_node_is_lost(
     slow = tmp_path / "slow"
     slow.touch()
     env = {"id": "TestTrouble-v0", "args": {"pause_s": 0.005, "pause_while": str(slow)}}
-    process = cluster.begin(launch_command(write_sweep(tmp_path, **SLOW, env=env, engine=engine), storage, address))
+    # No failure is forgiven, and the loss of a node is none.
+    spec = write_sweep(tmp_path, **SLOW, env=env, engine=engine, max_retries=0)
+    process = cluster.begin(launch_command(spec, storage, address))
     folder = storage / "swept"
     try:
         lost = wait_for_checkpoint_on(doomed_id, folder, process, SLOW["stop"]["num_env_steps"])
-        doomed.crash()
+        if how == "crash":
+            doomed.crash()
+        else:
+            wait_until_it_left(cluster, doomed, folder / "trials" / lost)
         slow.unlink()
         iteration = max(int(path.name) for path in (folder / "trials" / lost / "checkpoints").glob("0*"))
         before = result_lines(folder, lost, iteration)
@@ -244,10 +250,26 @@ def test_a_trial_goes_on_elsewhere_when_its_node_is_lost(
     ids = {cluster.nodes["head"].node_id[:8], worker.node_id[:8]}
     assert {node_of(trial) for name, trial in trials.items() if name != lost} == ids
     assert node_of(trials[lost]) in ids
-    assert trials[lost]["num_failures"] == 1
+    assert [trial["num_failures"] for trial in trials.values()] == [0] * 3
+    [note] = trials[lost]["notes"]
+    assert f"({doomed_id[:8]}) was {'lost' if how == 'crash' else 'drained'}." in note
     # The lines hold times to the microsecond: iterations that were trained again would have others.
     assert len(before) == iteration
     assert result_lines(folder, lost, iteration) == before
+
+
+def wait_until_it_left(cluster: Cluster, node: Node, trial: Path) -> None:
+    """Drain a node, as before a spot machine is taken away, until its trial has saved and goes on elsewhere."""
+    cluster.drain(node)
+    deadline = time.monotonic() + 120
+    while "was drained" not in (trial / "trial.json").read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    record = json.loads((trial / "trial.json").read_text())
+    newest = max(int(path.name) for path in (trial / "checkpoints").glob("0*"))
+    # Nothing that it has told of is trained again.
+    assert newest >= record["num_iterations"]
+    node.crash()
 
 
 def wait_for_checkpoint_on(node_id: str, folder: Path, process: subprocess.Popen[str], num_env_steps: int) -> str:

@@ -10,6 +10,7 @@ from ray.exceptions import RayTaskError
 from scripted_packs import make_sweep
 
 from policies.errors import CheckpointError
+from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.processes import RayWatch
 from tune_jobs.ray_tune.run_trials import RunJob, _TrialEvents, run_trials
 from tune_jobs.ray_tune.trainable import TrialTrainable, watchdog
@@ -23,7 +24,7 @@ def tune_trial(folder: Path, trial_id: str, cause: Exception) -> types.SimpleNam
     """As Tune shows its callbacks one whose process raised."""
     path = folder / f"{trial_id}.pkl"
     path.write_bytes(cloudpickle.dumps(RayTaskError("step", "a traceback", cause)))
-    return types.SimpleNamespace(config={"trial_id": trial_id}, pickled_error_file=str(path))
+    return types.SimpleNamespace(config={"trial_id": trial_id}, trial_id=trial_id, pickled_error_file=str(path))
 
 
 @pytest.mark.parametrize("timeout_s", [1e9, 1e10, 1e300])
@@ -37,7 +38,8 @@ def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path: Pat
     store = make_sweep(tmp_path / "mine", 2)
     keeper = RecordKeeper(store, ["t0000", "t0001"], lambda record: None)
     # Of a Ray that lives: no part of it is silent.
-    events = _TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0))
+    losses = NodeLosses(lambda trial: 0, lambda error: None)
+    events = _TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0), losses)
     for trial_id, cause in (("t0000", OwnershipLostError("taken")), ("t0001", ValueError("broke"))):
         keeper.started(trial_id)
         getattr(events, event)(0, [], tune_trial(tmp_path, trial_id, cause))

@@ -264,3 +264,21 @@ def test_a_pack_that_another_process_is_has_not_died(tmp_path: Path) -> None:
     # Nor does it count later, for who goes on alone.
     driven.driver.died("p00", "killed")
     assert driven.assigned() == [0, 1]
+
+
+def test_the_loss_of_a_packs_node_is_no_failure_and_who_was_to_end_has_ended(tmp_path: Path) -> None:
+    driven = Driven(tmp_path, 4, num_packs=1, slots=3, scheduler={"type": "asha", "grace_env_steps": 100})
+    driven.tell(t0000=(200, 5.0))
+    driven.tell(t0001=(200, 1.0))
+    assert driven.assigned() == [0, 2, 3]
+    assert driven.driver.reached("p00") == (("t0000", 0), ("t0001", 0), ("t0002", 0), ("t0003", 0))
+    for _ in range(9):
+        driven.driver.moved("p00", "Node 10.0.0.7 (1234) was lost.")
+    records = driven.keeper.all_records()
+    assert [record.status for record in records] == ["pending", "stopped", "pending", "pending"]
+    assert [record.num_failures for record in records] == [0] * 4
+    assert (
+        records[0].notes[0] == "Node 10.0.0.7 (1234) was lost. The trial went on elsewhere, from its latest checkpoint."
+    )
+    assert driven.assigned() == [0, 2, 3]
+    assert not driven.driver.is_finished

@@ -156,10 +156,32 @@ class PackDriver:
 
     def lost(self, pack_id: str) -> None:
         """Handle the end of a process that lost its pack to another one: no member has failed; it is started again."""
+        self._restarts(pack_id, self._keeper.lost)
+
+    def moved(self, pack_id: str, left: str) -> None:
+        """Handle the loss of a pack's node: no member has failed; the pack is started again elsewhere.
+
+        Args:
+            pack_id: The pack.
+            left: What became of the node, a sentence.
+        """
+        self._restarts(pack_id, lambda trial_id: self._keeper.moved(trial_id, left))
+
+    def reached(self, pack_id: str) -> tuple[tuple[str, int], ...]:
+        """Return the members of a pack, and the latest checkpoint that each has on disk."""
+        members = self._packs[pack_id].members
+        return tuple((name, max(self._store.trial(name).checkpoint_iterations(), default=0)) for name in members)
+
+    def _restarts(self, pack_id: str, note: Callable[[str], None]) -> None:
         pack = self._packs[pack_id]
         pack.is_up = False
+        for trial_id in list(pack.ending):
+            # The next process is not told of them, so none would report their end.
+            self._stopped(pack, trial_id)
         for trial_id in pack.members:
-            self._keeper.lost(trial_id)
+            note(trial_id)
+        self._fill(pack, self._slots)
+        self._write(pack)
 
     def closed(self, pack_id: str) -> None:
         """Handle a pack that Tune has ended: it has nothing to do, or the sweep stops and it did not save in time."""

@@ -16,6 +16,7 @@ from ray import tune
 from policies.acting.evaluate import Evaluator
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules
+from tune_jobs.ray_tune.lost_nodes import DrainNotice
 from tune_jobs.ray_tune.trainable import (
     REPORT_INTERVAL_S,
     TaskReader,
@@ -53,16 +54,21 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         self._evaluator: Evaluator | None = None
         self._loop: PackLoop | None = None
         self._node = this_node()
+        self._notice = DrainNotice()
 
     def step(self) -> dict[str, Any]:
         """Remove members that shall end, add new ones, and train until there is something to decide.
 
         Raises:
             Exception: An error of no single member; it is in the pack's log too.
+            NodeLeavesError: The node is taken away; the members are saved.
         """
         try:
             if self._loop is None:
                 self._loop = self._open()
+            if self._notice.came:
+                # Before any member is built: Ray may still start a process on a node that it drains.
+                self._leave(self._loop)
             self._arrange(self._loop)
             reports = self._loop.advance(REPORT_INTERVAL_S, until_evaluated=self._is_scheduled)
         except Exception:
@@ -70,6 +76,11 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
             raise
         # The driver decides when there is nothing left to do.
         return {"done": False, "reports": reports, "node": self._node}
+
+    def _leave(self, loop: PackLoop) -> None:
+        """Save the members and end the pack here, as the node is taken away."""
+        loop.save()
+        raise self._notice.error()
 
     def make_engine(self) -> PackEngine:
         """Make the engine of this pack."""

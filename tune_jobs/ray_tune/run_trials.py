@@ -22,6 +22,7 @@ from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import describe_failure, error_of, was_lost
+from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import PopulationScheduler
@@ -151,9 +152,10 @@ class _Run:
         choose = None if self._chooser is None else self._chooser.prepare
         rule = self._scheduler.scheduler
         driver = PackDriver(self._store, self._spec, plan, trial_ids, scheduler=rule, keeper=self.keeper, choose=choose)
-        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch)
+        losses = NodeLosses(lambda trial: driver.reached(_pack_id(trial)), self._watch.check_after)
+        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch, losses)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
-        tune.Tuner(
+        tuner = tune.Tuner(
             tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
             param_space={
                 **self._config,
@@ -168,19 +170,22 @@ class _Run:
             ),
             # The driver decides which of a dead pack's trials are retried, and the run ends when none is left.
             run_config=self._run_config(folder, events, -1, lambda: driver.is_finished),
-        ).fit()
+        )
+        with losses.not_counted():
+            tuner.fit()
 
     def _single_trials(self, trial_ids: Sequence[str], folder: str) -> None:
         """Run single trials, as many at once as fit."""
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
-        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch)
+        losses = NodeLosses(self._reached, self._watch.check_after)
+        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
         searcher = None
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
         else:
             param_space["trial_id"] = tune.grid_search(list(trial_ids))
-        tune.Tuner(
+        tuner = tune.Tuner(
             tune.with_resources(TrialTrainable, _resources(spec, job)),
             param_space=param_space,
             tune_config=tune.TuneConfig(
@@ -194,7 +199,12 @@ class _Run:
                 trial_dirname_creator=_trial_id,
             ),
             run_config=self._run_config(folder, events, spec.max_retries),
-        ).fit()
+        )
+        with losses.not_counted():
+            tuner.fit()
+
+    def _reached(self, trial: Trial) -> int:
+        return max(self._store.trial(_trial_id(trial)).checkpoint_iterations(), default=0)
 
     def _run_config(
         self, name: str, events: tune.Callback, max_failures: int, is_finished: Callable[[], bool] = lambda: False
@@ -261,10 +271,13 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
 class _TrialEvents(tune.Callback):  # type: ignore[misc]
     """Tells the keeper of records what Tune does with the trials."""
 
-    def __init__(self, store: Sweep, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
+    def __init__(
+        self, store: Sweep, keeper: RecordKeeper, timeout_s: float, watch: RayWatch, losses: NodeLosses
+    ) -> None:
         self._store = store
         self._keeper = keeper
         self._timeout_s = timeout_s
+        self._losses = losses
         self._watch = watch
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
@@ -308,6 +321,9 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         if was_lost(error):
             self._keeper.lost(trial_id)
             return
+        if left := self._losses.take(trial):
+            self._keeper.moved(trial_id, left)
+            return
         self._watch.check_after(error)
         message = describe_failure(error, self._store.trial(trial_id).log_tail(), timeout_s=self._timeout_s)
         self._keeper.failed(trial_id, message, retried=retried)
@@ -320,7 +336,10 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
 class _PackEvents(tune.Callback):  # type: ignore[misc]
     """Tells the driver of the packs what happens to their processes."""
 
-    def __init__(self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float, watch: RayWatch) -> None:
+    def __init__(
+        self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float, watch: RayWatch, losses: NodeLosses
+    ) -> None:
+        self._losses = losses
         self._watch = watch
         self._driver = driver
         self._keeper = keeper
@@ -354,6 +373,9 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
         pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), error_of(trial)
         if was_lost(error):
             self._driver.lost(pack_id)
+            return
+        if left := self._losses.take(trial):
+            self._driver.moved(pack_id, left)
             return
         self._watch.check_after(error)
         self._driver.died(pack_id, describe_failure(error, tail, timeout_s=self._timeout_s, what="pack"))

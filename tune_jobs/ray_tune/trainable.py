@@ -27,6 +27,7 @@ from policies.envs.tallies import end_tally
 from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
+from tune_jobs.ray_tune.lost_nodes import DrainNotice
 from tune_jobs.ray_tune.scheduling import score_of
 from tune_jobs.ray_tune.tune_scheduler import METRIC
 from tune_jobs.spec.engines import engine_on_record
@@ -173,6 +174,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         self._loop: TrialLoop | None = None
         self._evaluators: dict[str, Evaluator] = {}
         self._node = this_node()
+        self._notice = DrainNotice()
         self._run = owner_of_run(config)
         end_with_driver(config, self._run)
         self._take(config)
@@ -193,12 +195,15 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
 
         Raises:
             Exception: Any error of the trial; it is in the trial's log too.
+            NodeLeavesError: The node is taken away; the trial is saved.
         """
         place, trial_id = self._trial
         try:
             if self._loop is None:
                 self._loop = self._open(place, trial_id)
             progress = self._watched(self._loop)
+            if progress.status == "running" and self._notice.came:
+                self._leave(self._loop)
         except Exception as error:
             # print_exc would fail where standard error of Ray's processes cannot encode the text.
             print(fit(traceback.format_exc()), file=sys.stderr, flush=True)
@@ -238,6 +243,12 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
     def _watched(self, loop: TrialLoop) -> Progress:
         with watchdog(loop.task.iteration_timeout_s + REPORT_INTERVAL_S, self._file):
             return loop.advance(REPORT_INTERVAL_S)
+
+    def _leave(self, loop: TrialLoop) -> None:
+        """Save the trial and end it here, as the node is taken away."""
+        with watchdog(loop.task.iteration_timeout_s, self._file):
+            loop.pause()
+        raise self._notice.error()
 
     def _report(self, progress: Progress) -> dict[str, Any]:
         return {

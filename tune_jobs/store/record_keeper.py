@@ -107,6 +107,17 @@ class RecordKeeper:
         """Note that a trial's process ended because another one has taken the trial, which waits to be continued."""
         self.paused(trial_id)
 
+    def moved(self, trial_id: str, left: str) -> None:
+        """Note that a trial's node is gone; the trial has not failed, and goes on elsewhere.
+
+        Args:
+            trial_id: The trial.
+            left: What became of the node, a sentence.
+        """
+        self.running.discard(trial_id)
+        note = f"{left} The trial went on elsewhere, from its latest checkpoint."
+        self._update(trial_id, transitions.moved(self._records[trial_id], note))
+
     def ended(self, trial_id: str) -> None:
         """Note that a trial runs no more: it has ended by itself, or it was paused or stopped."""
         self.running.discard(trial_id)

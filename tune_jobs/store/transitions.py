@@ -63,6 +63,11 @@ def paused(record: TrialRecord) -> TrialRecord:
     return record.model_copy(update={"status": "paused"})
 
 
+def moved(record: TrialRecord, note: str) -> TrialRecord:
+    """Return the record of a trial whose node was lost; it has not failed, and goes on elsewhere."""
+    return record.model_copy(update={"status": "pending", "notes": (*record.notes, note)[-_MAX_NOTES:]})
+
+
 def stopped(record: TrialRecord, now: float) -> TrialRecord:
     """Return the record after the scheduler ended the trial."""
     return record.model_copy(update={"status": "stopped", "stop_reason": _by_scheduler(record), "ended_at": now})

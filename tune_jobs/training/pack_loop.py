@@ -196,6 +196,11 @@ class PackLoop:
             leave = {member: lambda: member.trial.leave("stopped")}
             self._attempt(leave, saves=False, leaves=True)
 
+    def save(self) -> None:
+        """Save every member that has trained, as this process is about to end."""
+        with self._watch(max((member.task.iteration_timeout_s for member in self._all), default=1.0)):
+            self._attempt({member: member.trial.pause for member in self._all if member.loop}, saves=True)
+
     def advance(self, max_s: float, *, until_evaluated: bool) -> list[MemberReport]:
         """Train until there is something to decide, or for `max_s` seconds.
 
