@@ -156,7 +156,7 @@ class Cluster:
 
     def drain(self, node: Node, within_s: int = 60) -> None:
         """Tell Ray that a node is about to be taken away, as the notice of a spot machine does."""
-        command = [
+        command: list[str | Path] = [
             BIN / "ray", "drain-node", "--address", self.address, "--node-id", node.node_id,
             "--reason", "DRAIN_NODE_REASON_PREEMPTION", "--reason-message", "a test",
             "--deadline-remaining-seconds", str(within_s),

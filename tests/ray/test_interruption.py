@@ -14,6 +14,9 @@ from typing import Any
 
 import pytest
 
+from tests.kills.ports import listening
+from tests.kills.processes import Family
+
 pytestmark = pytest.mark.ray
 
 PROGRAM = str(Path(sys.executable).with_name("tune-jobs"))
@@ -61,6 +64,7 @@ class Sweep:
     def __init__(self, cwd: Path) -> None:
         self.cwd, self.folder = cwd, cwd / "sweeps" / "cut"
         self.slow = cwd / "slow"
+        self.listens_at: set[str] = set()
         (cwd / "spec.yaml").write_text(SPEC.format(slow=self.slow, num_env_steps=NUM_ENV_STEPS))
 
     def interrupt(self, number: signal.Signals, *command: str) -> tuple[int, str]:
@@ -83,6 +87,8 @@ class Sweep:
 
         try:
             wait_until(second_has_checkpoints, process)
+            with Family(process.pid) as family:
+                self.listens_at |= set(listening(family.alive()))
             process.send_signal(number)
             out, err = process.communicate(timeout=600)
         finally:
@@ -152,6 +158,9 @@ def test_signals_save_and_stop_and_the_sweep_goes_on_after_each(sweep: Sweep) ->
 def test_a_kill_loses_no_more_than_the_last_iterations(sweep: Sweep) -> None:
     code, _ = sweep.interrupt(signal.SIGKILL, "launch", "spec.yaml", "--name", "cut")
     assert code == -signal.SIGKILL
+    # Nobody on another machine reaches a sweep's processes, those of Ray among them.
+    assert len(sweep.listens_at) >= 5
+    assert {address.rpartition(":")[0] for address in sweep.listens_at} == {"127.0.0.1"}
     wait_until_gone(read(sweep.folder)[1]["pid"])
     command = [PROGRAM, "status", str(sweep.folder), "--json"]
     status = subprocess.run(command, capture_output=True, text=True, check=True)

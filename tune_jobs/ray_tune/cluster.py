@@ -85,7 +85,10 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
                 if address is None:
                     _start(machine)
                 else:
-                    _join(address)
+                    # One that a sweep's process started here for its others: a cluster's nodes are elsewhere.
+                    is_ours = is_users and address.startswith("127.0.0.1:")
+                    with _at_loopback() if is_ours else contextlib.nullcontext():
+                        _join(address)
             source = "this machine" if address is None else f"the cluster at {address}"
             yield Connection(address, is_client(), cluster_machine(source))
         finally:
@@ -140,7 +143,7 @@ def _start(machine: Machine | None) -> None:
     if machine is not None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
     try:
-        with _finding_own_modules(), _without_unused_processes():
+        with _finding_own_modules(), _without_unused_processes(), _at_loopback():
             # "local": a cluster of this sweep's own, even if another one runs already.
             ray.init(
                 address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
@@ -150,6 +153,22 @@ def _start(machine: Machine | None) -> None:
             f"Ray cannot be started on this machine: {_first_line(error)}",
             "Look for the cause in Ray's logs in /tmp/ray/session_latest/logs.",
         ) from error
+
+
+@contextlib.contextmanager
+def _at_loopback() -> Iterator[None]:
+    """Let a Ray that is started in the block listen at 127.0.0.1 alone, where no other machine reaches it.
+
+    Ray 2.60 puts this machine's own address in the place of 127.0.0.1, in `_node_ip_address` too, and then listens at
+    all addresses; but not on macOS and Windows, nor where this says that it is on one of them. A process that joins
+    such a Ray has to do so too.
+    """
+    constants: Any = ray._private.ray_constants  # noqa: SLF001
+    original, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER = original
 
 
 _UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
