@@ -5,6 +5,8 @@
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table;
 #              then service, drivers and database a hundred times
+# make faults  kill drivers and training processes at random moments, COUNT of each (100), and lose what a sweep stands on:
+#              a table; it goes on where it was cut, or anew with FRESH=--fresh
 # make bench   the benchmarks, beside their peers, in one table
 # make bench-choice   what each way to choose a setting loses, from trainings that were done before (docs/choice.md)
 # make docs    the site of all documentation, into site/: open site/index.html
@@ -16,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test test-slow unit lint types learn kills bench bench-choice docs clean
+.PHONY: install sweep test test-slow unit lint types learn kills faults bench bench-choice docs clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -89,6 +91,10 @@ learn: $(VENV)/installed-test
 kills: $(VENV)/installed-test
 	$(BIN)/python -m tests.kills
 	TUNE_JOBS_NUM_KILLS=50 $(BIN)/python -m pytest --quiet tests/integration/test_service_kills.py
+
+COUNT ?= 100
+faults: $(VENV)/installed-test
+	$(BIN)/python -m tests.faults --count $(COUNT) $(FRESH)
 
 bench: $(VENV)/installed-bench
 	$(BIN)/python -m tests.benchmarks

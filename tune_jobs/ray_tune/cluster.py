@@ -159,7 +159,7 @@ def _start(machine: Machine | None) -> None:
 def _at_loopback() -> Iterator[None]:
     """Let a Ray that is started in the block listen at 127.0.0.1 alone, where no other machine reaches it.
 
-    Ray 2.60 puts this machine's own address in the place of 127.0.0.1, in `_node_ip_address` too, and then listens at
+    Ray 2.60 puts this machine's own address in the place of 127.0.0.1, also where it was given, and then listens at
     all addresses; but not on macOS and Windows, nor where this says that it is on one of them. A process that joins
     such a Ray has to do so too.
     """
