@@ -17,6 +17,8 @@ OWN = {"policies", "analysis", "tune_jobs"}
 # Why something is required that nothing here imports; by distribution.
 NOT_IMPORTED = {
     "psycopg": "SQLAlchemy loads it for PostgreSQL",
+    "check-jsonschema": "it carries the schema of compose files",
+    "kubernetes-validate": "it carries Kubernetes' schemas",
     "build": "the tests build the wheel by `python -m build`",
     "optuna-dashboard": "a command, beside which the page is measured",
     "mkdocs-material": "the theme of the site",

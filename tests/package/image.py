@@ -59,18 +59,18 @@ def read_dockerfile(path: Path) -> list[Instruction]:
 
 
 def read_compose(path: Path, variables: dict[str, str]) -> dict[str, Any]:
-    """The services, `${NAME:-default}` and `${NAME:?message}` replaced."""
+    """The services, `${NAME:-default}`, `${NAME-default}` and `${NAME:?message}` replaced."""
 
     def replace(match: re.Match[str]) -> str:
         name, kind, rest = match.groups()
-        if variables.get(name):
+        if variables.get(name) or (kind == "-" and name in variables):
             return variables[name]
         if kind == ":?":
             raise KeyError(f"{name}: {rest}")
         return str(rest or "")
 
     text = "\n".join(line for line in path.read_text().splitlines() if not line.lstrip().startswith("#"))
-    services: dict[str, Any] = yaml.safe_load(re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", replace, text))
+    services: dict[str, Any] = yaml.safe_load(re.sub(r"\$\{(\w+)(?:(:[-?]|-)([^}]*))?\}", replace, text))
     return services
 
 
@@ -148,6 +148,15 @@ class Root:
         out, _ = process.communicate(timeout=TIMEOUT_S)
         return subprocess.CompletedProcess(command, process.returncode, out.decode(errors="replace"))
 
+    def make_read_only(self, *writable: str) -> None:
+        """From now on, nothing can be written but /tmp, /dev/shm, and these folders, which begin empty."""
+        mounts = "; ".join(f"mkdir -p /mnt/root{path}; mount -t tmpfs tmpfs /mnt/root{path}" for path in writable)
+        done = subprocess.run(
+            [*self._enter, "sh", "-ec", f"{mounts}; mount -o remount,ro /mnt/root"],
+            check=False, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+
     def path(self, path: str) -> Path:
         """A path of the root, as this process can reach it."""
         return Path(f"/proc/{self._inside}/root/mnt/root{path}")
@@ -177,6 +186,8 @@ class Image:
     workdir: str = "/"
     user: str | None = None
     command: list[str] = field(default_factory=list)
+    healthcheck: str = ""
+    given: dict[str, str] = field(default_factory=dict)
 
     def build(self, dockerfile: Path, context: Path) -> None:
         """Run its instructions, those that begin with FROM apart: the base is this machine, with its Python.
@@ -184,18 +195,22 @@ class Image:
         Raises:
             AssertionError: A command failed; with the end of what it printed.
         """
-        system = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
-        self.environment["PATH"] = f"{sys.base_prefix}/bin:{system}"
+        self.given = dict(self.environment)
         arguments = {name: value for name, value in os.environ.items() if name.startswith(_PASSED_ON)}
+        # torch comes from this machine's index, too: whichever build is there.
+        arguments["TORCH_INDEX_URL"] = ""
         for instruction in read_dockerfile(dockerfile):
             getattr(self, f"_{instruction.word.lower()}")(instruction.rest, context, arguments)
 
     def _from(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
-        """The base image: see `build`."""
+        """A stage begins, on the base image: see `build`. What an earlier one made lies there already."""
+        system = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+        self.environment = {**self.given, "PATH": f"{sys.base_prefix}/bin:{system}"}
+        self.workdir = "/"
 
     def _arg(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         name, _, default = rest.partition("=")
-        arguments[name] = default.strip('"')
+        arguments.setdefault(name, default.strip('"'))
 
     def _env(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         for assignment in shlex.split(rest):
@@ -207,13 +222,20 @@ class Image:
         self._checked(["mkdir", "-p", rest])
 
     def _user(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
-        self.user = rest
+        self.user = rest.partition(":")[0]
+
+    def _healthcheck(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
+        self.healthcheck = rest.partition("CMD ")[2]
 
     def _cmd(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         self.command = json.loads(rest)
 
     def _copy(self, rest: str, context: Path, arguments: dict[str, str]) -> None:
         *sources, target = rest.split()
+        if sources[0].startswith("--from="):
+            # One root is all stages'.
+            assert sources[1:] == [target], rest
+            return
         folder = self.root.path(os.path.normpath(Path(self.workdir, target)))
         ignore = shutil.ignore_patterns("__pycache__")
         for source in sources:
@@ -240,7 +262,7 @@ class Image:
     ) -> subprocess.Popen[bytes]:
         """Start a command as a container of this image would."""
         return self.root.begin(
-            command, environment={"HOME": f"/home/{self.user}", **self.environment, **environment},
+            command, environment={"HOME": "/home/tune", **self.environment, **environment},
             workdir=workdir or self.workdir, user=self.user, log=log,
         )  # fmt: skip
 

@@ -25,6 +25,9 @@ def image() -> Iterator[Image]:
         image.build(ROOT / "docker" / "Dockerfile", ROOT)
         image.environment["PYTHONPYCACHEPREFIX"] = "/tmp/compiled"
         root.cut_off()
+        # As compose and Kubernetes have it; the volumes are tune's.
+        root.make_read_only("/sweeps", "/files")
+        root.run(["chown", f"{image.user}:{image.user}", "/sweeps"], environment=image.environment)
         yield image
 
 
@@ -57,6 +60,8 @@ def test_the_composed_services_run_a_sweep_on_two_workers(image: Image, tmp_path
     head_log = tmp_path / "head.log"
     head = image.begin(services["head"]["command"], environment=services["head"]["environment"], log=head_log)
     image.wait_until_healthy(services["head"], head, head_log)
+    # The image's own check, too, which knows whether it is a node.
+    assert image.run(["sh", "-c", image.healthcheck], environment=services["head"]["environment"]).returncode == 0
     for number in range(2):
         log = tmp_path / f"worker-{number}.log"
         worker = image.begin(services["worker"]["command"], environment=services["worker"]["environment"], log=log)
@@ -71,7 +76,6 @@ def test_the_composed_services_run_a_sweep_on_two_workers(image: Image, tmp_path
     for setting in settings:
         arguments += ["--set", setting]
     files = image.root.path(launcher["working_dir"])
-    files.mkdir()
     shutil.copy(ROOT / "tune_jobs" / "spec" / "presets" / "cartpole-ppo.yaml", files / "mine.yaml")
     # Begun early: Ray tries for 20 s before it gives up.
     stranger = image.begin(

@@ -1,14 +1,17 @@
 """What the Docker files promise, read from them."""
 
+import json
 import subprocess
 import sys
 import tomllib
 from fnmatch import fnmatch
+from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pytest
 from image import read_compose, read_dockerfile
+from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 from served import Served
 
 from tune_jobs.cli.serve_command import serve
@@ -28,21 +31,41 @@ def rest_of(word: str) -> list[str]:
 
 
 def copied() -> list[str]:
-    return [source for rest in rest_of("COPY") for source in rest.split()[:-1]]
+    return [source for rest in rest_of("COPY") for source in rest.split()[:-1] if not rest.startswith("--from=build ")]
 
 
 def test_the_image_runs_as_another_user_than_root() -> None:
-    assert rest_of("USER") == ["tune"]
+    assert rest_of("USER") == ["10001:10001"]
+    (made,) = [rest for rest in rest_of("RUN") if "useradd" in rest]
+    assert "--uid 10001 --gid tune" in made
+    assert "groupadd --gid 10001 tune" in made
     words = [instruction.word for instruction in INSTRUCTIONS]
     assert "RUN" not in words[words.index("USER") :]
 
 
 def test_the_base_and_every_package_are_pinned() -> None:
-    (base,) = rest_of("FROM")
+    build, base = rest_of("FROM")
     assert base.startswith("python:3.11-slim-")
+    assert build == f"{base} AS build"
     installs = [command for rest in rest_of("RUN") for command in rest.split("&&") if "pip install" in command]
-    assert len(installs) == 2
+    assert len(installs) == 3
     assert all("--constraint constraints.txt" in command or "--no-deps" in command for command in installs)
+
+
+def test_torch_is_its_cpu_build_unless_the_argument_is_empty() -> None:
+    argument, default = rest_of("ARG")[0].split("=")
+    assert (argument, default.strip('"').rpartition("/")[2]) == ("TORCH_INDEX_URL", "cpu")
+    (install,) = [rest for rest in rest_of("RUN") if "--index-url" in rest]
+    # Nothing else is taken from its index.
+    assert install.startswith("pip install --no-compile --constraint constraints.txt --no-deps ")
+    assert install.endswith(f'${{{argument}:+--index-url "${argument}"}} torch')
+    built = [
+        read_compose(DOCKER / "compose.yaml", {"RAY_AUTH_TOKEN": "secret", **given})["services"]["head"]["build"][
+            "args"
+        ]
+        for given in ({}, {argument: ""})
+    ]
+    assert built == [{argument: default.strip('"')}, {argument: ""}]
 
 
 def test_the_whole_package_is_copied_and_nothing_else_is_sent() -> None:
@@ -63,6 +86,15 @@ def test_the_secret_is_never_committed() -> None:
     assert any(fnmatch("docker/.env", rule) for rule in ignored)
 
 
+def test_the_health_check_of_the_image_asks_a_node_or_a_service(compose: dict[str, Any]) -> None:
+    (check,) = rest_of("HEALTHCHECK")
+    assert "then ray health-check" in check
+    assert "http://127.0.0.1:8470/readyz" in check
+    for name, service in compose["services"].items():
+        # A launcher ends with its command.
+        assert ("disable" in service["healthcheck"]) == (name == "launcher")
+
+
 def test_without_a_token_nothing_starts() -> None:
     with pytest.raises(KeyError, match=r"RAY_AUTH_TOKEN: Write one to docker/\.env first"):
         read_compose(DOCKER / "compose.yaml", {})
@@ -74,13 +106,66 @@ def test_every_service_shows_the_token_and_shares_the_storage(compose: dict[str,
     for name, service in services.items():
         assert service["cap_drop"] == ["ALL"]
         assert service["security_opt"] == ["no-new-privileges:true"]
-        if name == "database":
+        assert service["read_only"] is True
+        assert service.get("user") != "root"
+        assert any(mount.partition(":")[0] == "/tmp" for mount in service["tmpfs"])
+        if name in ("database", "s3"):
             continue
         assert service["environment"]["RAY_AUTH_MODE"] == "token"
         assert service["environment"]["RAY_AUTH_TOKEN"] == "secret"
         assert f"sweeps:{storage.partition('=')[2]}" in service["volumes"]
-    assert "sweeps" not in str(services["database"]["volumes"])
-    assert list(compose["volumes"]) == ["sweeps", "database"]
+        # Ray runs programs from there.
+        assert "exec" in service["tmpfs"][0].partition(":")[2].split(",")
+        assert service["environment"]["TUNE_JOBS_STORAGE"] == storage.partition("=")[2]
+    assert services["database"]["volumes"] == ["database:/var/lib/postgresql/data"]
+    assert services["s3"]["volumes"] == ["objects:/data"]
+    assert list(compose["volumes"]) == ["sweeps", "database", "objects"]
+
+
+def test_the_bucket_is_where_every_process_looks_with_the_keys_of_its_server() -> None:
+    variables = {
+        "RAY_AUTH_TOKEN": "secret", "AWS_ACCESS_KEY_ID": "tune", "AWS_SECRET_ACCESS_KEY": "key",
+        "TUNE_JOBS_STORAGE": "s3://sweeps/tune-jobs?endpoint=http://s3:8333",
+    }  # fmt: skip
+    services = read_compose(DOCKER / "compose.yaml", variables)["services"]
+    server = services.pop("s3")
+    assert (server["profiles"], server["user"]) == (["s3"], "1000:1000")
+    # Conditional writes of several at once were not safe before 4.18.
+    name, _, version = server["image"].partition(":")
+    assert name == "chrislusf/seaweedfs"
+    assert tuple(int(part) for part in version.split(".")) >= (4, 18)
+    assert "ports" not in server
+    assert "http://127.0.0.1:8333/healthz" in server["healthcheck"]["test"]
+    assert server["environment"]["S3_BUCKET"] == "sweeps"
+    readme = (DOCKER / "README.md").read_text()
+    assert variables["TUNE_JOBS_STORAGE"] in readme
+    for name, service in services.items():
+        if name != "database":
+            for variable in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+                assert service["environment"][variable] == server["environment"][variable] == variables[variable]
+            assert service["environment"]["TUNE_JOBS_STORAGE"] == variables["TUNE_JOBS_STORAGE"]
+
+
+def schema() -> Draft202012Validator:
+    """Compose's own, which this package carries."""
+    path = files("check_jsonschema") / "builtin_schemas" / "vendor" / "compose-spec.json"
+    return Draft202012Validator(json.loads(path.read_text()))
+
+
+def test_the_compose_file_is_of_composes_schema(compose: dict[str, Any]) -> None:
+    extension = {name: value for name, value in compose.items() if not name.startswith("x-")}
+    assert [f"{list(error.path)}: {error.message}" for error in schema().iter_errors(extension)] == []
+    assert {service["image"] for service in compose["services"].values() if "build" in service} == {"tune-jobs"}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("read_onli", True), ("cap_drop", "ALL"), ("healthcheck", {"tests": []}), ("cpus", {}), ("tmpfs", 3)],
+)
+def test_a_wrong_field_of_the_compose_file_is_found(field: str, value: object) -> None:
+    compose = read_compose(DOCKER / "compose.yaml", {"RAY_AUTH_TOKEN": "secret"})
+    compose["services"]["worker"][field] = value
+    assert any(list(error.absolute_path)[:2] == ["services", "worker"] for error in schema().iter_errors(compose))
 
 
 def test_no_port_is_published_but_the_services_for_this_machine(compose: dict[str, Any]) -> None:
@@ -98,7 +183,6 @@ def test_the_service_is_asked_for_what_it_has_and_stopped_after_sweeps_have_save
     assert (given["address"], given["host"], given["port"]) == ("ray://head:10001", "0.0.0.0", 8470)
     assert given["drain_s"] < int(service["stop_grace_period"].removesuffix("s"))
     assert f":{given['port']}/readyz" in service["healthcheck"]["test"][-1]
-    assert (service["read_only"], service["tmpfs"]) == (True, ["/tmp"])
     # Without a setting, no other database; with the profile, the one beside it.
     assert service["environment"]["TUNE_JOBS_DATABASE"] == ""
     database = compose["services"]["database"]
@@ -136,5 +220,7 @@ def test_the_services_agree_on_the_heads_ports(compose: dict[str, Any]) -> None:
     assert launcher["profiles"] == ["launch"]
     for service in (head, worker):
         assert "head:6379" in " ".join(service["healthcheck"]["test"])
+    # Ray Jobs, for the containers alone.
+    assert {"--include-dashboard=true", "--dashboard-host=0.0.0.0", "--dashboard-port=8265"} <= set(head["command"])
     for service in (worker, launcher):
         assert service["depends_on"] == {"head": {"condition": "service_healthy"}}

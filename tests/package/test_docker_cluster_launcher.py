@@ -1,0 +1,98 @@
+"""The file for Ray's cluster launcher: Ray's own schema, and the token on every process. No cloud was asked."""
+
+import copy
+import json
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft7Validator  # type: ignore[import-untyped]
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+@pytest.fixture
+def config() -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((ROOT / "docker" / "cluster-launcher" / "aws.yaml").read_text())
+    return found
+
+
+def problems(config: dict[str, Any]) -> list[str]:
+    schema = json.loads((files("ray") / "autoscaler" / "ray-schema.json").read_text())
+    return [f"{list(error.absolute_path)}: {error.message}" for error in Draft7Validator(schema).iter_errors(config)]
+
+
+def test_it_is_of_rays_schema(config: dict[str, Any]) -> None:
+    assert problems(config) == []
+    from ray.autoscaler._private.util import prepare_config, validate_config
+
+    # What `ray up` does before it asks the cloud.
+    validate_config(prepare_config(copy.deepcopy(config)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("max_worker", 8),
+        ("idle_timeout_minutes", "five"),
+        ("auth", {"ssh_users": "ubuntu"}),
+        ("available_node_types", {"head": {"resources": {"CPU": "0"}, "node_config": {}}}),
+    ],
+)
+def test_a_wrong_field_is_found(config: dict[str, Any], field: str, value: object) -> None:
+    assert problems({**config, field: value}) != []
+
+
+def test_every_ray_process_shows_the_token_and_the_file_has_none(config: dict[str, Any]) -> None:
+    started = [
+        command
+        for name in ("head_start_ray_commands", "worker_start_ray_commands")
+        for command in config[name]
+        if "ray start" in command
+    ]
+    assert len(started) == 2
+    for command in started:
+        assert "RAY_AUTH_MODE=token" in command.partition("ray start")[0]
+        assert "RAY_AUTH_TOKEN" not in command
+        assert "TUNE_JOBS_STORAGE=s3://" in command
+    assert config["file_mounts"]["~/.ray/auth_token"] == "~/.ray/auth_token"
+    head = started[0]
+    assert "--dashboard-host=127.0.0.1" in head
+    assert "--num-cpus=0" in head
+
+
+def test_workers_are_spot_machines_and_the_head_is_not(config: dict[str, Any]) -> None:
+    types = config["available_node_types"]
+    head = types.pop(config["head_node_type"])
+    assert "InstanceMarketOptions" not in head["node_config"]
+    assert head["resources"]["CPU"] == 0
+    for kind in types.values():
+        assert kind["node_config"]["InstanceMarketOptions"] == {"MarketType": "spot"}
+        assert kind["max_workers"] == config["max_workers"]
+    for kind in (head, *types.values()):
+        assert kind["node_config"]["MetadataOptions"]["HttpTokens"] == "required"
+        assert "IamInstanceProfile" in kind["node_config"]
+
+
+def test_from_outside_there_is_ssh_alone_for_one_address(config: dict[str, Any]) -> None:
+    (rule,) = config["provider"]["security_group"]["IpPermissions"]
+    assert (rule["FromPort"], rule["ToPort"]) == (22, 22)
+    (source,) = rule["IpRanges"]
+    assert source["CidrIp"].endswith("/32")
+
+
+def test_what_is_installed_is_pinned_and_of_this_version(config: dict[str, Any]) -> None:
+    installs = [
+        command
+        for name in ("setup_commands", "head_setup_commands")
+        for command in config[name]
+        if "pip install" in command
+    ]
+    assert all("--constraint ~/install/constraints.txt" in command for command in installs)
+    wheel = f"tune_jobs-{PROJECT['version']}-py3-none-any.whl"
+    assert config["file_mounts"][f"~/install/{wheel}"] == f"dist/{wheel}"
+    assert any(f"{wheel}[cluster]" in command for command in installs)
