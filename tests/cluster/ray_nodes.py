@@ -115,10 +115,13 @@ class Cluster:
         }
         self.nodes: dict[str, Node] = {}
 
-    def start_head(self) -> Node:
+    def start_head(self, dashboard_port: int | None = None) -> Node:
+        """Start the head; with a port, the dashboard answers there, and takes jobs."""
+        self.jobs_address = f"http://127.0.0.1:{dashboard_port}"
         options = [
             "--head", f"--port={self.port}", f"--ray-client-server-port={self.client_port}",
-            f"--dashboard-port={free_port()}", "--include-dashboard=false",
+            f"--dashboard-port={dashboard_port or free_port()}",
+            f"--include-dashboard={'true' if dashboard_port else 'false'}",
         ]  # fmt: skip
         return self._start("head", options, 1, (), {})
 
