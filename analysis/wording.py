@@ -97,6 +97,12 @@ def shown_path(path: str | Path) -> str:
     return str(absolute.relative_to(here)) if absolute.is_relative_to(here) else str(absolute)
 
 
+def shown_part(place: str, name: str) -> str:
+    """Return what a user types for a part of a place, such as a trial of a sweep; a URL's settings stay behind it."""
+    path, mark, settings = place.partition("?") if "://" in place else (place, "", "")
+    return f"{path}/{name}{mark}{settings}"
+
+
 def setting_text(value: Any) -> str:
     """Return a hyperparameter's text for a terminal, as in a sweep file: no separated thousands; 64x64 for lists."""
     if isinstance(value, float):

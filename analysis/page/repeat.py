@@ -11,7 +11,7 @@ from analysis.page.source import Source
 from analysis.records import SweepRecord
 from analysis.report_tables import Cell, Table
 from analysis.tables import cell_value
-from analysis.wording import NONE, duration, moment, number, seed_range
+from analysis.wording import NONE, duration, moment, number, seed_range, shown_part
 
 _MAX_CPUS = 4
 
@@ -123,7 +123,7 @@ def _machines(source: Source) -> list[tuple[str, str]]:
 def _reproduce(source: Source) -> str:
     ended = [trial.trial_id for trial in source.trials if trial.status == "completed"]
     which = source.winner or next(iter(ended), None)
-    return "" if which is None else f"tune-jobs reproduce {shlex.quote(f'{source.path}/{which}')}"
+    return "" if which is None else f"tune-jobs reproduce {shlex.quote(shown_part(source.path, which))}"
 
 
 def _again(source: Source) -> str:

@@ -72,7 +72,7 @@ def test_everything_is_shown_and_json_is_json(
     made: Synthetic, tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
     status = SweepStatus(made.sweep, {"completed": 1, "failed": 1}, alive=False)
-    result = Result(tmp_path, made.sweep, made.trials, made.best, None, {})
+    result = Result(str(tmp_path), made.sweep, made.trials, made.best, None, {})
     shown: list[Callable[[], None]] = [
         lambda: show_result(cast("SweepResult", result), storage=None, as_json=as_json),
         lambda: show_sweeps([status], as_json=as_json),

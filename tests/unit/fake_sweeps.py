@@ -43,7 +43,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunCommand:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    folder: Path
+    place: str = dataclasses.field(metadata={"json": "folder"})
     sweep: SweepRecord
     trials: list[TrialRecord]
     best: BestRecord | None
@@ -130,7 +130,7 @@ def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeSweeps:
     """Calls are kept in `.calls`; what they return or raise can be replaced in `.answers`."""
     fake = FakeSweeps("tune_jobs.sweeps.verbs")
     folder = tmp_path / "sweeps" / "mine"
-    result = Result(folder, SWEEP, TRIALS, BEST, None, {"report": folder / "report" / "index.html"}, exit_code=3)
+    result = Result(str(folder), SWEEP, TRIALS, BEST, None, {"report": folder / "report" / "index.html"}, exit_code=3)
     status = SweepStatus(SWEEP, {"completed": 1, "failed": 1, "running": 0}, alive=False)
     fake.calls = []
     fake.answers = {

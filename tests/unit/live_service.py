@@ -32,7 +32,7 @@ class Live:
 
     @property
     def storage(self) -> Path:
-        return self.service.config.storage
+        return Path(self.service.config.storage)
 
     def get(self, path: str, **options: Any) -> httpx2.Response:
         return httpx2.get(f"{self.url}/api/v1{path}", timeout=30, **options)

@@ -1,146 +1,258 @@
-"""Nothing that is read from a sweep folder names a place outside it, and no link in it is followed."""
+"""Places of sweeps and storages: folders, and URLs of object stores."""
 
-import json
-from collections.abc import Iterator
+import shlex
 from pathlib import Path
-from typing import Any
 
 import pytest
-from trial_runs import Trial
+from click.testing import CliRunner
+from fake_sweeps import BEST, SWEEP, TRIALS
 
-from analysis.records import CheckpointRecord, TrialRecord
-from policies.errors import CheckpointError, NotFoundError
-from tune_jobs.store.pack_files import Assignment, PackFiles
-from tune_jobs.store.record_files import seal
+from analysis.wording import shown_part, shown_path
+from policies.errors import CannotRunError, SpecError
+from tune_jobs.cli.commands import cli
+from tune_jobs.cli.output import show_result, show_status
+from tune_jobs.service.config import ServiceConfig
+from tune_jobs.store.opening import is_url, name_for_commands, open_storage, open_sweep, sweep_of_trial
 from tune_jobs.store.sweep_store import SweepStore
-from tune_jobs.store.trial_store import TrialStore
+from tune_jobs.store.urls import join_place, name_of_place, outer_place
+from tune_jobs.sweeps.create import CreatedSweep
+from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.plain import to_json
+from tune_jobs.sweeps.status import SweepStatus
+from tune_jobs.sweeps.storage import place_named, split_trial, storage_place
+
+SETTINGS = "?endpoint=http://host:9000"
+VARIABLES = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_REGION", "AWS_DEFAULT_REGION", "TUNE_JOBS_STORAGE")
 
 
-def edit(file: Path, /, **changes: Any) -> None:
-    """As somebody would who knows how manifests are sealed."""
-    data = json.loads(file.read_text()) | changes
-    file.write_text(json.dumps(data | {"sha256": seal(data)}))
+@pytest.fixture(autouse=True)
+def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in VARIABLES:
+        monkeypatch.delenv(name, raising=False)
 
 
-@pytest.fixture
-def precious(tmp_path: Path) -> Iterator[Path]:
-    """A folder outside the sweep, with what must not be touched."""
-    folder = tmp_path / "precious"
-    folder.mkdir()
-    (folder / "thesis.txt").write_text("years of work")
-    yield folder
-    assert [path.name for path in folder.iterdir()] == ["thesis.txt"]
-    assert (folder / "thesis.txt").read_text() == "years of work"
-
-
-@pytest.fixture
-def sweep(tmp_path: Path) -> Path:
-    """A sweep's folder whose trial has checkpoints 10, 20 and 25, the latest."""
-    folder = tmp_path / "sweeps" / "mine"
-    trial = Trial(
-        folder, stop={"num_iterations": 25}, scores=lambda iteration: -float(iteration), checkpoints={"keep": 3}
-    )
-    trial.run()
-    return folder
-
-
-@pytest.mark.parametrize("place", ["{precious}", "../../precious", "trials/t0000/checkpoints/../../../../../precious"])
-def test_a_manifest_does_not_say_what_is_deleted_when_old_checkpoints_are_pruned(
-    sweep: Path, precious: Path, place: str
-) -> None:
-    store = TrialStore(sweep, "t0000")
-    kept = [record.iteration for record in store.checkpoints()]
-    for iteration in kept:
-        edit(store.checkpoints_folder / f"{iteration:06d}" / "manifest.json", path=place.format(precious=precious))
-    # It goes on as `resume` lets it.
-    Trial(sweep, stop={"num_iterations": 60}).run()
-    assert precious.is_dir()
-    left = {record.iteration for record in store.checkpoints()}
-    assert len(left) < len(kept) + 4
-    assert left - set(kept)
-    assert set(kept) - left
+# -- places as texts
 
 
 @pytest.mark.parametrize(
-    "changes", [{"trial_id": "t0001"}, {"iteration": 5}, {"trial_id": "../../precious"}, {"iteration": -1}]
+    ("place", "name", "joined"),
+    [
+        ("/sweeps", "mine", "/sweeps/mine"),
+        ("file:///my%20sweeps", "mine", "/my sweeps/mine"),
+        ("s3://bucket", "mine", "s3://bucket/mine"),
+        ("s3://bucket/", "mine", "s3://bucket/mine"),
+        ("s3://bucket/a/b", "mine", "s3://bucket/a/b/mine"),
+        (f"s3://bucket/a{SETTINGS}", "mine", f"s3://bucket/a/mine{SETTINGS}"),
+        (f"s3://bucket{SETTINGS}", "mine-2.x", f"s3://bucket/mine-2.x{SETTINGS}"),
+        ("gs://bucket/a", "a b?", "gs://bucket/a/a%20b%3F"),
+    ],
 )
-def test_a_manifest_of_another_checkpoint_is_refused(sweep: Path, precious: Path, changes: dict[str, Any]) -> None:
-    folder = TrialStore(sweep, "t0000").checkpoint_folder(25)
-    edit(folder / "manifest.json", **changes)
-    with pytest.raises(CheckpointError, match="000025"):
-        TrialStore(sweep, "t0000").checkpoints()
+def test_a_name_is_joined_before_the_settings_and_is_found_again(place: str, name: str, joined: str) -> None:
+    assert join_place(place, name) == joined
+    assert name_of_place(joined) == name
+    if not place.startswith("file:"):
+        assert outer_place(joined) == place.replace("bucket/" if place.endswith("/") else "\0", "bucket")
+
+
+def test_a_bucket_has_no_name_and_lies_in_itself() -> None:
+    for place in ("s3://bucket", f"s3://bucket{SETTINGS}", "s3://bucket/"):
+        assert name_of_place(place) == ""
+        assert outer_place(place) == place
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["../../precious", "..", "", "t1", "t0000/../t0000", "t\u0660\u0660\u0660\u0660", "t0000\n", "t" + "0" * 300],
-)
-def test_a_trial_is_called_by_its_number_alone(sweep: Path, precious: Path, name: str) -> None:
-    with pytest.raises(NotFoundError, match="is not a trial's id"):
-        SweepStore(sweep).trial(name)
-    with pytest.raises(ValueError, match="trial_id"):
-        TrialRecord(trial_id=name, index=0, point_index=0, seed=1, point={})
-    with pytest.raises(ValueError, match="trial_id"):
-        CheckpointRecord(trial_id=name, iteration=1, num_env_steps=1)
-
-
-def test_the_record_in_a_trials_folder_is_that_trials(sweep: Path) -> None:
-    store = SweepStore(sweep)
-    store.trial("t0000").write_record(TrialRecord(trial_id="t0000", index=0, point_index=0, seed=1, point={}))
-    assert [record.trial_id for record in store.read_trials()] == ["t0000"]
-    edit(store.trial("t0000").record_path, trial_id="t0001")
-    with pytest.raises(CheckpointError, match="is in the folder of t0000"):
-        store.read_trials()
-
-
-def move_and_link(path: Path, precious: Path) -> None:
-    """A link to the precious folder, or its file, where a part of the sweep was."""
-    if path.is_dir():
-        path.rename(path.parent.parent / "moved")
-        path.symlink_to(precious, target_is_directory=True)
-    else:
-        path.unlink(missing_ok=True)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.symlink_to(precious / "thesis.txt")
-
-
-@pytest.mark.parametrize(
-    "part",
-    ["trials", "trials/t0000", "trials/t0000/checkpoints", "trials/t0000/checkpoints/000025",
-     "trials/t0000/results.jsonl"],
+    ("place", "expected"),
+    [
+        ("s3://b/p", True), ("S3://b/p", True), ("gs://b", True), ("az://c/p", True), ("abfs://c@a/p", True),
+        ("memory://x", False), ("file:///x", False), ("/s3://b", False), ("mine", False), ("s3:/b", False),
+        (Path("s3://b"), False),
+    ],
 )  # fmt: skip
-def test_a_trial_does_not_go_on_through_a_link(sweep: Path, precious: Path, part: str) -> None:
-    move_and_link(sweep / part, precious)
-    with pytest.raises(CheckpointError, match="symbolic link"):
-        Trial(sweep, stop={"num_iterations": 60}).run()
+def test_only_an_object_store_is_a_url(place: str | Path, expected: bool) -> None:
+    assert is_url(place) is expected
 
 
-def test_a_link_is_no_checkpoint_to_go_on_from(sweep: Path, precious: Path) -> None:
-    (sweep / "trials" / "t0000" / "checkpoints" / "000030").symlink_to(precious, target_is_directory=True)
-    with pytest.raises(CheckpointError, match="000030 is a symbolic link"):
-        Trial(sweep)
+# -- what a user gives
 
 
-@pytest.mark.parametrize("name", [".000026.1234", ".000025.deleted"])
-def test_a_link_among_the_leftovers_is_left(sweep: Path, precious: Path, name: str) -> None:
-    link = sweep / "trials" / "t0000" / "checkpoints" / name
-    link.symlink_to(precious, target_is_directory=True)
-    Trial(sweep)
-    assert link.is_symlink()
+@pytest.mark.parametrize(
+    ("given", "place"),
+    [
+        ("s3://bucket/a/", "s3://bucket/a"),
+        ("S3://bucket/a", "s3://bucket/a"),
+        ("s3://bucket", "s3://bucket"),
+        (f"s3://bucket/a/{SETTINGS}", f"s3://bucket/a{SETTINGS}"),
+        ("s3://bucket/a?endpoint=http%3A%2F%2Fhost%3A9000", f"s3://bucket/a{SETTINGS}"),
+        ("abfs://container@account/a", "abfs://container@account/a"),
+        ("file:///my%20sweeps", "/my sweeps"),
+        ("file://localhost/sweeps", "/sweeps"),
+    ],
+)
+def test_a_url_has_one_form(given: str, place: str) -> None:
+    assert storage_place(given) == place
+    assert place_named(place) == place
 
 
-@pytest.mark.parametrize("attribute", ["best_folder", "report_folder", "tune_folder", "driver_log"])
-def test_the_other_parts_of_a_sweep_are_no_links(sweep: Path, precious: Path, attribute: str) -> None:
-    store = SweepStore(sweep)
-    getattr(store, attribute).symlink_to(precious, target_is_directory=True)
-    with pytest.raises(CheckpointError, match="symbolic link"):
-        getattr(store, attribute)
+def test_a_folder_is_absolute_and_the_variable_may_be_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    assert storage_place("~/mine") == "/home/me/mine"
+    assert storage_place(Path("mine")) == str(tmp_path / "mine")
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", f"s3://bucket/a{SETTINGS}")
+    assert storage_place(None) == f"s3://bucket/a{SETTINGS}"
+    assert storage_place("mine") == str(tmp_path / "mine")
 
 
-def test_a_pack_reads_and_writes_through_no_link(sweep: Path, precious: Path) -> None:
-    (sweep / "packs").symlink_to(precious, target_is_directory=True)
-    files = PackFiles(sweep, "p00")
-    with pytest.raises(CheckpointError, match="symbolic link"):
-        files.write(Assignment(("t0000",)))
-    with pytest.raises(CheckpointError, match="symbolic link"):
-        files.read()
+@pytest.mark.parametrize(
+    ("variables", "given", "place"),
+    [
+        ({"AWS_ENDPOINT_URL": "http://a:1"}, "s3://b/p", "s3://b/p?endpoint=http://a:1"),
+        (
+            {"AWS_ENDPOINT_URL": "http://a:1", "AWS_ENDPOINT_URL_S3": "http://s:2"},
+            "s3://b",
+            "s3://b?endpoint=http://s:2",
+        ),
+        ({"AWS_ENDPOINT_URL": "http://a:1"}, f"s3://b/p{SETTINGS}", f"s3://b/p{SETTINGS}"),
+        ({"AWS_REGION": "eu-1", "AWS_DEFAULT_REGION": "us-2"}, "s3://b/p", "s3://b/p?region=eu-1"),
+        ({"AWS_DEFAULT_REGION": "us-2"}, "s3://b/p?region=x", "s3://b/p?region=x"),
+        ({"AWS_DEFAULT_REGION": "us-2", "AWS_ENDPOINT_URL": "http://a:1"}, "gs://b/p", "gs://b/p"),
+        ({"AWS_ENDPOINT_URL": ""}, "s3://b/p", "s3://b/p"),
+    ],
+)
+def test_what_the_environment_says_of_the_store_is_set_once(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], given: str, place: str
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert storage_place(given) == place
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("ftp://host/p", r"ftp://: known are s3://, gs://, az://, abfs://, file:// and folders"),
+        ("http://host:9000/b", r"http://: known are s3://"),
+        ("memory://b", r"memory://"),
+        ("s3://", "names no bucket"),
+        ("s3:///a", "names no bucket"),
+        ("s3://?endpoint=http://a", "names no bucket"),
+        ("s3://b/a//c", "empty part"),
+        ("s3://b/../c", r"\.\."),
+        ("file://host/x", "no folder of this machine"),
+        ("s3:/b/p", "one slash"),
+        (Path("s3://b/p"), "one slash"),
+    ],
+)
+def test_a_url_that_no_sweeps_can_be_kept_at_is_refused(given: str | Path, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        storage_place(given)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        "s3://key:hunter2@bucket/p", "s3://hunter2@bucket/p", "s3://key:hun/hunter2@bucket", "s3://key:hunter2/bucket",
+        "s3://bucket/p?access_key=hunter2", "s3://bucket?aws_secret_access_key=hunter2", "gs://b?token=hunter2",
+        "s3://bucket?endpoint=http://key:hunter2@host:9000", "az://c@a:hunter2/x", "az://c/x?sig=hunter2",
+        "ftp://me:hunter2@host/p",
+    ],
+)  # fmt: skip
+def test_credentials_in_a_url_are_refused_and_not_repeated(given: str) -> None:
+    with pytest.raises(SpecError) as raised:
+        storage_place(given)
+    assert "hunter2" not in str(raised.value)
+
+
+def test_credentials_in_an_endpoint_of_the_environment_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://key:hunter2@host:9000")
+    with pytest.raises(SpecError, match=r"\$AWS_ENDPOINT_URL") as raised:
+        storage_place("s3://bucket")
+    assert "hunter2" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("source", "parts"),
+    [
+        ("mine/t0003", ("mine", "t0003")),
+        ("mine", ("", "")),
+        (f"s3://b/mine/t0003{SETTINGS}", (f"s3://b/mine{SETTINGS}", "t0003")),
+        ("s3://b", ("", "")),
+    ],
+)
+def test_a_trial_is_named_behind_its_sweep(source: str, parts: tuple[str, str]) -> None:
+    assert split_trial(source) == parts
+    if parts[0]:
+        assert shown_part(*parts) == source
+
+
+# -- opened, and told
+
+
+def test_a_folder_is_opened_by_its_url_or_its_path(tmp_path: Path) -> None:
+    for place in (tmp_path, str(tmp_path), tmp_path.as_uri()):
+        assert open_storage(place).place == str(tmp_path)
+        assert open_sweep(place).place == str(tmp_path)
+    assert name_for_commands(SweepStore(tmp_path / "mine")) == "mine"
+    assert sweep_of_trial(str(tmp_path / "mine" / "trials" / "t0000")) is None
+
+
+def test_a_result_has_the_folder_of_a_sweep_that_has_one() -> None:
+    assert CreatedSweep("mine", "/a/mine").folder == Path("/a/mine")
+    assert SweepResult("/a/mine", SWEEP, []).folder == Path("/a/mine")
+    for result in (CreatedSweep("mine", "s3://b/mine"), SweepResult("s3://b/mine", SWEEP, [])):
+        with pytest.raises(SpecError, match=r"(?s)s3://b/mine.*`place`"):
+            _ = result.folder
+        assert "s3://b/mine" in result._repr_html_()
+        assert "href" not in result._repr_html_()
+
+
+def test_the_names_in_json_stay() -> None:
+    assert to_json(CreatedSweep("mine", "/a/mine")) == {"name": "mine", "folder": "/a/mine"}
+    told = to_json(SweepResult("s3://b/mine", SWEEP, []))
+    assert told["folder"] == "s3://b/mine"
+    assert "place" not in told
+
+
+def test_a_command_that_is_told_can_be_pasted(capsys: pytest.CaptureFixture[str]) -> None:
+    place = f"s3://b/mine{SETTINGS}&region=eu"
+    show_result(SweepResult(place, SWEEP, TRIALS, BEST, interrupted=True), storage="s3://b", as_json=False)
+    assert f"tune-jobs resume {shlex.quote(place)}\n" in capsys.readouterr().err
+    status = SweepStatus(SWEEP.model_copy(update={"state": "interrupted"}), {}, alive=False)
+    assert f"resume '{place}'` continues it" in status.facts(place=place)["time left"]
+    assert f"resume {SWEEP.name} --storage x` continues" in status.facts(" --storage x")["time left"]
+    show_status(status, sweep=place, as_json=False)
+    assert "resume 's3://b/mine?endpoint" in capsys.readouterr().out
+    assert shown_path(place) == place
+
+
+# -- a service whose sweeps are in an object store
+
+
+def test_a_service_of_an_object_store_needs_a_folder_of_its_own(tmp_path: Path) -> None:
+    config = ServiceConfig(storage="s3://b/p")
+    with pytest.raises(SpecError, match=r"(?s)s3://b/p is no folder.*--folder"):
+        _ = config.database_url
+    given = ServiceConfig(storage="s3://b/p", own_folder=tmp_path)
+    assert given.folder == given.working_folder == tmp_path
+    assert str(tmp_path / "service.db") in given.database_url
+    assert given.place == "s3://b/p"
+    beside = ServiceConfig(storage=tmp_path / "sweeps")
+    assert beside.working_folder == tmp_path / "sweeps"
+    assert beside.folder == tmp_path / "sweeps" / ".service"
+
+
+def test_tokens_are_in_the_folder_of_such_a_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(cli, ["token", "list", "--storage", "s3://b/p"])
+    assert refused.exit_code == SpecError.exit_code
+    assert "--folder" in refused.output
+    made = CliRunner().invoke(cli, ["token", "list", "--storage", "s3://b/p", "--folder", "own", "--json"])
+    assert made.exit_code == 0, made.output
+    assert (tmp_path / "own" / "service.db").is_file()
+    assert not (tmp_path / "s3:").exists()
+
+
+def test_a_place_without_a_store_is_told() -> None:
+    for open_it in (open_storage, open_sweep):
+        with pytest.raises(CannotRunError, match="s3://b/p"):
+            open_it("s3://b/p")

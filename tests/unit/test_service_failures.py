@@ -41,7 +41,7 @@ def folder_of_database(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def finished(service: Service) -> str:
-    make_sweep_folder(service.config.storage / "done")
+    make_sweep_folder(Path(service.config.storage) / "done")
     return "done"
 
 
@@ -60,7 +60,7 @@ def submit(client: TestClient, **changes: Any) -> Any:
 
 def files_of(service: Service) -> set[str]:
     """What is in the storage folder, besides what the service itself writes there."""
-    storage = service.config.storage
+    storage = Path(service.config.storage)
     return {str(path.relative_to(storage)) for path in storage.rglob("*") if ".service" not in path.parts}
 
 
@@ -170,7 +170,7 @@ def test_a_database_whose_file_is_gone(
         assert "database" in problem(answer, 503)["detail"]
     assert "The database can't be used." in client.get("/readyz").json()["problems"]
     assert client.get("/healthz").status_code == 200
-    assert not (service.config.storage / "mine").exists()
+    assert not (Path(service.config.storage) / "mine").exists()
     if how == "moved":
         elsewhere.rename(file)
         assert submit(client).status_code == 201
@@ -212,7 +212,7 @@ class TestPostgreSQL:
         for answer in (submit(client, name="other"), client.get("/api/v1/sweeps/mine")):
             assert "database" in problem(answer, 503)["detail"]
         assert client.get("/healthz").status_code == 200
-        assert not (service.config.storage / "other").exists()
+        assert not (Path(service.config.storage) / "other").exists()
         server.start()
         assert client.get("/api/v1/sweeps/mine").status_code == 200
         assert submit(client, name="other").status_code == 201

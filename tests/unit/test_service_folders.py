@@ -20,7 +20,7 @@ def database_url(tmp_path: Path) -> str:
 
 
 def test_a_sweep_whose_folder_was_renamed_has_the_name_of_the_folder(client: TestClient, service: Service) -> None:
-    made = make_sweep_folder(service.config.storage / "before")
+    made = make_sweep_folder(Path(service.config.storage) / "before")
     made.folder.rename(made.folder.with_name("after"))
     (item,) = client.get("/api/v1/sweeps").json()["sweeps"]
     assert item["name"] == "after"
@@ -35,7 +35,7 @@ def test_a_sweep_whose_folder_was_renamed_has_the_name_of_the_folder(client: Tes
 def test_a_sweep_whose_record_is_damaged_says_so_and_can_be_removed(
     client: TestClient, service: Service, damaged: str
 ) -> None:
-    made = make_sweep_folder(service.config.storage / "mine")
+    made = make_sweep_folder(Path(service.config.storage) / "mine")
     (made.folder / "sweep.json").write_text(damaged)
     told = client.get("/api/v1/sweeps/mine")
     assert (told.status_code, told.json()["error"]) == (500, "CheckpointError")

@@ -40,7 +40,7 @@ with_both = pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], in
 @pytest.fixture
 def finished(service: Service) -> str:
     """A completed sweep of 4 trials that was made from a terminal."""
-    make_sweep_folder(service.config.storage / "done")
+    make_sweep_folder(Path(service.config.storage) / "done")
     return "done"
 
 
@@ -199,7 +199,7 @@ def test_limits_of_a_person_and_a_sweep(client: TestClient, service: Service) ->
 
 def test_lists_have_pages(client: TestClient, service: Service) -> None:
     for index in range(5):
-        make_sweep_folder(service.config.storage / f"s{index}")
+        make_sweep_folder(Path(service.config.storage) / f"s{index}")
     names, cursor = [], None
     while True:
         query: dict[str, Any] = {"sort": "name", "order": "asc", "limit": 2} | (
@@ -265,8 +265,8 @@ def test_what_is_not_there(client: TestClient, finished: str, path: str) -> None
 
 
 def test_a_damaged_sweep_is_named_and_hides_no_other(client: TestClient, finished: str, service: Service) -> None:
-    make_sweep_folder(service.config.storage / "bad")
-    (service.config.storage / "bad" / "sweep.json").write_text("{")
+    make_sweep_folder(Path(service.config.storage) / "bad")
+    (Path(service.config.storage) / "bad" / "sweep.json").write_text("{")
     names = [item["name"] for item in client.get("/api/v1/sweeps").json()["sweeps"]]
     assert names == ["done"]
     assert "sweep.json" in problem(client.get("/api/v1/sweeps/bad"), 500)["detail"]
@@ -316,7 +316,7 @@ def test_a_finished_sweep_is_extended_and_replicated_in_turn(client: TestClient,
 
 def test_how_many_trials_an_extended_sweep_will_have_is_planned_not_guessed(service: Service) -> None:
     spec = {"space": {"lr": {"uniform": [1e-4, 1e-2]}, "gamma": {"grid": [0.9, 0.99]}}, "seeds_per_point": 3}
-    store = make_sweep_folder(service.config.storage / "done", iterations=1, num_samples=2, **spec)
+    store = make_sweep_folder(Path(service.config.storage) / "done", iterations=1, num_samples=2, **spec)
     replication = ReplicationRecord(num_points=4, points=(0, 1, 1))
     store.write_record(store.read_record().model_copy(update={"replications": (replication,)}))
     # As a sweep is whose driver was killed while it wrote its trials.
@@ -375,7 +375,7 @@ def test_actions_that_cannot_be(client: TestClient, finished: str) -> None:
 @with_both
 def test_a_finished_sweep_is_deleted(client: TestClient, finished: str, service: Service) -> None:
     assert client.delete("/api/v1/sweeps/done").status_code == 204
-    assert not (service.config.storage / "done").exists()
+    assert not (Path(service.config.storage) / "done").exists()
     problem(client.get("/api/v1/sweeps/done"), 404)
     assert client.get("/api/v1/sweeps").json()["sweeps"] == []
 

@@ -1,6 +1,7 @@
 """A point of one's own by HTTP: `POST .../trials` lets a job wait, or says what is wrong."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from tune_jobs.service.service import Service
 
 @pytest.fixture
 def finished(service: Service) -> str:
-    make_sweep_folder(service.config.storage / "done", space={"lr": {"uniform": [1e-4, 1e-2]}})
+    make_sweep_folder(Path(service.config.storage) / "done", space={"lr": {"uniform": [1e-4, 1e-2]}})
     return "/api/v1/sweeps/done/trials"
 
 

@@ -95,7 +95,7 @@ def test_steps_of_a_sweep_that_came_and_went_between_two_scrapes_count(client: T
     """It was trained by a job, or from a terminal."""
     expected = 0
     for name in ("queued", "terminal"):
-        store = make_sweep_folder(service.config.storage / name)
+        store = make_sweep_folder(Path(service.config.storage) / name)
         store.write_record(store.read_record().model_copy(update={"created_at": time.time() + 1}))
         expected += sum(trial.num_env_steps for trial in store.read_trials())
     job, _ = service.queue.begin("queued", "drive", {}, owner=OWNER, num_cpus=1.0)
@@ -106,7 +106,7 @@ def test_steps_of_a_sweep_that_came_and_went_between_two_scrapes_count(client: T
 
 
 def test_what_was_seen_earlier_and_comes_later_counts_nothing_twice(client: TestClient, service: Service) -> None:
-    store = make_sweep_folder(service.config.storage / "new")
+    store = make_sweep_folder(Path(service.config.storage) / "new")
     store.write_record(store.read_record().model_copy(update={"created_at": time.time() + 1}))
     trial = store.trial("t0001").read_record()
     store.trial("t0001").write_record(trial.model_copy(update={"num_env_steps": trial.num_env_steps - 100}))

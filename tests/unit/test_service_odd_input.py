@@ -59,7 +59,7 @@ def test_every_route_says_that_there_is_no_such_sweep(shared: Service) -> None:
         assert method == "HEAD" or (b"content-type", b"application/problem+json") in answer.headers
         asked += answer.status == 404
     assert asked > 20
-    assert not (shared.config.storage / "no-such-sweep").exists()
+    assert not (Path(shared.config.storage) / "no-such-sweep").exists()
 
 
 def test_a_name_with_a_nul_is_no_sweep_for_any_route(service: Service) -> None:

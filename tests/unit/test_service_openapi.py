@@ -5,6 +5,7 @@ import copy
 import re
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import pytest
@@ -64,7 +65,7 @@ def at(service: Service) -> Place:
 
 def restore(service: Service) -> None:
     if not service.storage.is_taken(SWEEP):
-        make_finished(service.config.storage / SWEEP)
+        make_finished(Path(service.config.storage) / SWEEP)
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ def database_url(tmp_path: Path) -> str:
 
 @pytest.fixture(autouse=True)
 def finished(service: Service) -> None:
-    make_sweep_folder(service.config.storage / "done")
+    make_sweep_folder(Path(service.config.storage) / "done")
 
 
 def events(text: str) -> list[tuple[str, dict[str, Any]]]:

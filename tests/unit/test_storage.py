@@ -18,7 +18,7 @@ from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.drive import write_new
-from tune_jobs.sweeps.storage import create_store, storage_folder
+from tune_jobs.sweeps.storage import create_store, storage_place
 
 
 def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path: Path) -> None:
@@ -67,10 +67,10 @@ def test_storage_is_what_is_given_else_the_environments_else_here(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
-    assert storage_folder(None) == tmp_path / "sweeps"
+    assert storage_place(None) == str(tmp_path / "sweeps")
     monkeypatch.setenv("TUNE_JOBS_STORAGE", "theirs")
-    assert storage_folder(None) == tmp_path / "theirs"
-    assert storage_folder("mine") == tmp_path / "mine"
+    assert storage_place(None) == str(tmp_path / "theirs")
+    assert storage_place("mine") == str(tmp_path / "mine")
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_sweep_of_the_same_points_again_is_not_extended(
 @pytest.mark.parametrize(
     "use",
     [
-        lambda: storage_folder(None),
+        lambda: storage_place(None),
         lambda: SweepStore(Path("mine")),
         sweeps.list_sweeps,
         lambda: sweeps.launch(MINIMAL, name="new", progress="none"),

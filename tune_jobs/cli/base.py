@@ -127,8 +127,8 @@ json_option = click.option(
     help="Print one JSON document on standard output.",
 )  # fmt: skip
 storage_option = click.option(
-    "--storage", metavar="FOLDER", shell_complete=complete_folders,
-    help="Where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]",
+    "--storage", metavar="PLACE", shell_complete=complete_folders,
+    help="Folder or URL where sweeps are kept.  [default: $TUNE_JOBS_STORAGE or ./sweeps]",
 )  # fmt: skip
 sweep_argument = click.argument("sweep", shell_complete=complete_sweeps)
 sweeps_argument = click.argument("sweeps", nargs=-1, required=True, shell_complete=complete_sweeps)

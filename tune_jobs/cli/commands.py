@@ -132,7 +132,7 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
     with stdout_for(as_json=as_json):
         state = sweeps.status(sweep, storage=storage)
         job = job_facts(state)
-    cli_output.show_status(state, storage=storage, program=program(), job=job, as_json=as_json)
+    cli_output.show_status(state, sweep=sweep, storage=storage, program=program(), job=job, as_json=as_json)
 
 
 @cli.command()

@@ -118,10 +118,10 @@ def _sweep_names(ctx: click.Context, incomplete: str) -> list[str]:
     if server is not None:
         return _asked(server, lambda client: _names_there(client, incomplete))
     from tune_jobs.store.opening import open_storage
-    from tune_jobs.sweeps.storage import storage_folder
+    from tune_jobs.sweeps.storage import storage_place
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):
-        return [sweep.name for sweep in open_storage(storage_folder(ctx.params.get("storage"))).sweeps()]
+        return [sweep.name for sweep in open_storage(storage_place(ctx.params.get("storage"))).sweeps()]
     return []
 
 
@@ -171,9 +171,9 @@ def _asked(server: Server, names: Callable[[Client], list[str]]) -> list[str]:
 def _of_sweep(ctx: click.Context, sweep: str, names: Callable[[Sweep], list[str]]) -> list[str]:
     from policies.errors import TuneJobsError
     from tune_jobs.store.opening import open_storage
-    from tune_jobs.sweeps.storage import storage_folder
+    from tune_jobs.sweeps.storage import storage_place
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):
-        store = open_storage(storage_folder(ctx.params.get("storage"))).sweep(sweep)
+        store = open_storage(storage_place(ctx.params.get("storage"))).sweep(sweep)
         return names(store) if store.exists() else []
     return []

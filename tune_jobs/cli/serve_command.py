@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 database_option = click.option(
     "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
-    help="postgresql://USER@HOST/NAME.  [default: an SQLite file in the storage folder]",
+    help="postgresql://USER@HOST/NAME.  [default: an SQLite file in the service's folder]",
+)  # fmt: skip
+folder_option = click.option(
+    "--folder", type=click.Path(file_okay=False, path_type=Path), metavar="FOLDER",
+    help="The service's own, for its database and logs.  [default: .service in the storage folder]",
 )  # fmt: skip
 
 
@@ -27,6 +31,7 @@ database_option = click.option(
 @click.option("--port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any free port.")
 @click.option("--address", metavar="ADDRESS", help="Ray cluster that sweeps run on; without it, this machine.")
 @database_option
+@folder_option
 @click.option("--env", "envs", multiple=True, metavar="PATTERN", help="Env ids that sweeps may name; may be repeated.")
 @click.option(
     "--allow-module", "modules", multiple=True, metavar="NAME",
@@ -66,6 +71,7 @@ def serve(
     port: int,
     address: str | None,
     database: str | None,
+    folder: Path | None,
     envs: tuple[str, ...],
     modules: tuple[str, ...],
     spare_idle_s: float,
@@ -94,21 +100,22 @@ def serve(
     from tune_jobs.service import logs
     from tune_jobs.service.config import ServiceConfig
     from tune_jobs.service.serve import serve as run
-    from tune_jobs.sweeps.storage import storage_folder
+    from tune_jobs.sweeps.storage import absolute_folder, storage_place
 
     config = ServiceConfig(
-        storage=storage_folder(storage), host=host, port=port, address=address, database=database,
+        storage=storage_place(storage), host=host, port=port, address=address, database=database,
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,
         webhooks=webhooks, webhook_secret=webhook_secret, stuck_s=stuck_s,
         command=tuple(shlex.split(run_command or "")),
         public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
         tls_certificate=tls_certificate, tls_key=tls_key, log_format=log_format, keep_audit_days=keep_audit_days,
+        own_folder=absolute_folder(folder),
     )  # fmt: skip
     logs.configure(log_format, secrets=config.secrets)
 
     def say(url: str) -> None:
         # One line, as whoever reads it waits for its end.
-        told = json.dumps({"url": url, "storage": str(config.storage)})
-        click.echo(told if as_json else f"serving {config.storage} at {url}")
+        told = json.dumps({"url": url, "storage": config.place})
+        click.echo(told if as_json else f"serving {config.place} at {url}")
 
     run(config, say)

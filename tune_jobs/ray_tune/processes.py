@@ -67,7 +67,7 @@ def ray_died(sweep: str, death: RayDiedError) -> CannotRunError:
     """Return the error that reports the death of a part of Ray.
 
     Args:
-        sweep: The sweep's name.
+        sweep: The sweep, as a command names it.
         death: The part that died.
     """
     return CannotRunError(

@@ -36,7 +36,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
-from tune_jobs.store.opening import open_sweep
+from tune_jobs.store.opening import name_for_commands, open_sweep
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 
@@ -85,12 +85,12 @@ def run_trials(job: RunJob, listener: Listener) -> None:
             run.all_trials()
         except (RayDiedError, Exception) as error:
             if isinstance(error, RayDiedError):
-                raise ray_died(store.name, error) from error
+                raise ray_died(name_for_commands(store), error) from error
             # Errors that Ray raises when a part of it is gone do not name the cause.
             try:
                 watch.check_after(error)
             except RayDiedError as death:
-                raise ray_died(store.name, death) from error
+                raise ray_died(name_for_commands(store), death) from error
             raise
         finally:
             with current().shielded():
@@ -397,4 +397,4 @@ def _give_up(run: _Run, death: RayDiedError) -> None:
     from tune_jobs.store.closing import end_process
 
     run.keeper.close()
-    end_process(run.store, ray_died(run.store.name, death))
+    end_process(run.store, ray_died(name_for_commands(run.store), death))

@@ -14,6 +14,7 @@ from tune_jobs.service.events import STUCK_S
 from tune_jobs.service.job_files import own_database, own_folder
 from tune_jobs.service.logs import LogFormat
 from tune_jobs.service.telling import COMMAND, check_target, secrets_of
+from tune_jobs.store.urls import folder_of, is_url
 
 LOOPBACK = "loopback"
 """As the address of a proxy: one on this machine."""
@@ -53,11 +54,11 @@ class ServiceConfig:
     """The service's settings.
 
     Args:
-        storage: The folder for sweeps, absolute.
+        storage: Where sweeps are kept: an absolute folder, or a URL.
         host: The address to listen on.
         port: The port; 0: any that is free.
         address: The Ray cluster that sweeps run on; None: this machine.
-        database: Its URL; None: an SQLite file in the storage folder.
+        database: Its URL; None: an SQLite file in the service's own folder.
         modules: Modules of environments and RLModules that specs may name.
         envs: Patterns (regular expressions) of env ids that specs may name; none: all that need no module.
         limits: What one request or one person may take.
@@ -74,9 +75,11 @@ class ServiceConfig:
         tls_key: A file with its key, PEM.
         log_format: Of the service's own log.
         keep_audit_days: How long the audit log keeps an entry, in days.
+        own_folder: The folder for what the service itself writes, which its drivers work in, too; None: one in the
+            storage folder.
     """
 
-    storage: Path
+    storage: str | Path
     host: str = "127.0.0.1"
     port: int = 8470
     address: str | None = None
@@ -97,6 +100,7 @@ class ServiceConfig:
     tls_key: Path | None = None
     log_format: LogFormat = "text"
     keep_audit_days: float = 365.0
+    own_folder: Path | None = None
 
     def __post_init__(self) -> None:
         for url in self.webhooks:
@@ -132,14 +136,35 @@ class ServiceConfig:
         return tuple(item for item in [*known, *(part for url in self.webhooks for part in secrets_of(url))] if item)
 
     @property
+    def place(self) -> str:
+        """The place of the storage."""
+        return str(self.storage)
+
+    @property
     def folder(self) -> Path:
-        """The folder for what the service itself writes."""
-        return own_folder(self.storage)
+        """The folder for what the service itself writes.
+
+        Raises:
+            SpecError: The storage is an object store, and no folder was given.
+        """
+        if self.own_folder is not None:
+            return self.own_folder
+        if is_url(self.storage):
+            raise SpecError(
+                f"The storage {self.storage} is no folder; the service needs one for its database, jobs and logs.",
+                "Give one of this machine with --folder, the same one each time.",
+            )
+        return own_folder(folder_of(self.storage))
+
+    @property
+    def working_folder(self) -> Path:
+        """The folder that drivers work in: that of the storage, or the service's own if one was given."""
+        return self.folder if self.own_folder is not None or is_url(self.storage) else folder_of(self.storage)
 
     @property
     def database_url(self) -> str:
         """The URL of the database, also where none was given."""
-        return self.database or sqlite_url(own_database(self.storage))
+        return self.database or sqlite_url(own_database(self.folder))
 
     @property
     def is_local(self) -> bool:

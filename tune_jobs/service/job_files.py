@@ -30,9 +30,9 @@ def own_folder(root: Path) -> Path:
     return root / SERVICE_FOLDER
 
 
-def own_database(root: Path) -> Path:
-    """Return the file of the service's database, where no other is given."""
-    return own_folder(root) / "service.db"
+def own_database(folder: Path) -> Path:
+    """Return the file of the service's database, where no other is given, in its own folder."""
+    return folder / "service.db"
 
 
 class Ended(BaseModel):

@@ -67,12 +67,12 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
         engine = open_database(config.database_url)
         try:
             gate = _gate(config, engine)
-            storage, queue, labels = open_storage(config.storage), Queue(engine), Labels(engine)
+            storage, queue, labels = open_storage(config.place), Queue(engine), Labels(engine)
             statuses = Statuses(storage)
             # A cluster shares its CPUs among the trials of all sweeps by itself.
             num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
             where = Surroundings(
-                config.storage, config.folder, config.address, num_cpus, config.modules, config.log_format
+                config.working_folder, config.folder, config.address, num_cpus, config.modules, config.log_format
             )
             metrics = Metrics()
             watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
@@ -145,7 +145,8 @@ def _gate(config: ServiceConfig, engine: Engine) -> Gate:
 
 def _where(config: ServiceConfig) -> str:
     if config.database is None:
-        return f" --storage {shlex.quote(str(config.storage))}"
+        folder = "" if config.own_folder is None else f" --folder {shlex.quote(str(config.own_folder))}"
+        return f" --storage {shlex.quote(config.place)}{folder}"
     # Its password stays out of the terminal.
     return " --database URL"
 

@@ -38,7 +38,7 @@ _LOOKING = "The queue can't be looked at"
 class Surroundings:
     """Where jobs run."""
 
-    storage_folder: Path
+    working_folder: Path
     service_folder: Path
     address: str | None
     """The Ray cluster; None: this machine."""
@@ -347,7 +347,7 @@ class Supervisor:
         return {
             "modules": self._where.modules,
             "log_format": self._where.log_format,
-            "working_folder": str(self._where.storage_folder),
+            "working_folder": str(self._where.working_folder),
             # A cluster has its own.
             "warm_ray": warm and self._where.address is None,
         }

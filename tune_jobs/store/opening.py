@@ -12,7 +12,7 @@ from tune_jobs.store.names import TRIALS_FOLDER
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
-__all__ = ["is_url", "open_storage", "open_sweep", "sweep_of_trial"]
+__all__ = ["is_url", "name_for_commands", "open_storage", "open_sweep", "sweep_of_trial"]
 
 
 def open_storage(place: str | Path) -> Storage:
@@ -35,6 +35,11 @@ def open_sweep(place: str | Path) -> Sweep:
     if is_url(place):
         _no_object_store(place)
     return SweepStore(folder_of(place))
+
+
+def name_for_commands(sweep: Sweep) -> str:
+    """Return how a command names a sweep: by its name in a storage folder, by its URL in an object store."""
+    return sweep.place if is_url(sweep.place) else sweep.name
 
 
 def sweep_of_trial(place: str | Path) -> Sweep | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +29,11 @@ from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
-from tune_jobs.store.opening import open_storage, open_sweep
+from tune_jobs.store.opening import is_url, name_for_commands, open_storage, open_sweep
+from tune_jobs.store.urls import join_place, outer_place
 from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
 from tune_jobs.sweeps.settings import judged
-from tune_jobs.sweeps.storage import expanded, storage_folder
+from tune_jobs.sweeps.storage import expanded, place_named, split_trial, storage_place
 from tune_jobs.training.registry import engine_of_checkpoint
 
 # The first seed of `evaluate` if no sweep gives one; it is never one of training, evaluation or confirmation.
@@ -38,22 +41,31 @@ FRESH_SEED = 2**31
 
 
 def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
-    """Find a sweep by its folder, or by its name in the storage folder.
+    """Find a sweep by its place, or by its name in the storage.
 
     Raises:
         NotFoundError: There is no such sweep.
     """
-    as_folder = open_sweep(expanded(sweep))
-    if as_folder.exists():
-        return as_folder
-    root = storage_folder(storage)
-    store = open_sweep(root / str(sweep))
-    if store.exists():
+    by_place = open_sweep(place_named(sweep))
+    if by_place.exists():
+        return by_place
+    if is_url(by_place.place):
+        raise NotFoundError(
+            f"There is no sweep at {by_place.place}.",
+            f"List the sweeps with `tune-jobs list --storage {shlex.quote(outer_place(by_place.place))}`.",
+        )
+    root = storage_place(storage)
+    if is_url(root):
+        with contextlib.suppress(NotFoundError):  # it may be `SWEEP/TRIAL`
+            store = open_storage(root).sweep(str(sweep))
+            if store.exists():
+                return store
+    elif (store := open_sweep(join_place(root, str(sweep)))).exists():
         return store
     known = [item.name for item in open_storage(root).sweeps()]
     raise NotFoundError(
         f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
-        "List the sweeps with `tune-jobs list`; name another storage folder with --storage.",
+        "List the sweeps with `tune-jobs list`; name another storage with --storage.",
     )
 
 
@@ -220,7 +232,7 @@ def _sweep_and_trial(text: str, storage: str | Path | None) -> tuple[Sweep, str 
     try:
         return _trusted(find_sweep(text, storage)), None
     except NotFoundError:
-        sweep, _, trial_id = text.rpartition("/")
+        sweep, trial_id = split_trial(text)
         if not sweep:
             raise
         try:
@@ -247,14 +259,14 @@ def best_checkpoint(store: Sweep, trial_id: str) -> CheckpointRecord:
     if trial_id not in trials:
         raise NotFoundError(
             f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)} trials.",
-            f"List them with `tune-jobs trials {store.name}`.",
+            f"List them with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
         )
     # A trial that failed later may still be evaluated, though it cannot win.
     found = best_of(trials[trial_id].checkpoints)
     if found is None:
         raise NotFoundError(
             f"Trial {trial_id} of sweep {store.name} has no checkpoint with a score.",
-            f"See why with `tune-jobs trials {store.name}`.",
+            f"See why with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
         )
     return found
 

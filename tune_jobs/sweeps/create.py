@@ -40,7 +40,7 @@ class CreatedSweep:
         return facts_html(f"Sweep {self.name}: created", facts)
 
 
-def write_created(spec: SweepSpec, name: str | None, stem: str, storage: Path, address: str | None) -> CreatedSweep:
+def write_created(spec: SweepSpec, name: str | None, stem: str, storage: str, address: str | None) -> CreatedSweep:
     """Plan a sweep and write it.
 
     Args:

@@ -20,7 +20,7 @@ from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.create import removed_if_not_begun, write_created
 from tune_jobs.sweeps.own_job import environment_of, version_here
-from tune_jobs.sweeps.storage import stem_of, storage_folder
+from tune_jobs.sweeps.storage import stem_of, storage_place
 from tune_jobs.sweeps.travel import folder_to_send, packed
 
 _BEGIN_S = 60.0
@@ -73,7 +73,7 @@ def launch_detached(
     content = _modules_of_sweep(modules_of(spec), source)
     with JobsApi(address) as api:
         api.ray_version()
-        created = write_created(spec, chosen, stem_of(source), storage_folder(storage), "auto")
+        created = write_created(spec, chosen, stem_of(source), storage_place(storage), "auto")
         with removed_if_not_begun(created):
             store = open_sweep(created.place)
             job = _new_job(store, address)

@@ -11,7 +11,7 @@ from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.drive import connected
-from tune_jobs.sweeps.storage import choose_store, stem_of, storage_folder
+from tune_jobs.sweeps.storage import choose_store, stem_of, storage_place
 
 
 @checked
@@ -30,7 +30,7 @@ def planned(
     spec = load_source(source, overrides)
     if name is not None:
         spec = spec.model_copy(update={"name": name})
-    store = choose_store(spec.name, stem_of(source), storage_folder(storage))
+    store = choose_store(spec.name, stem_of(source), storage_place(storage))
     if address is None:
         plan = make_plan(spec, local_machine())
         with store.rehearsal():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 from analysis.objectives import SettingScores
@@ -10,6 +11,7 @@ from analysis.records import FINISHED, ReplicationRecord, SweepRecord
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.plan.sweep_plan import MAX_TRIALS
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import name_for_commands
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.races import NamedRace, last_race, race_named, ranking_of, round_of
 from tune_jobs.sweeps.resume import replicate
@@ -70,7 +72,7 @@ def _check(store: Sweep, ranking: Sequence[SettingScores]) -> None:
     if not ranking:
         raise NotFoundError(
             f"No setting of sweep {store.name} can be replicated: none of its trials was evaluated.",
-            f"See why with `tune-jobs trials {store.name}`.",
+            f"See why with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
         )
     if len(ranking) == 1:
         raise SpecError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 import shutil
 import tempfile
 import time
@@ -31,7 +32,7 @@ from tune_jobs.spec.sections import SchedulerSpec, SearchSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.logs import continued_from
-from tune_jobs.store.opening import open_sweep
+from tune_jobs.store.opening import name_for_commands, open_sweep
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.drive import git_commit, machine_here, settled
@@ -110,7 +111,8 @@ def _check(store: Sweep, trial: TrialRecord, spec: SweepSpec, recorded: Sequence
     if not trial.has_point or not recorded:
         why = f": it failed before ({error_summary(trial.error)})" if trial.status == "failed" else ""
         raise NotFoundError(
-            f"{name} has done no iteration that could be repeated{why}.", f"See `tune-jobs trials {store.name}`."
+            f"{name} has done no iteration that could be repeated{why}.",
+            f"See `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
         )
 
 

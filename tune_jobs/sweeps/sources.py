@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from analysis.records import TrialRecord
@@ -9,12 +10,13 @@ from policies.errors import NotFoundError
 from policies.suggestions import did_you_mean
 from tune_jobs.store.candidates import read_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import sweep_of_trial
-from tune_jobs.sweeps.storage import expanded
+from tune_jobs.store.opening import name_for_commands, sweep_of_trial
+from tune_jobs.store.urls import name_of_place
+from tune_jobs.sweeps.storage import place_named, split_trial
 
 
 def find_source(source: str | Path, storage: str | Path | None = None) -> tuple[Sweep, str | None]:
-    """Find a sweep by name or folder, or a trial of one: `SWEEP/t0003`, or the trial's folder.
+    """Find a sweep by name or place, or a trial of one: `SWEEP/t0003`, or the trial's place.
 
     Returns:
         The sweep, and the trial's id as it was given, which need not exist; None: it is the sweep.
@@ -24,13 +26,13 @@ def find_source(source: str | Path, storage: str | Path | None = None) -> tuple[
     """
     from tune_jobs.sweeps.conclude import find_sweep
 
-    folder = expanded(source)
-    if (of_trial := sweep_of_trial(folder)) is not None:
-        return of_trial, folder.name
+    place = place_named(source)
+    if (of_trial := sweep_of_trial(place)) is not None:
+        return of_trial, name_of_place(place)
     try:
         return find_sweep(source, storage), None
     except NotFoundError as error:
-        sweep, _, trial_id = str(source).rstrip("/").rpartition("/")
+        sweep, trial_id = split_trial(str(source).rstrip("/"))
         if not sweep:
             raise
         try:
@@ -50,6 +52,6 @@ def find_trial(store: Sweep, trial_id: str) -> TrialRecord:
         raise NotFoundError(
             f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)} trials."
             f"{did_you_mean(trial_id, list(trials))}",
-            f"List them with `tune-jobs trials {store.name}`.",
+            f"List them with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
         )
     return trials[trial_id]

@@ -20,7 +20,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_storage
 from tune_jobs.sweeps.forecast import Forecast, caps_of, forecast
-from tune_jobs.sweeps.storage import storage_folder
+from tune_jobs.sweeps.storage import storage_place
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,15 @@ class SweepStatus:
         """The number of trials by status, as text."""
         return ", ".join(f"{number:,} {name}" for name, number in self.counts.items() if number) or "none"
 
-    def facts(self, option: str = "", program: str = "tune-jobs") -> dict[str, str]:
+    def facts(self, option: str = "", program: str = "tune-jobs", place: str | None = None) -> dict[str, str]:
         """Return what is known, each with its name, for a reader.
 
         Args:
             option: What a command needs besides the sweep's name to find it.
             program: How a command begins.
+            place: The sweep's place, if a command has to name it by that; None: its name does.
         """
+        named = f"{shlex.quote(place or self.sweep.name)}{option}"
         facts = {
             "sweep": self.sweep.name,
             "state": self.state,
@@ -81,7 +83,7 @@ class SweepStatus:
             "trials": f"{self.sweep.num_trials:,}: {self.told_counts}",
             "best so far": _best_text(self.best),
             "speed": "" if self.env_steps_per_s is None else f"{self.env_steps_per_s:,.0f} env steps/s",
-            "time left": self._time_left(option, program),
+            "time left": self._time_left(named, program),
             "run time": self._run_time(),
         }
         return {name: text for name, text in facts.items() if text}
@@ -95,12 +97,12 @@ class SweepStatus:
         share = 100 * self.num_env_steps // self.max_env_steps
         return f"{share} %: {self.num_env_steps:,} of at most {counted(self.max_env_steps, 'env step')}"
 
-    def _time_left(self, option: str, program: str) -> str:
+    def _time_left(self, named: str, program: str) -> str:
         if not self.alive:
             if self.sweep.state == "completed":
                 return ""
             verb = "starts" if self.sweep.state == "created" else "continues"
-            return f"nothing runs; `{program} resume {shlex.quote(self.sweep.name)}{option}` {verb} it"
+            return f"nothing runs; `{program} resume {named}` {verb} it"
         if self.sweep.state == "completed":
             return "the trials are done; the best is being confirmed and filmed, and the report written"
         if self.time_left_s is None:
@@ -177,7 +179,7 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
     from tune_jobs.store.candidates import leave_out
 
     found = Sweeps()
-    for store in open_storage(storage_folder(storage)).sweeps():
+    for store in open_storage(storage_place(storage)).sweeps():
         try:
             found.append(_status(store))
         except TuneJobsError as error:

@@ -31,7 +31,7 @@ from tune_jobs.sweeps.reproduce import reproduce
 from tune_jobs.sweeps.results import importance, report, trials
 from tune_jobs.sweeps.stages import run_sweep
 from tune_jobs.sweeps.status import SweepStatus, list_sweeps, status
-from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storage_folder
+from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storage_place
 
 __all__ = [
     "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
@@ -73,7 +73,7 @@ def create(
     """
     spec = load_source(source, overrides, rl_module)
     chosen = name if name is not None else spec.name
-    return write_created(spec, chosen, stem_of(source), storage_folder(storage), address)
+    return write_created(spec, chosen, stem_of(source), storage_place(storage), address)
 
 
 @checked
@@ -166,7 +166,7 @@ def _launch_here(
     rl_module: type[Any] | str | None,
 ) -> SweepResult:
     spec = load_source(source, overrides, rl_module)
-    names = (name if name is not None else spec.name, stem_of(source), storage_folder(storage))
+    names = (name if name is not None else spec.name, stem_of(source), storage_place(storage))
     choose_store(*names)
     # Planned here and not only on the cluster, so that a bad env or point is found before Ray starts.
     machine = machine_here() if address is None else None

@@ -137,7 +137,7 @@ async def play(
     """Play one greedy episode: the events `info`, `step` after step, and `end`, or `problem`."""
     request = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
     told = {**request, "seed": seed, "speed": speed, "start": start}
-    return _Play(told, str(service.config.storage), service.config.limits.players)
+    return _Play(told, str(service.config.working_folder), service.config.limits.players)
 
 
 def _request(service: Service, name: str, trial: str | None, iteration: int | None, random: bool) -> dict[str, Any]:  # noqa: FBT001
