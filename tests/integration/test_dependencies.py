@@ -23,6 +23,8 @@ NOT_IMPORTED = {
     "optuna-dashboard": "a command, beside which the page is measured",
     "mkdocs-material": "the theme of the site",
     "mkdocstrings-python": "a plugin of MkDocs",
+    "flask": "moto's server needs it",
+    "flask-cors": "moto's server needs it",
     "mypy": "a command",
     "ruff": "a command",
     "pandas-stubs": "types, for mypy",

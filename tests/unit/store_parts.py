@@ -18,18 +18,25 @@ from analysis.records import (
     TrialRecord,
 )
 from tune_jobs.store.contract import Sweep, Trial
+from tune_jobs.store.objects import owners, trial_state
 
 SWEEP, TRIAL, RESULTS = "sweep.json", "trials/t0000/trial.json", "trials/t0000/results.jsonl"
 BEST, PACK = "best/evaluation.json", "packs/p00.json"
 NO_IDS = ["", ".", "..", "../t0000", "t0000/", "/t0000", "t000", "T0000", "t00000000000", "t0000\n", "t0000\0", "*"]
 
 
+# What fails in the calls of a file system; that of an object store is in test_objects_faults.
+ON_DISK = pytest.mark.parametrize("harness", ["local"], indirect=True)
+
 Reopen = Callable[[], Sweep]
 """Opens the sweep as another process does."""
 
 
 @pytest.fixture(params=HARNESSES)
-def harness(request: pytest.FixtureRequest, tmp_path: Path) -> Harness:
+def harness(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Harness:
+    # What the store says of an owner is believed for a second, which no test waits for.
+    monkeypatch.setattr(owners, "_LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(trial_state, "_LOOK_EVERY_S", 0.0)
     return HARNESSES[request.param](tmp_path)
 
 

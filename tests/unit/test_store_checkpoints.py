@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from store_parts import Reopen, fill, killed, make_checkpoint, make_iteration, make_sweep, make_trial, numbers
+from store_parts import ON_DISK, Reopen, fill, killed, make_checkpoint, make_iteration, make_sweep, make_trial, numbers
 from stores import Harness
 
 from policies.errors import CheckpointError, NotFoundError
@@ -55,6 +55,7 @@ def test_a_checkpoint_that_was_not_written_whole_is_not_there(trial: Trial, anot
     assert (trial.checkpoint_folder(3) / "state" / "weights").read_text() == "abc"
 
 
+@ON_DISK
 def test_of_a_checkpoint_whose_writer_is_killed_nothing_is_seen_and_the_next_owner_clears_it_away(
     harness: Harness, trial: Trial, another: Reopen
 ) -> None:
@@ -84,39 +85,43 @@ PLACE = "trials/t0000/checkpoints/000003/"
 
 
 @pytest.mark.parametrize(
-    ("key", "content", "what"),
+    ("key", "content"),
     [
-        ("state/weights", b"abd", "state/weights"),
-        ("state/weights", b"", "state/weights"),
-        ("state/weights", None, "state/weights"),
-        ("state/more", b"", "state/more"),
-        ("manifest.json", None, "manifest"),
-        ("manifest.json", b"{", "manifest"),
-        ("manifest.json", b"{}", "manifest"),
+        ("state/weights", b"abd"),
+        ("state/weights", b""),
+        ("state/weights", None),
+        ("state/more", b""),
+        ("manifest.json", None),
+        ("manifest.json", b"{"),
+        ("manifest.json", b"{}"),
     ],
 )
 def test_a_damaged_checkpoint_is_found_before_it_is_read(
-    harness: Harness, trial: Trial, key: str, content: bytes | None, what: str
+    harness: Harness, sweep: Sweep, another: Reopen, key: str, content: bytes | None
 ) -> None:
-    trial.write_checkpoint(make_checkpoint(3), fill)
+    sweep.trial("t0000").write_checkpoint(make_checkpoint(3), fill)
+    trial = another().trial("t0000")
     if content is None:
         harness.remove("mine", PLACE + key)
     else:
         harness.put("mine", PLACE + key, content)
-    with pytest.raises(CheckpointError, match=what) as raised:
+    with pytest.raises(CheckpointError, match=key.removesuffix(".json")) as raised:
         trial.verify_checkpoint(3)
     assert "000003" in raised.value.message
     assert trial.checkpoint_iterations() == [3]
 
 
-def test_an_edited_score_and_another_checkpoints_manifest_are_refused(harness: Harness, trial: Trial) -> None:
+def test_an_edited_score_and_another_checkpoints_manifest_are_refused(
+    harness: Harness, sweep: Sweep, another: Reopen
+) -> None:
+    trial = sweep.trial("t0000")
     trial.write_checkpoint(make_checkpoint(3, evaluation_return=1.0), fill)
     trial.write_checkpoint(make_checkpoint(4, evaluation_return=2.0), fill)
     data = json.loads(harness.content("mine", PLACE + "manifest.json"))
     other = harness.content("mine", PLACE.replace("3", "4") + "manifest.json")
     for manifest in (json.dumps(data | {"evaluation_return": 9.0}).encode(), other):
         harness.put("mine", PLACE + "manifest.json", manifest)
-        for read in (lambda: trial.checkpoint(3), trial.checkpoints):
+        for read in (lambda: another().trial("t0000").checkpoint(3), another().trial("t0000").checkpoints):
             with pytest.raises(CheckpointError, match="000003"):
                 read()
     assert trial.checkpoint(4).evaluation_return == 2.0
@@ -149,12 +154,13 @@ def test_a_copy_stays_when_its_checkpoint_is_deleted(sweep: Sweep, trial: Trial,
 
 
 def test_nothing_is_copied_of_a_checkpoint_that_is_damaged_or_gone(
-    harness: Harness, sweep: Sweep, trial: Trial
+    harness: Harness, sweep: Sweep, trial: Trial, another: Reopen
 ) -> None:
     other = sweep.trial("t0001")
     other.write_checkpoint(make_checkpoint(3, trial_id="t0001"), fill)
     trial.copy_checkpoint(other.checkpoint_folder(3), 7)
     harness.put("mine", PLACE.replace("t0000", "t0001") + "state/weights", b"abd")
+    other = another().trial("t0001")
     before = harness.keys("mine")
     with pytest.raises(CheckpointError, match="state/weights"):
         trial.copy_checkpoint(other.checkpoint_folder(3), 7)
@@ -184,6 +190,7 @@ def test_what_is_set_aside_is_kept_and_taken_for_nothing(harness: Harness, trial
     assert harness.content("mine", "trials/t0000/results.damaged") == b"\xff\n{\n[\n"
 
 
+@ON_DISK
 def test_leftovers_of_a_sweep_are_removed_and_nothing_else(harness: Harness, sweep: Sweep, trial: Trial) -> None:
     sweep.write_record(make_sweep())
     trial.write_record(make_trial(status="completed"))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from policy_factory import make_portable
-from store_parts import BEST, PACK, Reopen, fill, killed, make_best, make_checkpoint, make_iteration, numbers
+from store_parts import BEST, ON_DISK, PACK, Reopen, fill, killed, make_best, make_checkpoint, make_iteration, numbers
 from stores import Harness
 
 from policies.acting.load import load_policy
@@ -16,8 +16,8 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.files import open_to_append
 from tests.narrowing import present
 from tune_jobs.store.contract import Assignment, Sweep, Trial
+from tune_jobs.store.opening import answer
 from tune_jobs.store.ownership import OwnershipLostError
-from tune_jobs.store.probe import answer
 
 # -- who writes: locks, and owners by epoch
 
@@ -38,6 +38,7 @@ def test_one_process_at_a_time_drives_a_sweep(sweep: Sweep, another: Reopen) -> 
         pass
 
 
+@ON_DISK
 def test_a_killed_driver_holds_no_lock(sweep: Sweep, another: Reopen) -> None:
     def act(die: Callable[..., None]) -> None:
         with another().lock():
@@ -101,8 +102,13 @@ def test_a_trial_that_is_lost_while_its_checkpoint_is_written_gets_none(trial: T
         fill(folder)
         another().trial("t0000").take()
 
-    with pytest.raises(OwnershipLostError):
+    def write_and_wait() -> None:
         trial.write_checkpoint(make_checkpoint(1), write)
+        # Here at the latest.
+        trial.settle()
+
+    with pytest.raises(OwnershipLostError):
+        write_and_wait()
     assert numbers(another) == []
 
 

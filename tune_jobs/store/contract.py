@@ -14,6 +14,8 @@ These rules hold for all of it:
 - **What is atomic.** A record, an assignment and a checkpoint exist whole or not at all, even if their writer is killed
   or the machine loses power: a reader sees either the old one or the new one. Results and logs are appended to; a
   reader never sees half a line that a killed writer was appending.
+- **When it is there.** What a call has written is kept when it returns; but results and checkpoints of a trial, and
+  records that are written `soon`, may be kept a moment later, in order. `settle` waits for them.
 - **Epochs.** If several processes take something one after the other, the last one owns it. Every write of a process
   that has lost it raises `OwnershipLostError` and changes nothing.
 - **What is trusted.** No path is taken from a file: parts are found only by names, ids and numbers, and anything that
@@ -38,10 +40,27 @@ from typing import Protocol
 
 from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
 from policies.portable.file import PortablePolicy
-from tune_jobs.store.probe import Probe
 from tune_jobs.store.trial_contract import Assignment, Ownership, Pack, Trial
 
 __all__ = ["Assignment", "Ownership", "Pack", "Storage", "Sweep", "Trial"]
+
+
+class Probe(Protocol):
+    """A question that other machines answer, where a sweep is."""
+
+    @property
+    def place(self) -> str:
+        """The text that a machine has to pass to `opening.answer`."""
+        ...
+
+    def is_same(self, question: str, machine: str) -> bool:
+        """Whether a machine has read this question, and its answer can be seen here.
+
+        Args:
+            question: The result of `answer` on that machine.
+            machine: The machine's name, as passed to `answer`.
+        """
+        ...
 
 
 class Sweep(Protocol):
@@ -115,6 +134,15 @@ class Sweep(Protocol):
 
         Raises:
             CannotRunError: It cannot be written.
+        """
+        ...
+
+    def settle(self) -> None:
+        """Wait until the records that were written by this object are kept for all; `write_record` does so first.
+
+        Raises:
+            OwnershipLostError: Another process runs the sweep by now.
+            CannotRunError: One cannot be kept.
         """
         ...
 
@@ -205,7 +233,7 @@ class Sweep(Protocol):
     def probing(self) -> AbstractContextManager[Probe]:
         """Find out in the block whether other machines see the same sweep; the caller has to hold the lock.
 
-        Each machine gets the probe's `place` and calls `probe.answer` with it; nothing is left after the block.
+        Each machine gets the probe's `place` and calls `opening.answer` with it; nothing is left after the block.
 
         Raises:
             CannotRunError: The sweep cannot be written.

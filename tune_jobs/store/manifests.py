@@ -94,6 +94,16 @@ def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
     return record
 
 
+def described_files(checkpoint: Path) -> list[str]:
+    """Return the names of a checkpoint's files, as its manifest has them; they need not be there.
+
+    Raises:
+        NotFoundError: The folder or its manifest is missing.
+        CheckpointError: The manifest is damaged, or was changed after it was written.
+    """
+    return sorted(_described_files(checkpoint / MANIFEST, _read(checkpoint)[1].get("files")))
+
+
 def files_of(checkpoint: Path) -> dict[str, Path]:
     """Return the files of a checkpoint by their names, its manifest first.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NoReturn
 
-from policies.errors import CannotRunError
+from tune_jobs.store import probe
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.store.local_storage import LocalStorage
 from tune_jobs.store.names import TRIALS_FOLDER
+from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
@@ -19,10 +19,12 @@ def open_storage(place: str | Path) -> Storage:
     """Return the storage at a place, which need not exist.
 
     Raises:
-        CannotRunError: The place is a URL, and there is no such store.
+        SpecError: The place is a URL that is wrong.
     """
     if is_url(place):
-        _no_object_store(place)
+        from tune_jobs.store.objects.object_storage import ObjectStorage
+
+        return ObjectStorage(ObjectUrl.parse(str(place)))
     return LocalStorage(folder_of(place))
 
 
@@ -30,10 +32,13 @@ def open_sweep(place: str | Path) -> Sweep:
     """Return the sweep at a place, which need not exist yet.
 
     Raises:
-        CannotRunError: The place is a URL, and there is no such store.
+        SpecError: The place is a URL that is wrong.
     """
     if is_url(place):
-        _no_object_store(place)
+        # Loaded for those that have one: it takes longer than all of the local store.
+        from tune_jobs.store.objects.object_sweep import ObjectSweep
+
+        return ObjectSweep(ObjectUrl.parse(str(place)))
     return SweepStore(folder_of(place))
 
 
@@ -42,18 +47,32 @@ def name_for_commands(sweep: Sweep) -> str:
     return sweep.place if is_url(sweep.place) else sweep.name
 
 
+def answer(place: str, machine: str) -> str:
+    """Answer the question of a probe, for this machine; see `contract.Probe`.
+
+    Args:
+        place: The probe's place.
+        machine: A name of this machine.
+
+    Raises:
+        FileNotFoundError: The folder cannot be seen here.
+        CannotRunError: Something cannot be done there from here.
+    """
+    if is_url(place):
+        from tune_jobs.store.objects import probe as of_objects
+
+        return of_objects.answer(place, machine)
+    return probe.answer(place, machine)
+
+
 def sweep_of_trial(place: str | Path) -> Sweep | None:
     """Return the sweep that a trial's place is in; None: it is in none.
 
     Raises:
-        CannotRunError: The place is a URL, and there is no such store.
+        SpecError: The place is a URL that is wrong.
     """
     trials = outer_place(str(place))
     if name_of_place(trials) != TRIALS_FOLDER:
         return None
     sweep = open_sweep(outer_place(trials))
     return sweep if sweep.exists() else None
-
-
-def _no_object_store(place: str | Path) -> NoReturn:
-    raise CannotRunError(f"{place} cannot be opened: there is no object store yet.", "Give a folder.")

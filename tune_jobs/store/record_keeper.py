@@ -84,6 +84,7 @@ class RecordKeeper:
         """Change a trial's record, and write it at once, because the trial's process reads it."""
         self._update(trial_id, change(self._records[trial_id]))
         self._write(trial_id)
+        self._store.settle()
 
     def started(self, trial_id: str) -> None:
         """Note that a process has begun a trial."""
@@ -169,6 +170,7 @@ class RecordKeeper:
         for trial_id in sorted(self._changed):
             self._write(trial_id)
         self._write_scalars()
+        self._store.settle()
 
     def _write_scalars(self) -> None:
         with self.owned():
@@ -182,6 +184,6 @@ class RecordKeeper:
     def _write(self, trial_id: str) -> None:
         record = self._records[trial_id]
         with self.owned():
-            self._store.trial(trial_id).write_record(record)
+            self._store.trial(trial_id).write_record(record, soon=True)
         self._written_at[trial_id] = self._clock()
         self._changed.discard(trial_id)

@@ -168,6 +168,9 @@ class SweepStore:
         """Replace sweep.json."""
         write_atomic(self.record_path, dump(record))
 
+    def settle(self) -> None:
+        """Do nothing: what was written is on disk."""
+
     def trial(self, trial_id: str) -> TrialStore:
         """Return the folder of one trial.
 

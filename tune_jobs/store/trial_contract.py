@@ -95,6 +95,18 @@ class Trial(Protocol):
         """Whether this process has taken the trial, and another one has taken it since."""
         ...
 
+    def settle(self) -> None:
+        """Wait until what this process has written here is kept for all; what is kept nearby is so at once.
+
+        A store that is far away takes checkpoints and results in the background. A process calls this before it says
+        of a trial that it has ended, or is paused.
+
+        Raises:
+            OwnershipLostError: Another process has taken the trial; something was not kept.
+            CannotRunError: Something cannot be kept.
+        """
+        ...
+
     # -- its record
 
     def read_record(self) -> TrialRecord:
@@ -106,8 +118,12 @@ class Trial(Protocol):
         """
         ...
 
-    def write_record(self, record: TrialRecord) -> None:
+    def write_record(self, record: TrialRecord, *, soon: bool = False) -> None:
         """Replace the record, atomically.
+
+        Args:
+            record: The record.
+            soon: Whether it may be kept a little later; `Sweep.settle` waits for it.
 
         Raises:
             CannotRunError: It cannot be written.

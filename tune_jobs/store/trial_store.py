@@ -88,7 +88,10 @@ class TrialStore(OwnedFolder):
             )
         return record
 
-    def write_record(self, record: TrialRecord) -> None:
+    def settle(self) -> None:
+        """Do nothing: what was written is on disk."""
+
+    def write_record(self, record: TrialRecord, *, soon: bool = False) -> None:  # noqa: ARG002 (never later here)
         """Replace trial.json."""
         write_atomic(self.record_path, dump(record))
 

@@ -339,7 +339,8 @@ def make_videos(store: Sweep, seed: int | None = None) -> dict[str, Path]:
             both_mp4=paths["before_after_mp4"],
             timeout_s=source.timeout_s,
         )
-    return dict(paths)
+    # Where they are kept; a store may have had them made elsewhere.
+    return dict(store.films())
 
 
 def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]:
@@ -376,7 +377,7 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
     films = store.films()
     videos = {name: films[key] for name, key in (("before", "before_mp4"), ("after", "after_mp4")) if key in films}
     with store.writing_report() as target:
-        return build_report(
+        page = build_report(
             store.place,
             target=target,
             sweep=record,
@@ -387,6 +388,8 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
             why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
             videos=videos if why_no_best is None else {},
         )
+        name = page.relative_to(target).as_posix()
+    return store.report_files()[name]
 
 
 def _known_best(store: Sweep) -> BestRecord:

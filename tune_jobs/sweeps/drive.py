@@ -38,7 +38,7 @@ def write_new(
 ) -> None:
     """Write the records of a new sweep, which is run at once or only created."""
     for trial in plan.trials:
-        store.trial(trial.trial_id).write_record(pending_record(trial))
+        store.trial(trial.trial_id).write_record(pending_record(trial), soon=True)
     # Written last: a folder without this record is not a sweep, so no reader sees half of one.
     store.write_record(
         SweepRecord(

@@ -334,6 +334,9 @@ class TrialSteps:
         self, status: TrialStatus, *, evaluated: bool, reason: str | None = None, error: str | None = None
     ) -> Progress:
         if status != "running":
+            # Before anybody hears that it has ended: what is told of it is there.
+            self.flush()
+            self._store.settle()
             end_tally(self.task.trial_id)
             self._store.forget_tally()
         return Progress(

@@ -1,0 +1,162 @@
+"""A lock between processes anywhere, made of an object: its holder writes there every few seconds that it lives.
+
+Nobody's clock is compared with another's: who wants the lock watches, by its own clock, whether the holder still
+writes. A holder of this machine whose process has ended is not waited for. The lock keeps two processes from driving
+one sweep; that a holder which was cut off writes nothing afterwards does not depend on it, see `owners`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from policies.errors import CannotRunError
+from policies.parents import is_gone, this_process
+from tune_jobs.store.objects.bucket import Bucket, ConflictError, Found, StorageError, Tag
+
+_BEAT_S = 4.0
+"""Seconds between two signs of life."""
+LEASE_S = 30.0
+"""Seconds without one after which a holder counts as gone. A request to the store may take some of them."""
+_FREE = b"{}"
+
+
+@contextlib.contextmanager
+def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Callable[[], bool]]:
+    """Hold the lock in the block, or raise; it takes up to half a minute to find out that a holder elsewhere is gone.
+
+    The block gets a function that says whether the lock is still this process's.
+
+    Args:
+        bucket: The sweep's objects.
+        key: The lock's object.
+        message: The error's message if another process holds it.
+        hint: The error's hint if another process holds it.
+
+    Raises:
+        CannotRunError: Another process holds it, or the store cannot be written.
+    """
+    own = secrets.token_hex(8)
+    beating = _Beating(bucket, key, _take(bucket, key, own, message, hint), own)
+    try:
+        yield beating.is_ours
+    finally:
+        beating.end()
+
+
+def is_leased(bucket: Bucket, key: str) -> bool:
+    """Whether a process holds the lock; for a holder elsewhere that may be gone, this takes some seconds.
+
+    Raises:
+        CannotRunError: The store cannot be read.
+    """
+    found = bucket.get(key)
+    if found is None or not _holder(found):
+        return False
+    state = _is_here(_holder(found))
+    if state is not None:
+        return state
+    # Twice, because one may be lost.
+    deadline = time.monotonic() + 2.5 * _BEAT_S
+    while time.monotonic() < deadline:
+        time.sleep(0.5)
+        now = bucket.get(key)
+        if now is None or now.data != found.data:
+            return now is not None and bool(_holder(now))
+    return False
+
+
+def _take(bucket: Bucket, key: str, own: str, message: str, hint: str) -> Tag:
+    seen: bytes | None = None
+    since = time.monotonic()
+    while True:
+        found = bucket.get(key)
+        holder = _holder(found) if found is not None else {}
+        if holder:
+            is_here = _is_here(holder)
+            data = found.data if found is not None else b""
+            if is_here or (seen is not None and data != seen):
+                raise CannotRunError(message, hint)
+            if is_here is None:
+                seen = data
+                if time.monotonic() - since < LEASE_S:
+                    time.sleep(0.5)
+                    continue
+        try:
+            if found is None:
+                return bucket.put(key, _sign(own, 0), is_new=True)
+            return bucket.put(key, _sign(own, 0), over=found.tag)
+        except ConflictError:
+            # Somebody else took it, or let it go; a new holder counts as one that lives.
+            seen = seen if seen is not None else b""
+            since = time.monotonic()
+
+
+def _sign(key: str, beat: int) -> bytes:
+    """Return what a holder writes; `key` is its own, so that it knows a write whose answer was lost."""
+    sign = {"key": key, "beat": beat, "process": this_process(), "host": socket.gethostname()}
+    return json.dumps({"holder": sign}).encode()
+
+
+def _holder(found: Found) -> dict[str, Any]:
+    try:
+        holder = json.loads(found.data)["holder"]
+    except (ValueError, LookupError, TypeError):
+        return {}
+    return holder if isinstance(holder, dict) else {}
+
+
+def _is_here(holder: dict[str, Any]) -> bool | None:
+    """Whether a holder of this machine lives; None: it is another machine's, or its process can't be seen from here."""
+    process = holder.get("process")
+    ours = this_process().rsplit(" ", 2)[0]
+    if not isinstance(process, str) or not ours or process.rsplit(" ", 2)[0] != ours:
+        return None
+    return not is_gone(process)
+
+
+class _Beating:
+    """Writes signs of life in a thread of its own, until the end."""
+
+    def __init__(self, bucket: Bucket, key: str, tag: Tag, own: str) -> None:
+        self._bucket, self._key, self._tag, self._own = bucket, key, tag, own
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="lease", daemon=True)
+        self._thread.start()
+
+    def _beat(self) -> None:
+        beat = 0
+        while not self._over.wait(_BEAT_S):
+            beat += 1
+            try:
+                self._tag = self._bucket.put(self._key, _sign(self._own, beat), over=self._tag)
+            except ConflictError:
+                if not self.is_ours():
+                    # Another process took it for gone. It has taken the run too, so this one's writes are refused.
+                    return
+            except StorageError:
+                # The store is away; it may be back for the next one.
+                continue
+
+    def is_ours(self) -> bool:
+        """Whether the sign that is there is one of this holder's, whose writing had seemed to fail."""
+        with contextlib.suppress(StorageError):
+            found = self._bucket.get(self._key)
+            if found is None or _holder(found).get("key") != self._own:
+                return False
+            self._tag = found.tag
+        return True
+
+    def end(self) -> None:
+        """Let the lock go."""
+        self._over.set()
+        self._thread.join()
+        with contextlib.suppress(StorageError):
+            if self.is_ours():
+                self._bucket.put(self._key, _FREE, over=self._tag)

@@ -1,0 +1,205 @@
+"""What all parts of a sweep in an object store share: its objects, this machine's folders, and the records."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import secrets
+import threading
+from collections.abc import Callable, Hashable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+
+from policies.errors import NotFoundError, TuneJobsError
+from policies.files import open_to_append, write_atomic
+from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError, Tag
+from tune_jobs.store.objects.outbox import outbox
+from tune_jobs.store.objects.owners import ObjectOwner
+from tune_jobs.store.objects.scratch import own_folder, shared_folder
+from tune_jobs.store.objects.url import ObjectUrl
+from tune_jobs.store.ownership import OwnershipLostError
+from tune_jobs.store.record_files import dump, read_record
+
+_RecordT = TypeVar("_RecordT", bound=BaseModel)
+
+RECORDS = "records"
+_EVENTS_AFTER_S = 10.0
+_ATTEMPTS = 20
+
+
+class Parts:
+    """The objects of one sweep, as one process sees them.
+
+    Args:
+        url: The sweep's address.
+    """
+
+    def __init__(self, url: ObjectUrl) -> None:
+        self.bucket = Bucket(url)
+        self.run: ObjectOwner | None = None
+        """The run that this process works for, which its records are written under."""
+        self.is_locked: Callable[[], bool] | None = None
+        """Whether this process still has the sweep's lock; None: it has not taken it."""
+        self._own: Path | None = None
+        self._writer = secrets.token_hex(4)
+        self.jobs: set[Hashable] = set()
+        """What this process may still have to upload here."""
+        self._tags: dict[str, Tag | None] = {}
+        self._pending: dict[str, bytes] = {}
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Parts, (self.bucket.url,)
+
+    # -- folders of this machine
+
+    def own(self) -> Path:
+        """Return a folder of this process alone."""
+        if self._own is None:
+            self._own = own_folder()
+        return self._own
+
+    def shared(self) -> Path:
+        """Return the sweep's folder that the processes of this machine share."""
+        return shared_folder(self.bucket.url)
+
+    @contextlib.contextmanager
+    def named(self) -> Iterator[None]:
+        """Let errors of the block name the store and not this process's folder."""
+        try:
+            yield
+        except TuneJobsError as error:
+            local = re.compile(rf"{re.escape(str(self.own()))}(/[0-9a-f]{{8}}(?=/))?")
+            message, hint = (local.sub(lambda _: self.bucket.url.short, text) for text in (error.message, error.hint))
+            raise type(error)(message, hint) from error.__cause__
+
+    # -- records: small objects that are replaced whole
+
+    def record_key(self, trial_id: str) -> str:
+        """Return the key of a trial's record: all lie side by side, so that they are listed together."""
+        return f"{RECORDS}/{trial_id}.json"
+
+    def read_record(self, key: str, kind: type[_RecordT], what: str, *, is_sealed: bool = False) -> _RecordT:
+        """Read a record.
+
+        Raises:
+            NotFoundError: There is none.
+            CheckpointError: It is damaged, of a newer format, or was changed; the message names it.
+        """
+        data = self._pending.get(key)
+        if data is None:
+            found = self.bucket.get(key)
+            if found is None:
+                hint = "List the sweeps there with `tune-jobs list --storage`."
+                raise NotFoundError(f"No {what} at {self.bucket.name_of(key)}.", hint)
+            self._tags[key], data = found.tag, found.data
+        # By the same code as a file's.
+        path = self.own() / key
+        with self._lock, self.named():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            return read_record(path, kind, what, is_sealed=is_sealed)
+
+    def write_record(self, key: str, record: BaseModel | str, *, soon: bool = False) -> None:
+        """Replace a record, atomically.
+
+        Args:
+            key: Its object.
+            record: The record, or its text.
+            soon: Whether it may be in the store a little later; `settle` waits for it.
+
+        Raises:
+            OwnershipLostError: Another process runs the sweep by now; the record is the other's.
+            CannotRunError: It cannot be written.
+        """
+        data = (record if isinstance(record, str) else dump(record)).encode()
+        self._pending[key] = data
+        if soon:
+            self.jobs.add(self._job(key))
+            outbox().add(self._job(key), lambda: self._upload(key))
+            return
+        outbox().forget([self._job(key)])
+        try:
+            self._upload(key)
+        except BaseException:
+            self._pending.pop(key, None)
+            raise
+
+    def settle(self) -> None:
+        """Wait until all records are in the store.
+
+        Raises:
+            OwnershipLostError: Another process runs the sweep by now.
+            CannotRunError: One cannot be written.
+        """
+        outbox().settle([self._job(key) for key in list(self._pending)])
+
+    def _job(self, key: str) -> Hashable:
+        return "record", self._writer, key
+
+    def _upload(self, key: str) -> None:
+        data = self._pending.get(key)
+        if data is None:
+            return
+        for _ in range(_ATTEMPTS):
+            if key not in self._tags:
+                found = self.bucket.get(key)
+                self._tags[key] = found.tag if found is not None else None
+            tag = self._tags[key]
+            try:
+                self._tags[key] = self.bucket.put(key, data, over=tag, is_new=tag is None)
+            except ConflictError:
+                self._check_ours()
+                del self._tags[key]
+            else:
+                break
+        else:
+            raise StorageError(
+                f"{self.bucket.name_of(key)} is written by several processes at once.", "End all but one of them."
+            )
+        if self._pending.get(key) is data:
+            self._pending.pop(key, None)
+
+    def _check_ours(self) -> None:
+        """Find out whether this process may write over what another one has written.
+
+        Raises:
+            OwnershipLostError: It may not.
+        """
+        if self.run is not None:
+            self.run.check()
+        elif self.is_locked is not None and not self.is_locked():
+            raise OwnershipLostError(
+                f"Another process drives {self.bucket.url.short} by now.",
+                "Leave it to that process; this one writes nothing there any more.",
+            )
+
+    # -- files that grow
+
+    def append(self, key: str, data: bytes) -> None:
+        """Append to a file that only this process writes to; it is uploaded from time to time."""
+        path = self.own() / "appended" / key
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open_to_append(path) as file:
+            file.write(data)
+        job = "appended", str(path)
+        self.jobs.add(job)
+        outbox().add(job, lambda: self._upload_file(key, path), after_s=_EVENTS_AFTER_S)
+
+    def _upload_file(self, key: str, path: Path) -> None:
+        self.bucket.put(key, path.read_bytes())
+
+    def newest_log(self, key: str, local: Path) -> Path:
+        """Return a local file with a log: this machine's, or a copy of the store's if that is newer."""
+        listed = self.bucket.look(key)
+        with contextlib.suppress(OSError):
+            if listed is None or local.stat().st_mtime >= listed.modified_s:
+                return local
+        copy = self.own() / "logs" / key
+        found = self.bucket.get(key) if listed is not None else None
+        if found is None:
+            return local
+        write_atomic(copy, found.data)
+        return copy

@@ -1,0 +1,94 @@
+"""Folders of this machine for a sweep whose files are elsewhere: what was fetched, what waits to be uploaded, logs.
+
+Nothing here is missed when it is gone. Each process has a folder of its own, which is removed when it ends, or by a
+later process if it was killed; logs and what users open are in a folder that the processes of this machine share.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import hashlib
+import os
+import secrets
+import shutil
+import stat
+import tempfile
+from pathlib import Path
+
+from policies.errors import CannotRunError
+from policies.parents import is_gone, this_process
+from tune_jobs.store.objects.url import ObjectUrl
+
+VARIABLE = "TUNE_JOBS_SCRATCH"
+"""Where these folders are; without it, in the system's folder for temporary files."""
+_PROCESS = "process"
+
+
+def shared_folder(url: ObjectUrl) -> Path:
+    """Return this machine's folder for a sweep, which processes of the same user share.
+
+    Raises:
+        CannotRunError: It cannot be made, or is another user's.
+    """
+    # Two storages of one name are two; the name is for whoever looks.
+    key = hashlib.sha256(str(url).encode()).hexdigest()[:12]
+    folder = _root() / f"{url.name or url.bucket}-{key}"
+    _make(folder)
+    return folder
+
+
+@functools.cache
+def _own(pid: int) -> Path:
+    """Return a new folder of this process alone; `pid` is its id, as a forked process needs another."""
+    folder = _root() / f"of-{pid}-{secrets.token_hex(4)}"
+    _make(folder)
+    (folder / _PROCESS).write_text(this_process(), encoding="ascii")
+    _remove_abandoned()
+    atexit.register(_remove, folder, pid)
+    return folder
+
+
+def own_folder() -> Path:
+    """Return a new empty folder that is removed when this process ends.
+
+    Raises:
+        CannotRunError: It cannot be made.
+    """
+    folder = _own(os.getpid()) / secrets.token_hex(6)
+    _make(folder)
+    return folder
+
+
+def _remove(folder: Path, pid: int) -> None:
+    if os.getpid() == pid:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_abandoned() -> None:
+    for path in _root().glob("of-*"):
+        with contextlib.suppress(OSError, ValueError):
+            if is_gone((path / _PROCESS).read_text(encoding="ascii")):
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def _root() -> Path:
+    given = os.environ.get(VARIABLE)
+    root = Path(given) if given else Path(tempfile.gettempdir()) / f"tune-jobs-{os.getuid()}"
+    _make(root)
+    found = root.lstat()
+    # In a folder for all, somebody else may have been there first.
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+        raise CannotRunError(f"{root} is no folder of this user.", f"Set {VARIABLE} to a folder of your own.")
+    return root
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise CannotRunError(
+            f"The folder {folder} for files of this machine cannot be made: {error.strerror or error}.",
+            f"Set {VARIABLE} to a folder that can be written.",
+        ) from error

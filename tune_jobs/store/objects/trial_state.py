@@ -1,0 +1,394 @@
+"""The state of a trial, as its head names it: read by anybody, and written in the background by the trial's owner.
+
+A process has local files of it, in a folder of its own. Of a reader they are what it has fetched. Of a writer they are
+the newest state, which `_upload` brings to the store: first new objects, then the head that names them, and then what
+no head names any more is removed.
+"""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+
+from policies.errors import CannotRunError, CheckpointError
+from policies.files import write_atomic
+from tune_jobs.store import names
+from tune_jobs.store.manifests import described_files
+from tune_jobs.store.objects.bucket import ConflictError, Tag
+from tune_jobs.store.objects.head import Chunk, Head, StoredCheckpoint, read_head
+from tune_jobs.store.objects.outbox import outbox
+from tune_jobs.store.objects.owners import Epoch, lost
+from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.trial_contract import Ownership
+from tune_jobs.store.trial_store import TrialStore
+
+_RESULTS_AFTER_S = 3.0
+"""Seconds in which results are gathered, if no checkpoint is uploaded sooner."""
+_LOOK_EVERY_S = 1.0
+_CHUNK_BYTES = 2**18
+_ATTEMPTS = 20
+
+
+class TrialState:
+    """Results and checkpoints of one trial.
+
+    Args:
+        parts: The sweep's objects.
+        trial_id: The trial.
+    """
+
+    def __init__(self, parts: Parts, trial_id: str) -> None:
+        self._parts, self._bucket, self._trial_id = parts, parts.bucket, trial_id
+        self._prefix = f"{names.TRIALS_FOLDER}/{trial_id}"
+        self._head_key = f"{self._prefix}/head.json"
+        self._folder: Path | None = None
+        self._writer = secrets.token_hex(4)
+        # What the store has, as far as this process knows.
+        self._head = Head()
+        self._tag: Tag | None = None
+        self._token: str | None = None
+        self._is_lost, self._looked_at = False, -float("inf")
+        self._is_writing = False
+        # What this process has written, as names of local folders by iteration, and what is to be in the next head.
+        self._checkpoints: dict[int, StoredCheckpoint | None] = {}
+        self._keys: dict[int, str] = {}
+        self._damaged: dict[str, str] = {}
+        self._results: tuple[Chunk, ...] = ()
+        self._has_results = False
+        self._lock = threading.RLock()
+
+    # -- who writes
+
+    def take(self, under: Ownership | None) -> None:
+        """Become the owner; see `Trial.take`."""
+        outbox().forget([self._job])
+        for _ in range(_ATTEMPTS):
+            head, tag = read_head(self._bucket, self._head_key)
+            if under is not None:
+                under.check()
+            epoch = Epoch.of(head.owner).next(under.token if under is not None else None, self._name)
+            token = epoch.token()
+            new = head.model_copy(update={"owner": token, "sequence": head.sequence + 1})
+            try:
+                new_tag = self._put(new, tag)
+            except ConflictError:
+                continue
+            with self._lock:
+                self._token, self._is_lost, self._looked_at = token, False, time.monotonic()
+                self._begin_writing(new, new_tag)
+            return
+        raise CannotRunError(
+            f"{self._name} is taken by one process after the other.", "End those that drive this sweep."
+        )
+
+    def _begin_writing(self, head: Head, tag: Tag | None) -> None:
+        self._head, self._tag, self._is_writing = head, tag, True
+        self._checkpoints = dict(head.checkpoints)
+        self._damaged, self._results, self._has_results = dict(head.damaged), head.results, head.has_results
+        self._keys.clear()
+        shutil.rmtree(self.folder(), ignore_errors=True)
+        self._write_results(head)
+
+    def check(self) -> None:
+        """Raise an error if another process has become the owner, as far as is known."""
+        if self._is_lost:
+            raise lost(self._name)
+
+    def begin(self) -> None:
+        """Begin to write, if this has not; from then on, the local files are the newest state.
+
+        Raises:
+            OwnershipLostError: Another process has become the owner, as far as is known.
+        """
+        self.check()
+        if not self._is_writing:
+            with self._lock:
+                self._begin_writing(*read_head(self._bucket, self._head_key))
+
+    def is_lost(self) -> bool:
+        """Whether this process has taken the trial, and another one has taken it since."""
+        if self._token is not None and not self._is_lost and time.monotonic() - self._looked_at > _LOOK_EVERY_S:
+            head, _ = read_head(self._bucket, self._head_key)
+            self._looked_at = time.monotonic()
+            self._is_lost = head.owner != self._token
+        return self._is_lost
+
+    def settle(self) -> None:
+        """Wait until what was written is in the store.
+
+        Raises:
+            OwnershipLostError: Another process has taken the trial.
+            CannotRunError: It cannot be written.
+        """
+        outbox().settle([self._job])
+
+    # -- what is read
+
+    def folder(self) -> Path:
+        """Return the local folder of the trial, in one of this process."""
+        if self._folder is None:
+            self._folder = self._parts.own() / secrets.token_hex(4)
+        return self._folder / names.TRIALS_FOLDER / self._trial_id
+
+    def local(self) -> TrialStore:
+        """Return the local files of the trial, with the results that there are now."""
+        if not self._is_writing:
+            self._look()
+        self.folder().mkdir(parents=True, exist_ok=True)
+        return TrialStore(self.folder().parent.parent, self._trial_id)
+
+    def has_results(self) -> bool:
+        """Whether any results have been written."""
+        return self._has_results if self._is_writing else self._look_head().has_results
+
+    def checkpoints(self) -> Mapping[int, StoredCheckpoint | None]:
+        """Return the checkpoints by iteration; None stands for one that is not in the store yet."""
+        return dict(self._checkpoints) if self._is_writing else self._look_head().checkpoints
+
+    def latest_damaged(self) -> int:
+        """Return the latest iteration of a checkpoint that was set aside; 0 if there is none."""
+        damaged = self._damaged if self._is_writing else self._look_head().damaged
+        return max((int(name.partition("-")[0]) for name in damaged if name[:6].isdecimal()), default=0)
+
+    def manifest_folder(self, iteration: int) -> Path:
+        """Return a local folder with a checkpoint's manifest; the other files need not be there."""
+        stored = self.checkpoints().get(iteration)
+        folder = self._local_checkpoint(iteration, stored)
+        if stored is not None and not (folder / names.MANIFEST).exists():
+            write_atomic(folder / names.MANIFEST, stored.manifest)
+        return folder
+
+    def checkpoint_folder(self, iteration: int) -> Path:
+        """Return a local folder with a checkpoint's files; it does not exist if there is no such checkpoint."""
+        stored = self.checkpoints().get(iteration)
+        folder = self._local_checkpoint(iteration, stored)
+        if stored is not None and self._keys.get(iteration) != stored.key:
+            self.manifest_folder(iteration)
+            prefix = self._checkpoint_prefix(iteration, stored.key)
+            # All that is there, so that something which the manifest does not name is found out.
+            for item in self._bucket.listed(f"{prefix}/"):
+                name = PurePosixPath(item.key.removeprefix(f"{prefix}/"))
+                if ".." not in name.parts and not (folder / name).exists():
+                    self._bucket.fetch(item.key, folder / name)
+        return folder
+
+    def _local_checkpoint(self, iteration: int, stored: StoredCheckpoint | None) -> Path:
+        if stored is None or self._keys.get(iteration) == stored.key:
+            return self.folder() / names.CHECKPOINTS_FOLDER / f"{iteration:06d}"
+        return self.folder() / "fetched" / stored.key / f"{iteration:06d}"
+
+    def _checkpoint_prefix(self, iteration: int, key: str) -> str:
+        return f"{self._prefix}/{names.CHECKPOINTS_FOLDER}/{iteration:06d}-{key}"
+
+    def _look_head(self) -> Head:
+        self._head, self._tag = read_head(self._bucket, self._head_key)
+        return self._head
+
+    def _look(self) -> None:
+        """Bring the local results to what the store has."""
+        for _ in range(_ATTEMPTS):
+            head = self._look_head()
+            if self._write_results(head):
+                return
+            # An object went while it was fetched, because there is a newer head.
+        raise CheckpointError(
+            f"{self._name} names results that do not exist.", "Restore the objects, or an earlier version of the head."
+        )
+
+    def _write_results(self, head: Head) -> bool:
+        path = self.folder() / names.RESULTS
+        if not head.has_results:
+            path.unlink(missing_ok=True)
+            return True
+        content = b""
+        for chunk in head.results:
+            kept = self.folder() / "chunks" / chunk.key
+            if not kept.exists() and not self._bucket.fetch(self._chunk_key(chunk.key), kept):
+                return False
+            content += kept.read_bytes()
+        present = path.read_bytes() if path.exists() else None
+        if present is not None and content.startswith(present):
+            # The same file grows, so that who has read its beginning reads on.
+            with path.open("ab") as file:
+                file.write(content[len(present) :])
+        else:
+            write_atomic(path, content)
+        return True
+
+    def _chunk_key(self, key: str) -> str:
+        return f"{self._prefix}/results/{key}.jsonl"
+
+    # -- what is written
+
+    @property
+    def _name(self) -> str:
+        return self._bucket.name_of(self._prefix)
+
+    @property
+    def _job(self) -> tuple[str, str]:
+        return self._name, self._writer
+
+    def changed(self, *, has_results: bool = False, after_s: float = _RESULTS_AFTER_S) -> None:
+        """Have the state uploaded."""
+        self._has_results = self._has_results or has_results
+        self._parts.jobs.add(self._job)
+        outbox().add(self._job, self._upload, after_s=after_s)
+
+    def wrote_checkpoint(self, iteration: int) -> None:
+        """Have a checkpoint uploaded that is in its local folder."""
+        with self._lock:
+            self._checkpoints[iteration] = None
+            self._keys[iteration] = secrets.token_hex(8)
+        self.changed(after_s=0.0)
+
+    def remove_checkpoint(self, iteration: int) -> None:
+        """Leave a checkpoint out of the state."""
+        with self._lock:
+            stored = self._checkpoints.pop(iteration)
+            shutil.rmtree(self._local_checkpoint(iteration, stored), ignore_errors=True)
+            self._keys.pop(iteration, None)
+        self.changed()
+
+    def set_aside(self, iteration: int) -> str:
+        """Take a damaged checkpoint out of the state, and return its name among what is damaged."""
+        # Set aside is kept: what is not in the store yet is brought there first.
+        self.settle()
+        with self._lock:
+            stored = self._checkpoints.pop(iteration, None)
+            name, number = f"{iteration:06d}", 1
+            while name in self._damaged:
+                number += 1
+                name = f"{iteration:06d}-{number}"
+            if stored is not None:
+                self._damaged[name] = stored.key
+        self.changed(after_s=0.0)
+        return name
+
+    def set_aside_results(self) -> str:
+        """Take all results out of the state, and return their name among what is damaged."""
+        self.settle()
+        with self._lock:
+            name, number = names.RESULTS, 1
+            while name in self._damaged:
+                number += 1
+                name = f"{names.RESULTS}-{number}"
+            self._damaged[name] = " ".join(chunk.key for chunk in self._results)
+            self._results, self._has_results = (), False
+            (self.folder() / names.RESULTS).unlink(missing_ok=True)
+        self.changed(after_s=0.0)
+        return name
+
+    def _upload(self) -> None:
+        if self._is_lost:
+            raise lost(self._name)
+        with self._lock:
+            wanted = dict(self._checkpoints)
+            keys, damaged, has_results = dict(self._keys), dict(self._damaged), self._has_results
+            path = self.folder() / names.RESULTS
+            content = path.read_bytes() if has_results and path.exists() else b""
+            known = self._results
+        stored: dict[int, StoredCheckpoint] = {}
+        for iteration, present in sorted(wanted.items()):
+            found = present if present is not None else self._upload_checkpoint(iteration, keys[iteration])
+            if found is not None:
+                stored[iteration] = found
+        results = self._upload_results(content, known)
+        head = self._head.model_copy(
+            update={
+                "owner": self._token if self._token is not None else self._head.owner,
+                "sequence": self._head.sequence + 1,
+                "has_results": has_results,
+                "results": results,
+                "checkpoints": stored,
+                "damaged": damaged,
+            }
+        )
+        before = self._head
+        self._commit(head)
+        with self._lock:
+            self._results = results
+            for iteration, checkpoint in stored.items():
+                if iteration in self._checkpoints and self._keys.get(iteration, checkpoint.key) == checkpoint.key:
+                    self._checkpoints[iteration] = checkpoint
+        self._remove_unnamed(before, head)
+
+    def _commit(self, head: Head) -> None:
+        try:
+            self._tag = self._put(head, self._tag)
+        except ConflictError:
+            present, tag = read_head(self._bucket, self._head_key)
+            if self._token is None or present.owner != self._token:
+                self._is_lost = True
+                raise lost(self._name, present.owner) from None
+            # This process wrote it, and the answer was lost.
+            self._tag = self._put(head.model_copy(update={"sequence": present.sequence + 1}), tag)
+        self._head = head
+
+    def _put(self, head: Head, tag: Tag | None) -> Tag:
+        data = head.model_dump_json().encode()
+        return self._bucket.put(self._head_key, data, over=tag, is_new=tag is None)
+
+    def _upload_checkpoint(self, iteration: int, key: str) -> StoredCheckpoint | None:
+        """Upload a checkpoint's files; None: it was removed meanwhile."""
+        folder = self.folder() / names.CHECKPOINTS_FOLDER / f"{iteration:06d}"
+        try:
+            manifest = (folder / names.MANIFEST).read_text(encoding="utf-8")
+            for name in described_files(folder):
+                self._bucket.put(f"{self._checkpoint_prefix(iteration, key)}/{name}", folder / name)
+        except (FileNotFoundError, CheckpointError):
+            if iteration in self._checkpoints and self._keys.get(iteration) == key:
+                raise
+            return None
+        return StoredCheckpoint(key=key, manifest=manifest)
+
+    def _upload_results(self, content: bytes, known: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
+        """Upload what is new of the results, with the last chunk while that is small; return all chunks."""
+        kept: list[Chunk] = []
+        offset = 0
+        for chunk in known:
+            path = self.folder() / "chunks" / chunk.key
+            is_same = path.exists() and content[offset : offset + chunk.num_bytes] == path.read_bytes()
+            if not is_same:
+                break
+            kept.append(chunk)
+            offset += chunk.num_bytes
+        if offset == len(content):
+            return tuple(kept)
+        if kept and kept[-1].num_bytes < _CHUNK_BYTES:
+            offset -= kept.pop().num_bytes
+        new = Chunk(key=secrets.token_hex(8), num_bytes=len(content) - offset)
+        self._bucket.put(self._chunk_key(new.key), content[offset:])
+        write_atomic(self.folder() / "chunks" / new.key, content[offset:])
+        return (*kept, new)
+
+    def _remove_unnamed(self, before: Head, now: Head) -> None:
+        """Remove the objects that one head named, and no head names any more."""
+        named = {chunk.key for chunk in now.results} | {key for text in now.damaged.values() for key in text.split()}
+        gone = [self._chunk_key(chunk.key) for chunk in before.results if chunk.key not in named]
+        for chunk in before.results:
+            if chunk.key not in named:
+                (self.folder() / "chunks" / chunk.key).unlink(missing_ok=True)
+        kept = {checkpoint.key for checkpoint in now.checkpoints.values()} | named
+        for iteration, checkpoint in before.checkpoints.items():
+            if checkpoint.key not in kept:
+                prefix = self._checkpoint_prefix(iteration, checkpoint.key)
+                gone += [item.key for item in self._bucket.listed(f"{prefix}/")]
+        if gone:
+            self._bucket.delete(gone)
+
+    def remove_leftovers(self) -> None:
+        """Remove objects that no head names: those of a process that ended before it wrote its head."""
+        head = self._head if self._is_writing else self._look_head()
+        named = {chunk.key for chunk in head.results} | {item.key for item in head.checkpoints.values()}
+        named |= {key for text in head.damaged.values() for key in text.split()} | set(self._keys.values())
+        gone = []
+        for folder in ("results", names.CHECKPOINTS_FOLDER):
+            for item in self._bucket.listed(f"{self._prefix}/{folder}/"):
+                part = item.key.removeprefix(f"{self._prefix}/{folder}/").partition("/")[0]
+                if part.removesuffix(".jsonl").rpartition("-")[2] not in named:
+                    gone.append(item.key)
+        self._bucket.delete(gone)
