@@ -34,6 +34,7 @@ class Range(NamedTuple):
 
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 PositiveInt = Annotated[int, Range(1)]
+Seconds = Annotated[float, Range(0, 10**9)]
 NumEpisodes = Annotated[int, Range(1, 2**18)]
 Inches = Annotated[float, Range(1, 100)]
 

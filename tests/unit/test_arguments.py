@@ -56,6 +56,7 @@ TAKES = {
     "returns": set(),
     "width": {"whole", "fraction"},
     "height": {"whole", "fraction"},
+    "wait_for_nodes": {"whole", "fraction", "zero"},
     # Any text is a name, an address or an id as far as its kind goes.
     "name": {"text", "none", "empty text", "no path"},
     "address": {"text", "none", "empty text", "no path"},

@@ -197,6 +197,12 @@ def run_options(command: _Command) -> _Command:
     return command
 
 
+wait_option = click.option(
+    "--wait-for-nodes", type=click.FloatRange(0, 10**9), default=0.0, metavar="SECONDS",
+    help="With --address: how long to wait for nodes that can hold one trial.  [default: 0]",
+)  # fmt: skip
+
+
 @contextlib.contextmanager
 def stdout_for(*, as_json: bool) -> Iterator[None]:
     """With --json, let only the JSON document reach standard output, whatever libraries print."""

@@ -7,7 +7,8 @@ from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.sweep_spec import SweepSpec
 
-_FOR_EVER = "It would wait forever."
+FOR_EVER = "It would wait forever."
+"""The end of the messages that a machine is too small."""
 
 
 def max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
@@ -17,7 +18,7 @@ def max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
         CannotRunError: One trial needs more than the machine has.
     """
     cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
-    _refuse_too_large(spec, machine)
+    refuse_too_large(spec, machine)
     # Env runners are placed one by one and may be on other nodes; the rest of a trial is one process on one node.
     whole = cpus if spec.resources.num_env_runners == 0 else 0
     limits = [machine.fitting(whole, gpus), machine.num_cpus // cpus, num_trials]
@@ -26,7 +27,12 @@ def max_concurrent(spec: SweepSpec, machine: Machine, num_trials: int) -> int:
     return max(1, int(min(limits)))
 
 
-def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
+def refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
+    """Refuse a sweep of which not even one trial fits on a machine.
+
+    Raises:
+        CannotRunError: One trial needs more than the machine has; the message has both numbers.
+    """
     cpus, gpus, runners = spec.cpus_per_trial, spec.resources.num_gpus, spec.resources.num_env_runners
     made_of = (
         f" (1 process and {counted(runners, 'env runner')})" if runners and spec.resources.num_cpus is None else ""
@@ -38,12 +44,12 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
             setting = f"num_env_runners to at most {most - 1}" if runners else f"num_cpus to at most {most}"
             hint = f"set resources.{setting}, or {hint}"
         raise CannotRunError(
-            f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {_FOR_EVER}",
+            f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {FOR_EVER}",
             f"{hint[0].upper()}{hint[1:]}.",
         )
     if gpus > machine.num_gpus:
         raise CannotRunError(
-            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {_FOR_EVER}",
+            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {FOR_EVER}",
             "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
         )
     main = cpus - runners
@@ -51,6 +57,6 @@ def _refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
         nodes = ", ".join(f"{node_cpus:g} and {node_gpus:g}" for node_cpus, node_gpus in machine.nodes)
         raise CannotRunError(
             f"One trial's process needs {counted(main, 'CPU')} and {gpus:g} GPU{'s' * (gpus != 1)} on one node; no "
-            f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {_FOR_EVER}",
+            f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {FOR_EVER}",
             "Lower resources.num_cpus or resources.num_gpus.",
         )

@@ -66,8 +66,41 @@ def cluster_machine(source: str) -> Machine:
         num_gpus=sum(gpus for _, gpus in nodes),
         source=source,
         nodes=nodes,
+        more="launch on a larger cluster, or let it wait for nodes with --wait-for-nodes SECONDS",
         memory_bytes=min(shares) * num_cpus if shares and min(shares) > 0 else None,
     )
+
+
+def present_machine(source: str) -> Machine:
+    """Return what the joined cluster has by now: all of it, or what is free if the caller joined it."""
+    return cluster_machine(source) if is_of_a_sweep() else replace(connected_machine(), source=source)
+
+
+@contextlib.contextmanager
+def asking_for(bundles: list[dict[str, float]]) -> Iterator[None]:
+    """Ask the cluster's autoscaler, if it has one, for nodes that can hold these resources while the block runs.
+
+    A cluster knows one such request: another sweep that waits at the same time replaces it, or withdraws it.
+
+    Args:
+        bundles: Resources that have to be on one node each, by Ray's names.
+    """
+    _request(bundles)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(Exception):
+            _request([])
+
+
+def _request(bundles: list[dict[str, float]]) -> None:
+    from ray.autoscaler.sdk import request_resources
+
+    if is_client():
+        # Ray 2.60 cannot ask from a client, so a worker does it.
+        ray.get(ray.remote(num_cpus=0)(request_resources).remote(bundles=bundles))
+    else:
+        request_resources(bundles=bundles)
 
 
 def connected_machine() -> Machine:

@@ -238,7 +238,7 @@ def _run_trials(
             todo,
             plan.cpus_per_trial,
             plan.gpus_per_trial,
-            plan.max_concurrent,
+            plan.max_concurrent if address is None else _most_at_once(store, plan, len(todo)),
             packs=plan.packs,
             run=run.token,
         )
@@ -267,6 +267,13 @@ def _run_trials(
                 # Done before Ray is shut down: if a part of Ray died, that takes long, and may end this process.
                 with current().shielded(), run.held():
                     close_run(store, started)
+
+
+def _most_at_once(store: Sweep, plan: SweepPlan, num_trials: int) -> int:
+    """Return how many single trials may run at once on a cluster: those that wait may begin on nodes that join."""
+    spec = stored_spec(store.read_record())
+    # What a search proposes depends on how many trials run at once.
+    return plan.max_concurrent if spec.search.type == "tpe" else spec.resources.max_concurrent or num_trials
 
 
 @contextlib.contextmanager

@@ -30,6 +30,7 @@ def go_on(
     finish: bool,
     progress: str,
     retry_failed: bool = False,
+    wait_for_nodes: float = 0.0,
 ) -> SweepResult:
     """Run what is missing of a sweep, `num_samples` more samples of its space, and a point that somebody chose.
 
@@ -37,7 +38,7 @@ def go_on(
         SpecError: The space has nothing to draw more samples from, or the point is wrong or known.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
-    with _taken_over(store, address) as (machine, where):
+    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where):
         record = store.read_record()
         spec = stored_spec(record)
         if num_samples:
@@ -81,7 +82,9 @@ def replicate(
 
 
 @contextlib.contextmanager
-def _taken_over(store: Sweep, address: str | None) -> Iterator[tuple[Machine | None, Machine]]:
+def _taken_over(
+    store: Sweep, address: str | None, wait_for_nodes: float = 0.0, progress: str = "none"
+) -> Iterator[tuple[Machine | None, Machine]]:
     """Hold the sweep's lock for the block; gives the machine to start Ray on, if any, and what the sweep runs on."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(store.lock())
@@ -96,6 +99,10 @@ def _taken_over(store: Sweep, address: str | None) -> Iterator[tuple[Machine | N
             return
         connection = stack.enter_context(connected(address, None))
         from tune_jobs.ray_tune.node_checks import check_nodes
+        from tune_jobs.sweeps.waiting import machine_that_fits
+
+        spec = stored_spec(store.read_record())
+        found = machine_that_fits(spec, connection, wait_for_nodes, store.name, progress)
 
         check_nodes(store.place, store.read_record().allowed_modules)
-        yield None, connection.machine
+        yield None, found

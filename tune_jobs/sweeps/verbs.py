@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from policies.arguments import PositiveInt, checked
+from policies.arguments import PositiveInt, Seconds, checked
 from policies.envs.modules import allowed_again
 from policies.guard.guard import guarding
 from tune_jobs.plan.sweep_plan import make_plan
@@ -119,6 +119,7 @@ def launch(
     finish: bool = True,
     progress: Progress = "auto",
     rl_module: type[Any] | str | None = None,
+    wait_for_nodes: Seconds = 0.0,
 ) -> SweepResult:
     """Run a new sweep to its end.
 
@@ -132,6 +133,8 @@ def launch(
         finish: Whether to choose and confirm the best policy, film it and write the report afterwards.
         progress: `auto`: a table on a terminal, else lines, also in threads other than the main one; or `none`.
         rl_module: An RLModule class of your own, or its `module:Class`; None: the source's, mostly none.
+        wait_for_nodes: The most seconds to wait, before anything is written, until the cluster's nodes can hold one
+            trial; its autoscaler is asked for them. 0: a cluster that is too small is refused at once.
 
     Returns:
         The records, and the path of each result. Failed trials are in the records; they raise no error.
@@ -144,12 +147,13 @@ def launch(
     """
     if can_drive():
         return _launch_here(
-            source, overrides, name, storage, address, finish=finish, progress=progress, rl_module=rl_module
-        )
+            source, overrides, name, storage, address, finish=finish, progress=progress, rl_module=rl_module,
+            wait_for_nodes=wait_for_nodes,
+        )  # fmt: skip
     # The source may hold classes, and errors in it are raised here.
     created = create(source, overrides=overrides, name=name, storage=storage, address=address, rl_module=rl_module)
     with removed_if_not_begun(created):
-        return drive(created.place, finish=finish, progress=progress)
+        return resume(created.place, address=address, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes)
 
 
 @run_alone
@@ -164,6 +168,7 @@ def _launch_here(
     finish: bool,
     progress: Progress,
     rl_module: type[Any] | str | None,
+    wait_for_nodes: float,
 ) -> SweepResult:
     spec = load_source(source, overrides, rl_module)
     names = (name if name is not None else spec.name, stem_of(source), storage_place(storage))
@@ -174,7 +179,10 @@ def _launch_here(
     with contextlib.ExitStack() as stack:
         if plan is None:
             connection = stack.enter_context(connected(address, None))
-            plan = make_plan(spec, connection.machine)
+            from tune_jobs.sweeps.waiting import machine_that_fits
+
+            found = machine_that_fits(spec, connection, wait_for_nodes, names[0] or names[1], progress)
+            plan = make_plan(spec, found)
         store = create_store(*names)
         try:
             stack.enter_context(store.lock())
@@ -202,6 +210,7 @@ def resume(
     finish: bool = True,
     progress: Progress = "auto",
     retry_failed: bool = False,
+    wait_for_nodes: Seconds = 0.0,
 ) -> SweepResult:
     """Run what is missing of a sweep: trials that had begun continue from their latest checkpoints.
 
@@ -215,6 +224,7 @@ def resume(
         finish: The same as for `launch`.
         progress: The same as for `launch`.
         retry_failed: Run failed trials again too, from their latest checkpoints.
+        wait_for_nodes: The same as for `launch`.
 
     Raises:
         NotFoundError: There is no such sweep.
@@ -225,7 +235,9 @@ def resume(
     from tune_jobs.sweeps.resume import go_on
 
     store = find_sweep(sweep, storage)
-    return go_on(store, address, finish=finish, progress=progress, retry_failed=retry_failed)
+    return go_on(
+        store, address, finish=finish, progress=progress, retry_failed=retry_failed, wait_for_nodes=wait_for_nodes
+    )
 
 
 @checked
