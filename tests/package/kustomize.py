@@ -7,6 +7,7 @@ and `images`; whatever else a kustomization says is refused, so that nothing goe
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
@@ -80,4 +81,6 @@ def _read(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def _resources(folder: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    return [part for name in settings["resources"] for part in yaml.safe_load_all((folder / name).read_text())]
+    parts = [part for name in settings["resources"] for part in yaml.safe_load_all((folder / name).read_text())]
+    # What stands behind an alias is a copy: a patch of one place leaves the other alone.
+    return [json.loads(json.dumps(part)) for part in parts]

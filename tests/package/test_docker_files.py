@@ -119,7 +119,7 @@ def test_every_service_shows_the_token_and_shares_the_storage(compose: dict[str,
         assert service["environment"]["TUNE_JOBS_STORAGE"] == storage.partition("=")[2]
     assert services["database"]["volumes"] == ["database:/var/lib/postgresql/data"]
     assert services["s3"]["volumes"] == ["objects:/data"]
-    assert list(compose["volumes"]) == ["sweeps", "database", "objects"]
+    assert list(compose["volumes"]) == ["sweeps", "service", "database", "objects"]
 
 
 def test_the_bucket_is_where_every_process_looks_with_the_keys_of_its_server() -> None:
@@ -183,6 +183,9 @@ def test_the_service_is_asked_for_what_it_has_and_stopped_after_sweeps_have_save
     assert (given["address"], given["host"], given["port"]) == ("ray://head:10001", "0.0.0.0", 8470)
     assert given["drain_s"] < int(service["stop_grace_period"].removesuffix("s"))
     assert f":{given['port']}/readyz" in service["healthcheck"]["test"][-1]
+    # A folder of its own: with sweeps in a bucket there is no other.
+    assert f"service:{given['folder']}" in service["volumes"]
+    assert any(f" {given['folder']}" in rest for rest in rest_of("RUN") if "install --directory --owner tune" in rest)
     # Without a setting, no other database; with the profile, the one beside it.
     assert service["environment"]["TUNE_JOBS_DATABASE"] == ""
     database = compose["services"]["database"]

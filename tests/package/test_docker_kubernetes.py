@@ -3,7 +3,13 @@
 No Kubernetes is here: nothing says that KubeRay makes of them what it should.
 """
 
+import contextlib
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -19,6 +25,7 @@ from tune_jobs.cli.serve_command import serve
 from tune_jobs.spec.file import load_spec
 
 ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
 FOLDER = ROOT / "docker" / "kubernetes"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PINS = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().split())
@@ -101,12 +108,13 @@ def test_every_pod_has_no_rights_and_a_limit(manifests: list[dict[str, Any]]) ->
         assert context["seccompProfile"] == {"type": "RuntimeDefault"}
         assert not {"hostNetwork", "hostPID", "hostIPC"} & spec.keys()
         (container,) = spec["containers"]
-        assert container["securityContext"] == {
-            "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
-        }  # fmt: skip
-        assert container["resources"]["limits"].keys() >= {"cpu", "memory"}
-        assert container["resources"]["requests"]["memory"] == container["resources"]["limits"]["memory"]
-        assert {"name": "tmp", "mountPath": "/tmp"} in container["volumeMounts"]
+        for one in [container, *spec.get("initContainers", [])]:
+            assert one["securityContext"] == {
+                "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
+            }  # fmt: skip
+            assert one["resources"]["limits"].keys() >= {"cpu", "memory"}
+            assert one["resources"]["requests"]["memory"] == one["resources"]["limits"]["memory"]
+            assert {"name": "tmp", "mountPath": "/tmp"} in one["volumeMounts"]
         (tmp,) = [volume for volume in spec["volumes"] if volume["name"] == "tmp"]
         assert "sizeLimit" in tmp["emptyDir"]
         mounted = {mount["name"] for mount in container["volumeMounts"]}
@@ -149,7 +157,8 @@ def test_every_ray_process_has_the_token_of_one_secret_and_no_secret_is_written_
 
 def test_the_image_and_ray_are_of_the_versions_here(manifests: list[dict[str, Any]]) -> None:
     for pod in pods(manifests):
-        assert pod["spec"]["containers"][0]["image"] == f"tune-jobs:{PROJECT['version']}"
+        for container in [*pod["spec"]["containers"], *pod["spec"].get("initContainers", [])]:
+            assert container["image"] == f"tune-jobs:{PROJECT['version']}"
     assert [spec["rayVersion"] for spec in clusters(manifests)] == [PINS["ray"]]
     for path in FOLDER.glob("*/kustomization.yaml"):
         for image in yaml.safe_load(path.read_text()).get("images", []):
@@ -210,7 +219,9 @@ def test_rays_ports_are_open_to_the_cluster_the_operator_and_the_service_alone(
 def test_sweeps_are_kept_where_every_pod_reaches_them(manifests: list[dict[str, Any]], storage: str) -> None:
     (settings,) = [one for one in of_kind(manifests, "ConfigMap") if one["metadata"]["name"] == "tune-jobs-settings"]
     place = settings["data"]["TUNE_JOBS_STORAGE"]
-    claims = of_kind(manifests, "PersistentVolumeClaim")
+    claims = [
+        one for one in of_kind(manifests, "PersistentVolumeClaim") if one["metadata"]["name"] != "tune-jobs-service"
+    ]
     for pod in pods(manifests):
         (container,) = pod["spec"]["containers"]
         sources = container["envFrom"]
@@ -280,6 +291,49 @@ def test_the_service_is_asked_for_what_it_has(storage: str) -> None:
     assert given["address"] == f"ray://{cluster['metadata']['name']}-head-svc:{PORTS['client']}"
     assert (given["host"], given["port"]) == ("0.0.0.0", container["ports"][0]["containerPort"])
     assert given["public_names"] == (service["metadata"]["name"],)
+    # With sweeps in a bucket, too, the service has a folder: one pod's.
+    (claim,) = [one for one in of_kind(manifests, "PersistentVolumeClaim") if "service" in one["metadata"]["name"]]
+    assert claim["spec"]["accessModes"] == ["ReadWriteOnce"]
+    volumes = {volume["name"]: volume for volume in spec["template"]["spec"]["volumes"]}
+    assert volumes["service"]["persistentVolumeClaim"] == {"claimName": claim["metadata"]["name"]}
+    assert {"name": "service", "mountPath": str(given["folder"])} in container["volumeMounts"]
     assert given["drain_s"] < spec["template"]["spec"]["terminationGracePeriodSeconds"]
     assert service["spec"]["selector"] == spec["selector"]["matchLabels"] == spec["template"]["metadata"]["labels"]
     assert service["spec"]["ports"][0]["targetPort"] == container["ports"][0]["name"]
+
+
+def test_the_service_waits_for_its_first_token_which_is_made_where_it_waits(tmp_path: Path) -> None:
+    (deployment,) = of_kind(render(FOLDER / "service", component=FOLDER / "storage-s3"), "Deployment")
+    spec = deployment["spec"]["template"]["spec"]
+    (waits,) = spec["initContainers"]
+    (container,) = spec["containers"]
+    # The same database, in the same folder.
+    assert waits["volumeMounts"] == [mount for mount in container["volumeMounts"] if mount["name"] != "sweeps"]
+    (database,) = waits["env"]
+    assert database in container["env"]
+    readme = (ROOT / "docker" / "README.md").read_text()
+    (made,) = re.findall(r"exec deploy/(\S+) --container (\S+) --\s+tune-jobs (token make [^`\n#]*)", readme)
+    assert made[:2] == (deployment["metadata"]["name"], waits["name"])
+    assert made[2].strip().endswith(" --folder /service")
+    # As they stand, but for the folder: it waits, a token is made, it ends.
+    shell, option, loop = waits["command"]
+    folder = tmp_path / "service"
+    environment = {**os.environ, "TUNE_JOBS_STORAGE": "s3://sweeps/here", "PATH": f"{BIN}:{os.environ['PATH']}"}
+    command = ["tune-jobs", *made[2].replace("/service", str(folder)).split()]
+    with subprocess.Popen(
+        [shell, option, loop.replace("/service", str(folder))], env=environment, stdout=subprocess.PIPE,
+        start_new_session=True,
+    ) as waiting:  # fmt: skip
+        try:
+            deadline = time.monotonic() + 60
+            while not (folder / "service.db").exists():
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            assert waiting.poll() is None
+            assert (
+                subprocess.run(command, env=environment, check=False, capture_output=True, timeout=60).returncode == 0
+            )
+            assert waiting.wait(timeout=60) == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(waiting.pid, signal.SIGKILL)
