@@ -61,6 +61,15 @@ def test_ray_itself_passes() -> None:
         check_is_ray(f"ray://127.0.0.1:{port}")
 
 
+def test_auto_is_asked_at_the_port_that_ray_address_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    with grpc_server({PROXY: grpc.StatusCode.NOT_FOUND}) as port:
+        monkeypatch.setenv("RAY_ADDRESS", f"ray://127.0.0.1:{port}")
+        check_is_ray("auto")
+    with grpc_server({GCS: grpc.StatusCode.OK}) as port:
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{port}")
+        check_is_ray("auto")
+
+
 def test_another_token_is_told_at_once() -> None:
     with grpc_server(dict.fromkeys((GCS, PROXY), grpc.StatusCode.UNAUTHENTICATED)) as port:
         for address in (f"127.0.0.1:{port}", f"ray://127.0.0.1:{port}"):

@@ -62,6 +62,17 @@ def place_of(address: str) -> tuple[str, int]:
     return _host_and_port(address, where)
 
 
+def is_for_clients(address: str) -> bool:
+    """Whether an address is that of the port for Ray clients; that of `auto` may be, as RAY_ADDRESS says.
+
+    Raises:
+        CannotRunError: With `auto`, no cluster is known on this machine.
+    """
+    if address == "auto":
+        address, _ = _find_cluster()
+    return address.startswith(f"{_CLIENT_SCHEME}://")
+
+
 def recorded_cluster() -> str | None:
     """Return the address of the cluster that `ray start` last started or joined on this machine, if it is recorded."""
     try:

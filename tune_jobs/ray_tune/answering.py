@@ -10,7 +10,7 @@ import os
 from typing import Any, Literal
 
 from policies.errors import CannotRunError
-from tune_jobs.ray_tune.address import place_of
+from tune_jobs.ray_tune.address import is_for_clients, place_of
 
 _TIMEOUT_S = 10.0
 _Kind = Literal["node", "client"]
@@ -39,7 +39,7 @@ def check_is_ray(address: str) -> None:
         return
     host, port = place_of(address)
     target = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    kind: _Kind = "client" if address.startswith("ray://") else "node"
+    kind: _Kind = "client" if is_for_clients(address) else "node"
     said, details = _ask(target, kind)
     if said == "UNAUTHENTICATED":
         raise wrong_token(address)
