@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 from fake_sweeps import run, sweeps
+from s3_faults import faults
 from store_parts import another, harness, sweep, trial
 
-__all__ = ["another", "harness", "in_double", "run", "sweep", "sweeps", "trial"]
+__all__ = ["another", "faults", "harness", "in_double", "run", "sweep", "sweeps", "trial"]
 
 
 @pytest.fixture

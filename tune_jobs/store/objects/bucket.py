@@ -1,13 +1,15 @@
 """Read and write objects: each call does one thing to the store, whole or not at all, and says why it could not.
 
-obstore repeats requests that a server answered by an error of its own, or not at all. What is left after that is an
-error here. Conditions of writes are those of the store (`If-Match`, `If-None-Match`), never a look beforehand.
+Requests that a server answered by an error of its own, or not at all, are repeated for a while: some by obstore, and
+all that it leaves, such as conditional writes, here. What is left after that is an error. Conditions of writes are
+those of the store (`If-Match`, `If-None-Match`), never a look beforehand.
 """
 
 from __future__ import annotations
 
 import contextlib
-import re
+import errno
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -16,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from policies.errors import CannotRunError
 from policies.files import atomic_path
+from tune_jobs.store.objects.reasons import reason_of
 from tune_jobs.store.objects.url import ObjectUrl
 
 if TYPE_CHECKING:
@@ -28,14 +31,7 @@ REQUEST_TIMEOUT_S = 30.0
 _PATIENCE_S = 30.0
 """Seconds in which requests that failed for reasons that pass are repeated."""
 _MAX_DELETED = 500
-_CODE, _MESSAGE = re.compile(r"<Code>([^<]{1,80})</Code>"), re.compile(r"<Message>([^<]{1,300})</Message>")
-_CAUSE = re.compile(
-    r"error sending request|timed? ?out|connection refused|dns error|tcp connect error|connection reset|"
-    r"connection closed|InvalidCertificate|missing credentials",
-    re.IGNORECASE,
-)
-_STATUS = re.compile(r"status code: (\d{3})[^:\n]{0,40}")
-
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 4.0
 Tag = tuple[str | None, str | None]
 """What tells one content of an object from another: its entity tag and its version."""
 
@@ -127,8 +123,9 @@ class Bucket:
         def ask() -> Listed | None:
             try:
                 return _listed(obstore.head(self._store, key))
-            except FileNotFoundError as error:
-                self._refuse_missing_bucket(error)
+            except FileNotFoundError:
+                # The answer has no body that says whether it is the object or the bucket that is missing.
+                self.get(key)
                 return None
 
         return self._doing("read", key, ask)
@@ -169,10 +166,14 @@ class Bucket:
 
         Raises:
             ConflictError: Something else is there; nothing was written.
+            FileNotFoundError: There is no such file.
             StorageError: It cannot be written.
         """
         import obstore
         from obstore.exceptions import AlreadyExistsError, PreconditionError
+
+        if isinstance(data, Path) and not data.exists():
+            raise FileNotFoundError(errno.ENOENT, "there is no such file", str(data))
 
         mode: Any = "create" if is_new else "overwrite"
         if over is not None:
@@ -185,16 +186,19 @@ class Bucket:
                 in_parts = False if over or is_new else None
                 return _tag(obstore.put(self._store, key, data, mode=mode, use_multipart=in_parts))
             except (AlreadyExistsError, PreconditionError) as error:
-                found = self._is_there(key, data) if isinstance(data, bytes) and (over or is_new) else None
+                if not (over or is_new) or "RequestConflict" in str(error):
+                    # Two writes at once: the store has done neither, perhaps.
+                    raise
+                found = self._is_there(key, data) if isinstance(data, bytes) else None
                 if found is not None:
                     # The request was repeated after its answer was lost.
                     return found
                 raise ConflictError(
                     f"{self.name_of(key)} was written by another process.", "Leave the sweep to that process."
-                ) from error
+                ) from None
             except FileNotFoundError as error:
                 if over is not None and "NoSuchKey" in str(error):
-                    raise ConflictError(f"{self.name_of(key)} is gone.", "Look who removed it.") from error
+                    raise ConflictError(f"{self.name_of(key)} is gone.", "Look who removed it.") from None
                 raise
 
         return self._doing("written", key, write)
@@ -216,8 +220,14 @@ class Bucket:
             part = wanted[begin : begin + _MAX_DELETED]
 
             def remove(part: list[str] = part) -> None:
-                with contextlib.suppress(FileNotFoundError):
+                try:
                     obstore.delete(self._store, part)
+                except FileNotFoundError as error:
+                    self._refuse_missing_bucket(error)
+                    # Stores that remove one after the other stop at one that is missing.
+                    for name in part:
+                        with contextlib.suppress(FileNotFoundError):
+                            obstore.delete(self._store, name)
 
             self._doing("removed", part[0], remove)
 
@@ -259,47 +269,29 @@ class Bucket:
             raise error
 
     def _doing(self, what: str, key: str, do: Callable[[], _T]) -> _T:
-        with self._told(what, key):
-            return do()
+        deadline, pause = time.monotonic() + _PATIENCE_S, _FIRST_PAUSE_S
+        while True:
+            try:
+                with self._told(what, key):
+                    return do()
+            except StorageError as error:
+                if not error.passes or time.monotonic() + pause > deadline:
+                    raise
+            time.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE_S)
 
     @contextlib.contextmanager
     def _told(self, what: str, key: str) -> Iterator[None]:
-        from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
+        from obstore.exceptions import BaseError
 
         try:
             yield
         except CannotRunError:
             raise
         except (BaseError, OSError, ValueError) as error:
-            reason, passes = _reason(error)
-            hint = f"Check that {self.url.short} is reached from this machine, and try again."
-            is_refused = isinstance(error, PermissionDeniedError | UnauthenticatedError)
-            if is_refused or reason.startswith(("status code: 401", "status code: 403")):
-                hint = (
-                    "Check the credentials in this process's environment (AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, "
-                    "say) or its machine's role, and what they allow."
-                )
-            elif "NoSuchBucket" in str(error):
-                hint = "Make the bucket, or correct its name in the storage's address."
-            elif "301" in reason or "PermanentRedirect" in reason:
-                hint = "The bucket is in another region: add ?region=REGION to the storage's address."
-            raise StorageError(f"{self.name_of(key)} cannot be {what}: {reason}.", hint, passes=passes) from None
-
-
-def _reason(error: Exception) -> tuple[str, bool]:
-    """Return why, without what a server's answer or a request may hold of credentials; and whether it may pass."""
-    text = str(error)
-    code, status = _CODE.search(text), _STATUS.search(text)
-    if code is not None or status is not None:
-        said = _MESSAGE.search(text)
-        parts = [status[0].rstrip() if status else "", code[1] if code else "", said[1].rstrip(".") if said else ""]
-        number = int(status[1]) if status else 0
-        return ", ".join(part for part in parts if part), number >= 500 or number == 429
-    causes = _CAUSE.findall(text)
-    if causes:
-        return " ".join(dict.fromkeys(cause.lower() for cause in causes)), True
-    first = text.strip().splitlines()[0] if text.strip() else type(error).__name__
-    return re.sub(r"https?://\S+", "the store", first)[:200].rstrip("."), True
+            reason = reason_of(error, self.url.short)
+            message = f"{self.name_of(key)} cannot be {what}: {reason.text}."
+            raise StorageError(message, reason.hint, passes=reason.passes) from None
 
 
 def _tag(meta: Any) -> Tag:
