@@ -77,6 +77,9 @@ def test_a_launch_leaves_a_sweep_and_a_job_that_resumes_it(head: Head, tmp_path:
     assert told["commands"]["attach"] == "tune-jobs attach mine --storage s"
     assert shlex.split(sent["entrypoint"]) == ["tune-jobs", "resume", str(store.folder), "--address", "auto"]
     assert store.read_record().job == JobRecord(id=told["job"], address=head.address)
+    assert launch(head, "--detach", "--name", "patient", "--wait-for-nodes", "90").exit_code == 0
+    sent_words = shlex.split(head.submitted[1]["entrypoint"])
+    assert sent_words[3:] == ["--wait-for-nodes", "90.0", "--address", "auto"]
     # No module of the user's own is named: nothing travels.
     assert set(sent["runtime_env"]) == {"env_vars"}
     assert sent["metadata"]["sweep"] == "mine"
@@ -167,7 +170,8 @@ def test_the_verbs_are_jobs_with_their_options(head: Head, tmp_path: Path) -> No
     at = ("--storage", "s", "--address", head.address, "--detach", "--no-finish")
     for words in (
         ("resume", "mine", "--retry-failed"), ("extend", "mine", "--num-samples", "2"),
-        ("replicate", "mine", "--top", "3", "--seeds", "2"), ("inject", "mine", "lr=0.003"),
+        ("replicate", "mine", "--top", "3", "--seeds", "2", "--wait-for-nodes", "600.0"),
+        ("inject", "mine", "lr=0.003"),
     ):  # fmt: skip
         assert run(*words, *at).exit_code == 0
         sent = shlex.split(head.submitted[-1]["entrypoint"])

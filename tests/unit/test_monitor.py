@@ -146,3 +146,31 @@ def test_elapsed_time_is_the_clocks() -> None:
     monitor = make_monitor(make_trial(0), clock=clock)
     clock.now += 12.5
     assert monitor.elapsed_s == 12.5
+
+
+def test_trials_that_wait_for_a_node_are_told_once_none_has_run_for_a_while() -> None:
+    clock = FakeClock()
+    monitor = make_monitor(make_trial(0), make_trial(1), clock=clock)
+    monitor.phase = "starting the trials"
+    clock.now += 60
+    assert "waiting" not in summary_line(monitor)
+    monitor.update(make_trial(0, "running"))
+    clock.now += 60
+    assert "waiting" not in summary_line(monitor)
+    # Its node is lost: it is about to begin on another one, if there is one.
+    monitor.update(make_trial(0))
+    clock.now += 9
+    assert "waiting" not in summary_line(monitor)
+    clock.now += 1
+    words = "no trial runs: waiting for a node that has room for one"
+    assert words in summary_line(monitor)
+    console = Console(width=120, record=True)
+    console.print(render(monitor, 120))
+    assert words in console.export_text()
+    for ended in ("completed", "failed"):
+        monitor.update(make_trial(0, "running"))
+        assert "waiting" not in summary_line(monitor)
+        monitor.update(make_trial(0, ended))
+        monitor.update(make_trial(1, "stopped"))
+        clock.now += 60
+        assert "waiting" not in summary_line(monitor)

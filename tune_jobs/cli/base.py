@@ -189,18 +189,19 @@ def run_options(command: _Command) -> _Command:
             metavar="ADDRESS",
             help="Ray cluster: auto, ray://... or http://... (as a job); without it, this machine.",
         ),
+        click.option(
+            "--wait-for-nodes",
+            type=click.FloatRange(0, 10**9),
+            default=0.0,
+            metavar="SECONDS",
+            help="With --address: how long to wait for nodes that can hold one trial.  [default: 0]",
+        ),
         allow_module_option,
         storage_option,
         json_option,
     ):
         command = option(command)
     return command
-
-
-wait_option = click.option(
-    "--wait-for-nodes", type=click.FloatRange(0, 10**9), default=0.0, metavar="SECONDS",
-    help="With --address: how long to wait for nodes that can hold one trial.  [default: 0]",
-)  # fmt: skip
 
 
 @contextlib.contextmanager

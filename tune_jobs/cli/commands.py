@@ -28,7 +28,6 @@ from tune_jobs.cli.base import (
     stdout_for,
     storage_option,
     sweep_argument,
-    wait_option,
 )
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
 from tune_jobs.cli.detached_runs import job_facts, refuse_dry_run_of_job
@@ -73,7 +72,6 @@ def cli(ctx: click.Context, /, *, debug: bool, server: str | None, token_file: s
 )
 @click.option("--dry-run", is_flag=True, help="Print the plan and start nothing.")
 @run_options
-@wait_option
 @click.pass_context
 def launch(
     ctx: click.Context,
@@ -161,7 +159,6 @@ def trials(*, sweep: str, sort: str | None, top: int | None, storage: str | None
 @sweep_argument
 @click.option("--retry-failed", is_flag=True, help="Run the failed trials again, too.")
 @run_options
-@wait_option
 @click.pass_context
 def resume(ctx: click.Context, /, *, sweep: str, storage: str | None, as_json: bool, **options: Any) -> None:
     """Go on with a sweep that was interrupted: what is done stays, trials go on from their checkpoints.

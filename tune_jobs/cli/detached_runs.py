@@ -26,6 +26,7 @@ def run_as_job(
     detach: bool,
     finish: bool,
     progress: str,
+    wait_for_nodes: float,
     as_json: bool,
     **options: Any,
 ) -> int:
@@ -43,12 +44,12 @@ def run_as_job(
         if verb == "launch":
             begun = detached.launch_detached(
                 arguments[0], overrides=options["overrides"], name=options["name"], storage=storage, address=address,
-                finish=finish,
+                finish=finish, wait_for_nodes=wait_for_nodes,
             )  # fmt: skip
         else:
             begun = detached.go_on_detached(
                 verb, arguments[0], _words(verb, arguments[1:], options), storage=storage, address=address,
-                finish=finish,
+                finish=finish, wait_for_nodes=wait_for_nodes,
             )  # fmt: skip
         try:
             state = detached.wait_until_begun(begun)

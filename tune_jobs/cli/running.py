@@ -6,7 +6,6 @@ from typing import Any
 
 import click
 
-from policies.errors import SpecError
 from tune_jobs.cli.base import losing_what_nobody_reads, result_of, stdout_for
 from tune_jobs.cli.server import refuse_options, server_of
 
@@ -34,10 +33,6 @@ def run_verb(
     from tune_jobs.ray_tune.jobs import is_jobs_address
 
     if detach or is_jobs_address(options["address"]):
-        if options.pop("wait_for_nodes", 0):
-            raise SpecError(
-                "--wait-for-nodes goes with no job of a cluster.", "Leave it out, or give an address without http://."
-            )
         from tune_jobs.cli.detached_runs import run_as_job
 
         ctx.exit(run_as_job(verb, arguments, storage=storage, detach=detach, as_json=as_json, **options))

@@ -93,6 +93,8 @@ class _Look:
         self.job: Job | None = None
         self._asked_at = -_ASK_EVERY_S
         self._let_go_at: float | None = None
+        # Where a node was lost before this process looked, one has run too.
+        self._has_run = record.address is not None and any(trial.node for trial in trials)
 
     def goes_on(self) -> bool:
         """Whether a process drives the sweep, or a job is about to."""
@@ -134,7 +136,10 @@ class _Look:
             return "stopping: the running trials save a checkpoint"
         if record.state == "completed":
             return "confirming and filming the best policy, and writing the report"
-        return "" if "running" in self.monitor.counts() else "starting the trials"
+        if "running" in self.monitor.counts():
+            self._has_run = True
+        # Once a trial has run, the monitor says what the others wait for.
+        return "" if self._has_run else "starting the trials"
 
 
 class _Monitor(SweepMonitor):

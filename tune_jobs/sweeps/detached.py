@@ -52,6 +52,7 @@ def launch_detached(
     storage: str | Path | None = None,
     address: str | None,
     finish: bool = True,
+    wait_for_nodes: float = 0.0,
 ) -> DetachedSweep:
     """Write a new sweep and have a cluster run it; `wait_until_begun` tells whether it does.
 
@@ -62,6 +63,7 @@ def launch_detached(
         storage: A folder that the cluster's nodes have under the same path.
         address: The Jobs API of the cluster, such as `http://head:8265`.
         finish: The same as for `tune_jobs.launch`.
+        wait_for_nodes: The same as for `tune_jobs.launch`; the job waits, and this process need not.
 
     Raises:
         SpecError: The sweep or the address is wrong, or its name is taken. Nothing was written or sent.
@@ -79,7 +81,7 @@ def launch_detached(
             job = _new_job(store, address)
             with store.lock():
                 store.write_record(store.read_record().model_copy(update={"job": job}))
-            _submit(api, store, job, ["resume"], content, finish=finish)
+            _submit(api, store, job, ["resume", *_waiting(wait_for_nodes)], content, finish=finish)
     return DetachedSweep(store.name, created.place, job)
 
 
@@ -91,6 +93,7 @@ def go_on_detached(
     storage: str | Path | None = None,
     address: str | None,
     finish: bool = True,
+    wait_for_nodes: float = 0.0,
 ) -> DetachedSweep:
     """Have a cluster go on with a sweep.
 
@@ -101,6 +104,7 @@ def go_on_detached(
         storage: The same as for `launch_detached`.
         address: The same as for `launch_detached`.
         finish: The same as for `launch_detached`.
+        wait_for_nodes: The same as for `launch_detached`.
 
     Raises:
         NotFoundError: There is no such sweep.
@@ -122,7 +126,7 @@ def go_on_detached(
     with JobsApi(address) as api:
         api.ray_version()
         job = _new_job(store, address)
-        _submit(api, store, job, [verb, *options], content, finish=finish)
+        _submit(api, store, job, [verb, *options, *_waiting(wait_for_nodes)], content, finish=finish)
     return DetachedSweep(store.name, store.place, job)
 
 
@@ -222,6 +226,10 @@ def _modules_of_sweep(modules: Sequence[str], source: object) -> bytes | None:
         if folder_to_send(wanted, folder) is not None:
             return packed(folder)
     return None
+
+
+def _waiting(wait_for_nodes: float) -> list[str]:
+    return ["--wait-for-nodes", str(wait_for_nodes)] if wait_for_nodes else []
 
 
 def _new_job(store: Sweep, address: str) -> JobRecord:

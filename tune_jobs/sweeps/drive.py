@@ -238,7 +238,7 @@ def _run_trials(
             todo,
             plan.cpus_per_trial,
             plan.gpus_per_trial,
-            plan.max_concurrent if address is None else _most_at_once(store, plan, len(todo)),
+            plan.max_concurrent if address is None else most_at_once(store, plan.max_concurrent, num_trials=len(todo)),
             packs=plan.packs,
             run=run.token,
         )
@@ -269,11 +269,17 @@ def _run_trials(
                     close_run(store, started)
 
 
-def _most_at_once(store: Sweep, plan: SweepPlan, num_trials: int) -> int:
-    """Return how many single trials may run at once on a cluster: those that wait may begin on nodes that join."""
+def most_at_once(store: Sweep, now: int, *, num_trials: int) -> int:
+    """Return how many single trials may run at once on a cluster: those that wait may begin on nodes that join.
+
+    Args:
+        store: The sweep.
+        now: How many the present nodes hold.
+        num_trials: How many trials are left.
+    """
     spec = stored_spec(store.read_record())
     # What a search proposes depends on how many trials run at once.
-    return plan.max_concurrent if spec.search.type == "tpe" else spec.resources.max_concurrent or num_trials
+    return now if spec.search.type == "tpe" else spec.resources.max_concurrent or num_trials
 
 
 @contextlib.contextmanager

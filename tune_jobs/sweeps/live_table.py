@@ -24,6 +24,7 @@ _MAX_ROWS = 12
 _ROOM_FOR_OTHERS = 9
 """Lines of a terminal that are not for trials: the facts above them, their titles, and what follows."""
 _GAP = 2
+_WAITS = "no trial runs: waiting for a node that has room for one"
 _MAX_MEASURED = 200
 _MAX_POINT = 300
 
@@ -96,6 +97,8 @@ def _facts(monitor: SweepMonitor) -> RenderableType:
     time = Text(duration(monitor.elapsed_s, tenths=False))
     if monitor.phase:
         time.append(f"   {monitor.phase} ...", "cyan")
+    elif monitor.waits:
+        time.append(f"   {_WAITS} ...", "cyan")
     else:
         time.append(_time_left(monitor))
     grid.add_row("time", time)
@@ -189,6 +192,8 @@ def summary_line(monitor: SweepMonitor) -> str:
         f"{share} %, {counted(progress.num_env_steps, 'env step')}",
         ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items())),
     ]
+    if monitor.waits:
+        words.append(_WAITS)
     best = monitor.best()
     if best is not None:
         words.append(f"best {return_text(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial, 60)})")

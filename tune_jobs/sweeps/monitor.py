@@ -7,11 +7,13 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from analysis.records import TrialRecord, TrialStatus
+from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, Selection, select_best
 from tune_jobs.sweeps.forecast import Forecast, forecast
 
 _RATE_WINDOW_S = 20.0
+_IDLE_S = 10.0
+"""How long no trial runs until that is worth a word; from one trial to the next takes less."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class SweepMonitor:
         self._caps = caps
         self._clock = clock
         self._start = clock()
+        # When the last trial that ran ended or was lost.
+        self._idle_since = self._start
         self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
         self._history: deque[tuple[float, int]] = deque([(self._start, self._num_env_steps)])
         self._selection: Selection | None = None
@@ -66,6 +70,7 @@ class SweepMonitor:
             caps: As for a new monitor.
         """
         self.stage = told
+        self._idle_since = self._clock()
         # The caps come first: a table that is drawn meanwhile asks for that of each record.
         self._caps = caps
         self.records = {record.trial_id: record for record in records}
@@ -87,6 +92,14 @@ class SweepMonitor:
         """Env steps of all trials so far."""
         return self._num_env_steps
 
+    @property
+    def waits(self) -> bool:
+        """Whether trials are left and none has run for a while: no node has room for one, or none is there."""
+        if self.phase or self.stopping or self._clock() - self._idle_since < _IDLE_S:
+            return False
+        statuses = {record.status for record in list(self.records.values())}
+        return "running" not in statuses and not statuses <= FINISHED
+
     def progress(self) -> Forecast:
         """Return how far the trials are, in env steps, and how long the others take: what `status` tells, too."""
         return forecast(list(self.records.values()), self._caps)
@@ -96,6 +109,8 @@ class SweepMonitor:
         if record.status == "running":
             self.phase = ""
         before = self.records.get(record.trial_id)
+        if before is not None and before.status == "running":
+            self._idle_since = self._clock()
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
         self.records[record.trial_id] = record
         now = self._clock()

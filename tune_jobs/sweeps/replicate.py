@@ -26,6 +26,7 @@ def run_race(
     finish: bool,
     progress: str,
     name: str | None = None,
+    wait_for_nodes: float = 0.0,
 ) -> SweepResult:
     """Run what is missing of a sweep, then a race of its leading settings.
 
@@ -39,6 +40,7 @@ def run_race(
         finish: The same as for `launch`.
         progress: The same as for `launch`.
         name: The race's name: the race of this name goes on, and if it is over, none is begun. None: it has none.
+        wait_for_nodes: The same as for `launch`.
 
     Raises:
         SpecError: The sweep cannot be replicated, or has one setting only.
@@ -65,7 +67,7 @@ def run_race(
         known = race.name
         return round_of(record, race, race.next_points(ranking))
 
-    return replicate(store, address, next_round, finish=finish, progress=progress)
+    return replicate(store, address, next_round, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes)
 
 
 def _check(store: Sweep, ranking: Sequence[SettingScores]) -> None:

@@ -58,6 +58,7 @@ def replicate(
     *,
     finish: bool,
     progress: str,
+    wait_for_nodes: float = 0.0,
 ) -> SweepResult:
     """Run what is missing of a sweep, then train some of its points with more seeds, stage by stage.
 
@@ -67,12 +68,13 @@ def replicate(
         next_round: Says before each stage which points get one more seed each; None: that was all.
         finish: The same as for `launch`.
         progress: The same as for `launch`.
+        wait_for_nodes: The same as for `launch`.
 
     Raises:
         SpecError: The sweep cannot be replicated.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
-    with _taken_over(store, address) as (machine, where):
+    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where):
         record = store.read_record()
         spec = stored_spec(record)
         check_replicable(spec)
@@ -83,7 +85,7 @@ def replicate(
 
 @contextlib.contextmanager
 def _taken_over(
-    store: Sweep, address: str | None, wait_for_nodes: float = 0.0, progress: str = "none"
+    store: Sweep, address: str | None, wait_for_nodes: float, progress: str
 ) -> Iterator[tuple[Machine | None, Machine]]:
     """Hold the sweep's lock for the block; gives the machine to start Ray on, if any, and what the sweep runs on."""
     with contextlib.ExitStack() as stack:
@@ -102,7 +104,8 @@ def _taken_over(
         from tune_jobs.sweeps.waiting import machine_that_fits
 
         spec = stored_spec(store.read_record())
-        found = machine_that_fits(spec, connection, wait_for_nodes, store.name, progress)
-
+        found = machine_that_fits(
+            spec, connection, wait_for_nodes, name=store.name, progress=progress, stop_requested=store.stop_requested
+        )
         check_nodes(store.place, store.read_record().allowed_modules)
         yield None, found

@@ -181,7 +181,7 @@ def _launch_here(
             connection = stack.enter_context(connected(address, None))
             from tune_jobs.sweeps.waiting import machine_that_fits
 
-            found = machine_that_fits(spec, connection, wait_for_nodes, names[0] or names[1], progress)
+            found = machine_that_fits(spec, connection, wait_for_nodes, name=names[0] or names[1], progress=progress)
             plan = make_plan(spec, found)
         store = create_store(*names)
         try:
@@ -250,6 +250,7 @@ def extend(
     address: str | None = None,
     finish: bool = True,
     progress: Progress = "auto",
+    wait_for_nodes: Seconds = 0.0,
 ) -> SweepResult:
     """Add samples to a sweep and run them (and whatever else is missing).
 
@@ -260,6 +261,7 @@ def extend(
         address: Ray cluster to run on.
         finish: The same as for `launch`.
         progress: The same as for `launch`.
+        wait_for_nodes: The same as for `launch`.
 
     Raises:
         SpecError: num_samples is not positive, or the space has nothing random to draw.
@@ -271,7 +273,9 @@ def extend(
     from tune_jobs.sweeps.resume import go_on
 
     store = find_sweep(sweep, storage)
-    return go_on(store, address, num_samples=num_samples, finish=finish, progress=progress)
+    return go_on(
+        store, address, num_samples=num_samples, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes
+    )
 
 
 @checked
@@ -284,6 +288,7 @@ def inject(
     address: str | None = None,
     finish: bool = True,
     progress: Progress = "auto",
+    wait_for_nodes: Seconds = 0.0,
 ) -> SweepResult:
     """Add a point of one's own to a sweep and run it (and whatever else is missing).
 
@@ -298,6 +303,7 @@ def inject(
         address: Ray cluster to run on.
         finish: The same as for `launch`.
         progress: The same as for `launch`.
+        wait_for_nodes: The same as for `launch`.
 
     Raises:
         SpecError: A name is not searched or is missing, a value is not allowed, the sweep has the point already, it has
@@ -310,7 +316,7 @@ def inject(
     from tune_jobs.sweeps.resume import go_on
 
     store = find_sweep(sweep, storage)
-    return go_on(store, address, point=point, finish=finish, progress=progress)
+    return go_on(store, address, point=point, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes)
 
 
 @checked
@@ -325,6 +331,7 @@ def replicate(
     address: str | None = None,
     finish: bool = True,
     progress: Progress = "auto",
+    wait_for_nodes: Seconds = 0.0,
 ) -> SweepResult:
     """Train the leading settings of a sweep again with fresh seeds, and rank them anew.
 
@@ -343,6 +350,7 @@ def replicate(
         address: Ray cluster to run on.
         finish: The same as for `launch`.
         progress: The same as for `launch`.
+        wait_for_nodes: The same as for `launch`.
 
     Raises:
         SpecError: The sweep is one of population based training, whose trials have no setting.
@@ -354,7 +362,9 @@ def replicate(
     from tune_jobs.sweeps.replicate import run_race
 
     store = find_sweep(sweep, storage)
-    return run_race(store, address, top=top, seeds=seeds, finish=finish, progress=progress, name=race)
+    return run_race(
+        store, address, top=top, seeds=seeds, finish=finish, progress=progress, name=race, wait_for_nodes=wait_for_nodes
+    )
 
 
 @checked

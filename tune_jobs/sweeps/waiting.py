@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from policies.errors import CannotRunError
 from tune_jobs.plan.concurrency import FOR_EVER, refuse_too_large
 from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.sweeps.interrupted import SweepInterrupted
 
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection
@@ -16,7 +18,15 @@ if TYPE_CHECKING:
 _POLL_INTERVAL_S = 1.0
 
 
-def machine_that_fits(spec: SweepSpec, connection: Connection, wait_s: float, name: str, progress: str) -> Machine:
+def machine_that_fits(
+    spec: SweepSpec,
+    connection: Connection,
+    wait_s: float,
+    *,
+    name: str,
+    progress: str,
+    stop_requested: Callable[[], bool] = lambda: False,
+) -> Machine:
     """Return the joined cluster's machine once one trial fits there; meanwhile its autoscaler is asked for nodes.
 
     Args:
@@ -25,9 +35,11 @@ def machine_that_fits(spec: SweepSpec, connection: Connection, wait_s: float, na
         wait_s: The most seconds to wait; 0: a cluster that is too small is returned as it is, to be refused.
         name: What the sweep is called on the screen.
         progress: The same as for `launch`.
+        stop_requested: Whether the sweep is asked to stop meanwhile.
 
     Raises:
         CannotRunError: The cluster is too small still.
+        SweepInterrupted: The sweep was asked to stop; nothing was changed.
     """
     machine = connection.machine
     lacking = _lacking(spec, machine)
@@ -48,6 +60,8 @@ def machine_that_fits(spec: SweepSpec, connection: Connection, wait_s: float, na
                             f"No node that one trial fits on joined within {wait_s:g} s. {_told(lacking)}",
                             "Add nodes (`ray status` says what an autoscaler does), or wait longer.",
                         )
+                    if stop_requested():
+                        raise SweepInterrupted
                     time.sleep(_POLL_INTERVAL_S)
                     machine = present_machine(seen.source)
             lacking = _lacking(spec, machine)
