@@ -105,7 +105,8 @@ def _question() -> Callable[..., dict[str, Any]]:  # noqa: C901 (it is sent in o
 
         told: dict[str, Any] = {"versions": found, "modules": {}}
         try:
-            from tune_jobs.store.probe import FailedOperationError, answer
+            from tune_jobs.store.opening import answer
+            from tune_jobs.store.probe import FailedOperationError
         except Exception as error:  # noqa: BLE001 (whatever its installation lacks)
             return {**told, "not_working": said(error)}
         try:

@@ -6,8 +6,9 @@ import contextlib
 import secrets
 from collections.abc import Iterator
 
-from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError
+from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError, Tag
 from tune_jobs.store.objects.url import ObjectUrl
+from tune_jobs.store.probe import FailedOperationError, Operation
 
 _FOLDER, _QUESTION = "probe", "question"
 
@@ -54,44 +55,53 @@ def probing(bucket: Bucket) -> Iterator[ObjectProbe]:
 
 
 def answer(place: str, machine: str) -> str:
-    """Read the question on another machine, leave an answer, and try what a sweep does there.
+    """Read the question on another machine, leave an answer, and try what trials do there.
 
     Args:
         place: The probe's place.
         machine: A name of this machine.
 
     Raises:
-        StorageError: Something cannot be done from here; the message names it.
+        FileNotFoundError: Another store, or another place in it, is seen here.
+        FailedOperationError: An operation fails here, or does not do what it says.
     """
     bucket = Bucket(ObjectUrl.parse(place))
-    found = bucket.get(f"{_FOLDER}/{_QUESTION}")
+    mine = f"{_FOLDER}/{machine}.try"
+    with _trying("read"):
+        found = bucket.get(f"{_FOLDER}/{_QUESTION}")
     if found is None:
-        raise StorageError(
-            f"{bucket.name_of(_FOLDER)} is not seen from here.",
-            "Check that the storage's address, with its endpoint, means the same on every machine.",
-        )
-    mine = f"{_FOLDER}/try-{machine}"
-    tag = bucket.put(mine, b"1", is_new=True)
-    _refuses(bucket, mine, "If-None-Match", over=None)
-    bucket.put(mine, b"2", over=tag)
-    _refuses(bucket, mine, "If-Match", over=tag)
-    if mine not in {item.key for item in bucket.listed(f"{_FOLDER}/")}:
-        raise StorageError(
-            f"{bucket.name_of(_FOLDER)} is listed without what was just written there.",
-            "Choose a store whose listings are consistent.",
-        )
-    bucket.delete([mine])
-    bucket.put(f"{_FOLDER}/{machine}", found.data)
+        raise FileNotFoundError(bucket.name_of(_FOLDER))
+    with _trying("write"):
+        tag = bucket.put(mine, b"1")
+        bucket.put(f"{_FOLDER}/{machine}", found.data)
+    with _trying("list"):
+        listed = {item.key for item in bucket.listed(f"{_FOLDER}/")}
+        if not {mine, f"{_FOLDER}/{machine}"} <= listed:
+            raise FailedOperationError("list", "objects that are there are not listed")
+    with _trying("lock"):
+        bucket.put(mine, b"2", over=tag)
+        # A sweep is safe from two writers by these conditions alone.
+        _refuses(bucket, mine, "If-Match", over=tag)
+        _refuses(bucket, mine, "If-None-Match", over=None)
+    with _trying("delete"):
+        bucket.delete([mine])
+        if bucket.look(mine) is not None:
+            raise FailedOperationError("delete", "an object that was deleted is still there")
     return found.data.decode(errors="replace")
 
 
-def _refuses(bucket: Bucket, key: str, condition: str, over: tuple[str | None, str | None] | None) -> None:
-    """Check that the store keeps to a condition: a sweep is safe from two writers by them alone."""
+@contextlib.contextmanager
+def _trying(operation: Operation) -> Iterator[None]:
+    try:
+        yield
+    except StorageError as error:
+        raise FailedOperationError(operation, error.message.rstrip(".")) from error
+
+
+def _refuses(bucket: Bucket, key: str, condition: str, over: Tag | None) -> None:
+    """Check that the store keeps to a condition of writes."""
     try:
         bucket.put(key, secrets.token_bytes(8), over=over, is_new=over is None)
     except ConflictError:
         return
-    raise StorageError(
-        f"{bucket.url.short} writes although a condition ({condition}) forbids it.",
-        "Choose a store with conditional writes: S3, GCS, Azure, or MinIO, SeaweedFS and Ceph of this year.",
-    )
+    raise FailedOperationError("lock", f"the store writes although a condition ({condition}) forbids it")
