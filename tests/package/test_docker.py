@@ -67,9 +67,10 @@ def test_the_composed_services_run_a_sweep_on_two_workers(image: Image, tmp_path
         log = tmp_path / f"worker-{number}.log"
         worker = image.begin(services["worker"]["command"], environment=services["worker"]["environment"], log=log)
         image.wait_until_healthy(services["worker"], worker, log)
-    # The health check of a worker asks for the head; that both have joined is seen in the cluster's CPUs.
-    status = ["ray", "status", "--address", "head:6379"]
-    image.wait_until(status, r"/2\.0 CPU", environment=services["head"]["environment"])
+        # All share one network here, so that the head's agent answers for a worker; and one worker after the other, as
+        # they would choose the same ports. That it has joined is seen in the cluster's CPUs.
+        status = ["ray", "status", "--address", "head:6379"]
+        image.wait_until(status, rf"/{number + 1}\.0 CPU", environment=services["head"]["environment"])
     launcher = services["launcher"]
     # Two packs, which ask for a CPU each at once: one on each worker, however short the trials.
     settings = ["num_samples=1", "stop.num_env_steps=8000", "stop.training_return=null", "evaluation.num_episodes=2"]
