@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 import ray
-from ray.exceptions import ActorUnavailableError, RayTaskError
+from ray.air.execution._internal import RayActorManager
+from ray.exceptions import ActorUnavailableError, OutOfMemoryError, RayActorError, RayTaskError
 from ray.tune.experiment import Trial
 
+from tune_jobs.ray_tune.failures import describe_failure
 from tune_jobs.ray_tune.lost_nodes import DrainNotice, NodeLeavesError, NodeLosses, node_that_left
 
 pytestmark = pytest.mark.ray
@@ -109,3 +111,31 @@ def test_losses_are_not_counted_until_there_is_nothing_else(nodes: dict[str, Any
         assert (trial.run_metadata.num_failures, losses.take(trial)) == (2, "")
     assert len(seen) == 9
     assert Trial.handle_error is original
+
+
+def test_what_tune_keeps_no_error_of_is_told_too(nodes: dict[str, Any]) -> None:
+    trial, losses = TuneTrial(), NodeLosses(lambda trial: 0, lambda error: None)
+    said = "1 worker(s) were killed due to the node running low on memory. Memory on the node (IP: 127.0.0.1, ID: aa) "
+    with losses.not_counted():
+        Trial.handle_error(trial, ValueError("broke"))
+        Trial.handle_error(
+            trial, OutOfMemoryError(f"{said}was 6.32GB used / 23.54GB limit (0.26)\nOOM kill reason: ...")
+        )
+    assert trial.run_metadata.num_failures == 2
+    assert describe_failure(losses.error_of(trial), "the log", timeout_s=1.0, what="pack") == (
+        "Ray ended the process of the pack, as its node ran low on memory (6.32GB of 23.54GB were used).\nthe log"
+    )
+
+
+def test_an_actor_that_is_ended_for_its_memory_ends_no_run() -> None:
+    told: list[Exception] = []
+    actor = types.SimpleNamespace(actor_id=1, _on_error=lambda actor, error: told.append(error))
+    task = types.SimpleNamespace(_tracked_actor=actor, _on_error=None)
+    manager = types.SimpleNamespace(_failed_actor_ids=set(), _cleanup_actor=lambda tracked_actor: None)
+    lack = OutOfMemoryError("was 1GB used / 2GB limit")
+    with pytest.raises(RuntimeError):
+        RayActorManager._actor_task_failed(manager, task, lack)
+    with NodeLosses(lambda trial: 0, lambda error: None).not_counted():
+        RayActorManager._actor_task_failed(manager, task, lack)
+    assert all(isinstance(error, RayActorError) for error in told)
+    assert "1GB of 2GB" in describe_failure(told[-1], "", timeout_s=1.0)

@@ -4,12 +4,12 @@ import json
 import types
 from pathlib import Path
 
-import cloudpickle
 import pytest
 from ray.exceptions import RayTaskError
 from scripted_packs import make_sweep
 
-from policies.errors import CheckpointError
+from policies.errors import CannotRunError, CheckpointError
+from tune_jobs.ray_tune.failures import going_on
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.processes import RayWatch
 from tune_jobs.ray_tune.run_trials import RunJob, _TrialEvents, run_trials
@@ -20,11 +20,9 @@ from tune_jobs.store.record_keeper import RecordKeeper
 pytestmark = pytest.mark.ray
 
 
-def tune_trial(folder: Path, trial_id: str, cause: Exception) -> types.SimpleNamespace:
-    """As Tune shows its callbacks one whose process raised."""
-    path = folder / f"{trial_id}.pkl"
-    path.write_bytes(cloudpickle.dumps(RayTaskError("step", "a traceback", cause)))
-    return types.SimpleNamespace(config={"trial_id": trial_id}, trial_id=trial_id, pickled_error_file=str(path))
+def tune_trial(trial_id: str) -> types.SimpleNamespace:
+    """As Tune shows its callbacks one."""
+    return types.SimpleNamespace(config={"trial_id": trial_id}, trial_id=trial_id)
 
 
 @pytest.mark.parametrize("timeout_s", [1e9, 1e10, 1e300])
@@ -42,7 +40,8 @@ def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path: Pat
     events = _TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0), losses)
     for trial_id, cause in (("t0000", OwnershipLostError("taken")), ("t0001", ValueError("broke"))):
         keeper.started(trial_id)
-        getattr(events, event)(0, [], tune_trial(tmp_path, trial_id, cause))
+        losses._errors[trial_id] = RayTaskError("step", "a traceback", cause)
+        getattr(events, event)(0, [], tune_trial(trial_id))
     assert (keeper.record("t0000").status, keeper.record("t0000").num_failures) == ("paused", 0)
     assert keeper.record("t0000").error is None
     assert keeper.record("t0001").num_failures == 1
@@ -80,3 +79,9 @@ def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(
         # Gone for no known reason: it must not begin anew in silence.
         with pytest.raises(CheckpointError, match="was paused at iteration 6"):
             trainable.load_checkpoint(str(tmp_path))
+
+
+def test_a_run_that_can_write_no_more_says_how_to_go_on() -> None:
+    error = going_on(CannotRunError("Cannot write trial.json: No space left on device.", "Free some."), "my sweep")
+    assert error.hint == "Free some. What is done is kept; continue with `tune-jobs resume 'my sweep'`."
+    assert error.message == "Cannot write trial.json: No space left on device."

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import re
+import shlex
 
-import cloudpickle
-from ray.exceptions import RayActorError, RayTaskError
-from ray.tune.experiment import Trial
+from ray.exceptions import OutOfMemoryError, RayActorError, RayTaskError
 
-from policies.errors import TuneJobsError, said_by
+from policies.errors import CannotRunError, TuneJobsError, said_by
 from tune_jobs.store.logs import died_by
 from tune_jobs.store.ownership import OwnershipLostError
 
-
-def error_of(trial: Trial) -> BaseException | None:
-    """Return the error that a trial or a pack of Tune's ended with; None: Tune has written none."""
-    # Trial.get_pickled_error looks where Tune syncs to, but nothing has been synced yet; Tune writes the error here.
-    path = trial.pickled_error_file
-    if not path or not Path(path).is_file():
-        return None
-    error: BaseException = cloudpickle.loads(Path(path).read_bytes())
-    return error
+_USED_MEMORY = re.compile(r"was ([\d.]+\w*) used / ([\d.]+\w*) limit")
 
 
 def was_lost(error: BaseException | None) -> bool:
@@ -37,12 +28,29 @@ def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float
         timeout_s: The sweep's `iteration_timeout_s`.
         what: What the process ran, a trial or a pack.
     """
+    if isinstance(error, RayActorError) and isinstance(error.__cause__, OutOfMemoryError):
+        error = error.__cause__
     if isinstance(error, RayTaskError):
         cause = error.cause if isinstance(error.cause, BaseException) else error
         message = str(cause) if isinstance(cause, TuneJobsError) else f"{type(cause).__name__}: {said_by(cause)}"
     elif isinstance(error, RayActorError):
         why = died_by(tail, timeout_s) or ("its node was taken away" if error.preempted else "")
         message = f"The process of the {what} died{f': {why}' if why else ''}."
+    elif isinstance(error, OutOfMemoryError):
+        used = _USED_MEMORY.search(str(error))
+        full = f" ({used[1]} of {used[2]} were used)" if used else ""
+        message = f"Ray ended the process of the {what}, as its node ran low on memory{full}."
     else:
         message = said_by(error) if error is not None else "Unknown error."
     return f"{message}\n{tail}".strip()
+
+
+def going_on(error: CannotRunError, sweep: str) -> CannotRunError:
+    """Return the error that ended a run in the middle, which says how to go on too.
+
+    Args:
+        error: The error.
+        sweep: The sweep, as a command names it.
+    """
+    how = f"What is done is kept; continue with `tune-jobs resume {shlex.quote(sweep)}`."
+    return CannotRunError(error.message, f"{error.hint} {how}".strip())

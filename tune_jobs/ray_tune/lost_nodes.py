@@ -13,7 +13,8 @@ from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import ray
-from ray.exceptions import RayActorError, RayError, RayTaskError
+from ray.air.execution._internal import RayActorManager
+from ray.exceptions import OutOfMemoryError, RayActorError, RayError, RayTaskError
 from ray.tune.experiment import Trial
 
 from policies.errors import TuneJobsError
@@ -64,6 +65,28 @@ def _is_there(node: dict[str, Any]) -> bool:
         return False
 
 
+@contextlib.contextmanager
+def _surviving_lack_of_memory() -> Iterator[None]:
+    """For the block, let an actor that Ray ends for its node's memory be one that died.
+
+    Ray 2.60 raises an error of another kind for it than for other deaths, at which Tune ends the whole run.
+    """
+    original = RayActorManager._actor_task_failed  # noqa: SLF001
+
+    def failed(manager: Any, tracked_actor_task: Any, exception: Exception) -> None:
+        if isinstance(exception, OutOfMemoryError):
+            died = RayActorError()
+            died.__cause__ = exception
+            exception = died
+        original(manager, tracked_actor_task=tracked_actor_task, exception=exception)
+
+    RayActorManager._actor_task_failed = failed  # noqa: SLF001
+    try:
+        yield
+    finally:
+        RayActorManager._actor_task_failed = original  # noqa: SLF001
+
+
 class NodeLosses:
     """Knows which of a run's failures were losses of a node; while it is entered, Tune does not count those.
 
@@ -77,6 +100,7 @@ class NodeLosses:
         self._reached, self._before = reached, before
         self._in_vain: dict[str, tuple[Hashable, int]] = {}
         self._told: dict[str, str] = {}
+        self._errors: dict[str, BaseException | None] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         # As for `RecordKeeper`, Tune's pickle of what uses this is never read back.
@@ -89,6 +113,8 @@ class NodeLosses:
 
         def handle_error(trial: Trial, exc: Any = None) -> None:
             counted = trial.run_metadata.num_failures
+            # Tune keeps only errors of two kinds, in a file; that an actor was ended for its memory is another.
+            self._errors[trial.trial_id] = exc
             left = self._node_that_left(trial, exc)
             original(trial, exc)
             if left:
@@ -97,13 +123,18 @@ class NodeLosses:
 
         Trial.handle_error = handle_error
         try:
-            yield
+            with _surviving_lack_of_memory():
+                yield
         finally:
             Trial.handle_error = original
 
     def take(self, trial: Trial) -> str:
         """Return the node whose loss was the trial's last error, once; empty: it was a failure."""
         return self._told.pop(trial.trial_id, "")
+
+    def error_of(self, trial: Trial) -> BaseException | None:
+        """Return the trial's last error."""
+        return self._errors.get(trial.trial_id)
 
     def _node_that_left(self, trial: Trial, error: BaseException | None) -> str:
         if error is None:

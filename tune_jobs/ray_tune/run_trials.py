@@ -16,12 +16,13 @@ from ray import tune
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 
+from policies.errors import CannotRunError
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
-from tune_jobs.ray_tune.failures import describe_failure, error_of, was_lost
+from tune_jobs.ray_tune.failures import describe_failure, going_on, was_lost
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -91,6 +92,9 @@ def run_trials(job: RunJob, listener: Listener) -> None:
                 watch.check_after(error)
             except RayDiedError as death:
                 raise ray_died(name_for_commands(store), death) from error
+            if type(error) is CannotRunError:
+                # The storage, say, can't be written any more.
+                raise going_on(error, name_for_commands(store)) from error
             raise
         finally:
             with current().shielded():
@@ -317,7 +321,7 @@ class _TrialEvents(tune.Callback):  # type: ignore[misc]
         self._failed(trial, retried=False)
 
     def _failed(self, trial: Trial, *, retried: bool) -> None:
-        trial_id, error = _trial_id(trial), error_of(trial)
+        trial_id, error = _trial_id(trial), self._losses.error_of(trial)
         if was_lost(error):
             self._keeper.lost(trial_id)
             return
@@ -370,7 +374,7 @@ class _PackEvents(tune.Callback):  # type: ignore[misc]
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Note that the pack's process died; Tune starts another one."""
-        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), error_of(trial)
+        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), self._losses.error_of(trial)
         if was_lost(error):
             self._driver.lost(pack_id)
             return
