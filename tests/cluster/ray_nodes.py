@@ -88,17 +88,18 @@ class Cluster:
 
     Args:
         folder: For logs; the token and Ray's own files lie in a folder with a short name, as sockets' names are.
+        host: The head's address.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, host: str = "127.0.0.1") -> None:
+        self.folder, self.host = folder, host
         self.temporary = Path(tempfile.mkdtemp(prefix="tj", dir="/tmp"))
         token = self.temporary / "token"
         token.touch(mode=0o600)
         token.write_text(secrets.token_hex(32))
         self.port, self.client_port = free_port(), free_port()
-        self.address = f"127.0.0.1:{self.port}"
-        self.client_address = f"ray://127.0.0.1:{self.client_port}"
+        self.address = f"{host}:{self.port}"
+        self.client_address = f"ray://{host}:{self.client_port}"
         self.environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith("RAY_")},
             "RAY_AUTH_MODE": "token",
@@ -122,14 +123,26 @@ class Cluster:
             "--head", f"--port={self.port}", f"--ray-client-server-port={self.client_port}",
             f"--dashboard-port={dashboard_port or free_port()}",
             f"--include-dashboard={'true' if dashboard_port else 'false'}",
+            *self._at(self.host),
         ]  # fmt: skip
         return self._start("head", options, 1, (), {})
 
     def start_worker(
-        self, name: str, *, num_cpus: int = 1, prefix: Sequence[str] = (), environment: dict[str, str] | None = None
+        self,
+        name: str,
+        *,
+        num_cpus: int = 1,
+        prefix: Sequence[str] = (),
+        environment: dict[str, str] | None = None,
+        host: str = "127.0.0.1",
     ) -> Node:
-        """Start a node; `prefix` is a command that runs the rest of its arguments."""
-        return self._start(name, [f"--address={self.address}"], num_cpus, prefix, environment or {})
+        """Start a node; `prefix` is a command that runs the rest of its arguments, `host` the node's address."""
+        options = [f"--address={self.address}", *self._at(host)]
+        return self._start(name, options, num_cpus, prefix, environment or {})
+
+    def _at(self, host: str) -> list[str]:
+        # Ray takes 127.0.0.1 for no address that was given.
+        return [] if host == "127.0.0.1" else [f"--node-ip-address={host}"]
 
     def _start(
         self, name: str, options: Sequence[str], num_cpus: int, prefix: Sequence[str], environment: dict[str, str]

@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 import yaml
-from ray_nodes import BIN, Cluster, Node
+
+from tests.cluster.ray_nodes import BIN, Cluster, Node
 
 pytestmark = pytest.mark.cluster
 

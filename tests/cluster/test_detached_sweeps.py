@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 import yaml
-from ray_nodes import BIN, Cluster, free_port, processes_naming
+
+from tests.cluster.ray_nodes import BIN, Cluster, free_port, processes_naming
 
 pytestmark = [
     pytest.mark.cluster,

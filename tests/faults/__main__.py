@@ -9,12 +9,13 @@ from __future__ import annotations
 import argparse
 import functools
 import random
+import re
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.faults import kills
+from tests.faults import kills, nodes, single
 from tests.faults.outcomes import Outcome, Outcomes
 
 _IN_ONE_SWEEP = 4
@@ -25,12 +26,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--count", type=int, default=100, help="of the faults that are brought about at random moments")
     parser.add_argument("--only", default="", metavar="NAME,...", help=f"of {', '.join(SCENARIOS)}")
+    parser.add_argument("--match", default="", metavar="TEXT", help="of the single faults those whose names have it")
     parser.add_argument("--kinds", default="", metavar="KIND,...", help="of sweeps: packed, rllib, pbt, tpe")
     parser.add_argument("--seed", type=int, default=12, help="of the moments")
     parser.add_argument("--folder", type=Path, default=Path("build/faults"), help="for sweeps and outcomes")
     parser.add_argument("--fresh", action="store_true", help="forget earlier outcomes")
     options = parser.parse_args(arguments)
     folder = options.folder.absolute()
+    _matching[0] = options.match
     if options.fresh:
         shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -44,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _place(folder: Path, scenario: str, done: int) -> Path:
     """An empty folder for a sweep; what was cut before is begun anew."""
-    place = folder / f"{scenario.replace(', ', '-').replace(' ', '-')}-{done}"
+    place = folder / f"{re.sub(r'[^a-z]+', '-', scenario)}-{done}"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
     return place
@@ -102,7 +105,35 @@ def resumes(folder: Path, outcomes: Outcomes, count: int, kinds: tuple[str, ...]
     )  # fmt: skip
 
 
-SCENARIOS = {"drivers": drivers, "processes": processes, "resumes": resumes}
+def single_faults(folder: Path, outcomes: Outcomes, _: int, kinds: tuple[str, ...], __: int) -> None:
+    """Those that are brought about once, for packs and for single trials."""
+    for kind in (kind for kind in kinds if kind in ("packed", "rllib")):
+        for name, act in single.all_of(kind, functools.partial(kills.reference, folder, kind)).items():
+            _once(outcomes, folder, name, act)
+
+
+def cluster_faults(folder: Path, outcomes: Outcomes, _: int, kinds: tuple[str, ...], seed: int) -> None:
+    """Those of a cluster's nodes."""
+    if "packed" in kinds:
+        for name, act in nodes.all_of(functools.partial(kills.reference, folder, "packed"), seed).items():
+            _once(outcomes, folder, name, act)
+
+
+_matching = [""]
+
+
+def _once(outcomes: Outcomes, folder: Path, name: str, act: Callable[[Path], Outcome]) -> None:
+    if _matching[0] in name:
+        _until(outcomes, folder, name, 1, lambda place, _: [act(place)])
+
+
+SCENARIOS = {
+    "drivers": drivers,
+    "processes": processes,
+    "resumes": resumes,
+    "single": single_faults,
+    "cluster": cluster_faults,
+}
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ class Paced(CartPoleEnv):
         slow: A file; while it is there, every step takes `pace_s`.
         pace_s: Seconds.
         fault: A file; while it is there, the first process that steps removes it and meets what it names: `hang`,
-            `exit` (`os._exit`) or `memory` (it allocates until it is stopped).
+            `exit` (`os._exit`) or `memory` (it allocates, and then hangs).
     """
 
     def __init__(self, slow: str, pace_s: float = 0.004, fault: str = "") -> None:
@@ -34,6 +34,25 @@ class Paced(CartPoleEnv):
         return super().step(action)  # type: ignore[no-untyped-call]
 
 
+class Alike(Paced):
+    """All episodes begin alike, whatever their seeds, and none ends before its last step.
+
+    So a trial that goes on with new episodes has the numbers of one that was not disturbed, if an iteration is whole
+    episodes and nothing else was lost.
+    """
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        self.state = np.array([0.01, -0.02, 0.03, -0.04], np.float64)
+        return self.state.astype(np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        observation, _, fell, truncated, info = super().step(action)
+        # CartPole warns of each step after a fall.
+        self.steps_beyond_terminated = None
+        return observation, float(not fell), False, truncated, info
+
+
 def _take(path: Path) -> str:
     taken = path.with_name(f"{path.name}.{os.getpid()}")
     try:
@@ -46,11 +65,17 @@ def _take(path: Path) -> str:
 def _meet(how: str) -> None:
     if how == "exit":
         os._exit(3)
-    if how == "hang":
-        time.sleep(10_000)
-    kept = []
-    while True:
-        kept.append(np.ones(2**24))
+    kept: list[Any] = []
+    while how == "memory" and len(kept) < MOST_MEMORY_BYTES // _PIECE_BYTES:
+        kept.append(np.ones(_PIECE_BYTES, np.uint8))
+        time.sleep(_PIECE_S)
+    time.sleep(10_000)
+
+
+MOST_MEMORY_BYTES = 6 * 1024**3
+"""So much is allocated at most, so that a machine where nobody stops it goes on."""
+_PIECE_BYTES, _PIECE_S = 2**26, 0.02
 
 
 gym.register("FaultsPaced-v0", entry_point="tests.faults.paced:Paced", max_episode_steps=200)
+gym.register("FaultsAlike-v0", entry_point="tests.faults.paced:Alike", max_episode_steps=16)

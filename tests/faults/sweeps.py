@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -9,11 +10,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from tests.faults.forked import Forked, Process
 from tests.kills.checks import problems
 from tests.kills.processes import Family
 from tune_jobs.store.logs import continued_from
@@ -29,9 +32,10 @@ _STARTUP = 4
 
 def spec(kind: str, folder: Path, **changes: Any) -> dict[str, Any]:
     """A sweep file's settings, of a kind of sweep; it is slow while `slow` is in the folder."""
+    env_id = f"tests.faults.paced:Faults{'Alike' if kind == 'packed' else 'Paced'}-v0"
     env_args = {"slow": str(folder / "slow"), "fault": str(folder / "fault")}
     found: dict[str, Any] = {
-        "env": {"id": "tests.faults.paced:FaultsPaced-v0", "args": env_args},
+        "env": {"id": env_id, "args": env_args},
         "algorithm": "ppo",
         "seed": 11,
         "engine": "packed" if kind in ("packed", "tpe") else "rllib",
@@ -60,33 +64,47 @@ class Sweep:
         settings: The sweep file's.
         environment: Variables for the commands.
         flags: For `launch` and `resume`.
+        num_cpus: Of the driver's own Ray.
     """
 
     def __init__(
-        self, folder: Path, settings: dict[str, Any], environment: dict[str, str] | None = None, *flags: str
+        self,
+        folder: Path,
+        settings: dict[str, Any],
+        environment: dict[str, str] | None = None,
+        *flags: str,
+        num_cpus: int = 2,
     ) -> None:
+        self.num_cpus = num_cpus
         self.folder, self.place, self.flags = folder, folder / "sweeps" / "cut", flags
         self.slow, self.fault = folder / "slow", folder / "fault"
         (folder / "spec.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
         self._environment = {**(environment or os.environ), "PYTHONPATH": str(ROOT)}
         self.output = folder / "output.txt"
 
-    def begin(self, prefix: tuple[str, ...] = ()) -> subprocess.Popen[bytes]:
-        """Launch it, or resume it if it is there."""
+    def begin(self, prefix: tuple[str, ...] = (), more: tuple[str, ...] = ()) -> Process:
+        """Launch it, or resume it if it is there; in a fork of this process, unless a command runs it.
+
+        Args:
+            prefix: A command that runs the rest of its arguments.
+            more: Flags of this command alone.
+        """
         module = ("--allow-module", "tests.faults.paced")
         verb = ["resume", str(self.place)] if (self.place / "sweep.json").is_file() else ["launch", "spec.yaml"]
-        command = [*prefix, PROGRAM, *verb, "--no-finish", *self.flags]
+        command = [*prefix, PROGRAM, *verb, "--no-finish", *self.flags, *more]
         if verb[0] == "launch":
             command += ["--name", "cut", *module]
         with self.output.open("ab") as output:
             output.write(f"$ {' '.join(command)}\n".encode())
             output.flush()
+            if not prefix and not self.flags:
+                return Forked(command, self.folder, self._environment, self.output, self.num_cpus)
             return subprocess.Popen(
                 command, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
                 env=self._environment, start_new_session=True,
             )  # fmt: skip
 
-    def end(self, process: subprocess.Popen[bytes] | None = None) -> list[str]:
+    def end(self, process: Process | None = None) -> list[str]:
         """Let it go on fast and to its end; what was wrong with that."""
         self.slow.unlink(missing_ok=True)
         process = process or self.begin()
@@ -129,7 +147,7 @@ class Sweep:
         return [path.name for path in sorted(self.place.glob("trials/t*"))]
 
 
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[bytes], limit_s: float = LIMIT_S) -> bool:
+def wait_for(condition: Callable[[], bool], process: Process, limit_s: float = LIMIT_S) -> bool:
     """Wait for a moment; False: the process ended before, or it never came."""
     deadline = time.monotonic() + limit_s
     while not condition():
@@ -165,47 +183,79 @@ class Before:
         return found
 
 
-def wrong(sweep: Sweep, kind: str, reference: Sweep, *, notes: str = "") -> list[str]:
+@dataclass(frozen=True)
+class Disturbed:
+    """What a fault may have left in the trials' records."""
+
+    kind: str
+    most_failures: int = 0
+    """Of a trial."""
+    notes: str = ""
+    """A pattern of the notes that a trial may have."""
+
+
+def wrong(sweep: Sweep, reference: Sweep, may: Disturbed) -> list[str]:
     """What is wrong with a sweep that came to its end after a fault, beside one that met none.
 
     Args:
         sweep: The sweep.
-        kind: Its kind.
         reference: The same, undisturbed.
-        notes: A pattern of notes that its trials may have.
+        may: What the fault may have left.
     """
     found = [
         text
         for text in problems(sweep.place, NUM_ENV_STEPS, finishes=False)
-        # A population has copies of checkpoints, which are its own.
-        if not (kind == "pbt" and "does not belong" in text) and not (notes and _only_notes(text, notes))
+        # Their statuses, failures and notes are looked at below; a population has copies of checkpoints, its own.
+        if not _OF_STATUS.match(text) and not (may.kind == "pbt" and "does not belong" in text)
     ]
     ours, theirs = sweep.records(), reference.records()
     if [record["trial_id"] for record in ours] != [record["trial_id"] for record in theirs]:
         return [*found, f"trials {[record['trial_id'] for record in ours]}"]
     for mine, other in zip(ours, theirs, strict=True):
         name = str(mine["trial_id"])
+        notes = [note for note in mine["notes"] if not (may.notes and re.search(may.notes, note))]
+        if mine["status"] != "completed" or mine["num_failures"] > may.most_failures or notes:
+            said = f"{name} is {mine['status']}, failed {mine['num_failures']} times, notes {notes}"
+            found.append(f"{said}: {str(mine['error'])[:300]}")
         if mine["seed"] != other["seed"]:
             found.append(f"{name} has seed {mine['seed']}, undisturbed {other['seed']}")
-        depends_on_results = kind == "pbt" or (kind == "tpe" and mine["index"] >= _STARTUP)
+        depends_on_results = may.kind == "pbt" or (may.kind == "tpe" and mine["index"] >= _STARTUP)
         if not depends_on_results and mine["point"] != other["point"]:
             found.append(f"{name} has point {mine['point']}, undisturbed {other['point']}")
         if not depends_on_results:
-            found += _differences(sweep, reference, name)
+            found += _differences(sweep, reference, name, whole=may.kind == "packed")
     return found
 
 
-def _only_notes(text: str, notes: str) -> bool:
-    return bool(re.search(rf"is completed, failed 0 times, notes \(.*(?:{notes}).*\)", text))
+_OF_STATUS = re.compile(r"t\d{4} is \w+, failed \d+ times")
 
 
-def _differences(sweep: Sweep, reference: Sweep, name: str) -> list[str]:
-    """Up to the first checkpoint that a trial went on from, its numbers are those of an undisturbed one."""
-    limit = continued_from(sweep.place / "trials" / name / "log.txt")
-    keys = ("iteration", "num_env_steps", "num_episodes", "training_return", "evaluation_return", "episode_returns")
+def _differences(sweep: Sweep, reference: Sweep, name: str, *, whole: bool) -> list[str]:
+    """Where a trial's numbers are not those of an undisturbed one; all of them, but for times.
+
+    Args:
+        sweep: The sweep.
+        reference: The same, undisturbed.
+        name: The trial.
+        whole: Whether it has to come to the same though it went on from a checkpoint: a pack does, whose generators are
+            in its checkpoints, where all episodes begin alike. In general they begin with new seeds then, and RLlib
+            draws its exploration and batches anew: so else up to the first checkpoint that it went on from.
+    """
+    limit = None if whole else continued_from(sweep.place / "trials" / name / "log.txt")
     ours, theirs = ([json.loads(line) for line in which.lines(name)] for which in (sweep, reference))
     ours = [line for line in ours if limit is None or line["iteration"] <= limit]
     for mine, other in zip(ours, theirs, strict=False):
-        if any(mine.get(key) != other.get(key) for key in keys):
-            return [f"{name} differs at iteration {mine['iteration']} from an undisturbed one"]
-    return [] if limit is not None or len(ours) == len(theirs) else [f"{name} has {len(ours)} iterations"]
+        keys = [key for key in mine.keys() | other.keys() if key != "time_s" and mine.get(key) != other.get(key)]
+        if keys:
+            return [f"{name} differs in {sorted(keys)} at iteration {mine['iteration']} from an undisturbed one"]
+    if limit is not None:
+        return []
+    if len(ours) != len(theirs):
+        return [f"{name} has {len(ours)} iterations, undisturbed {len(theirs)}"]
+    hashes = [_last_weights(which, name) for which in (sweep, reference)]
+    return [f"{name} has other weights in the end than an undisturbed one"] if hashes[0] != hashes[1] else []
+
+
+def _last_weights(sweep: Sweep, name: str) -> str:
+    checkpoint = sweep.place / "trials" / name / "checkpoints" / f"{sweep.newest(name):06d}"
+    return hashlib.sha256((checkpoint / "policy.safetensors").read_bytes()).hexdigest()
