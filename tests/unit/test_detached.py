@@ -19,6 +19,7 @@ from policies.errors import CannotRunError
 from tune_jobs.cli.commands import cli
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import detached
+from tune_jobs.sweeps.attach import _Look
 from tune_jobs.sweeps.own_job import environment_of, note_own_job
 
 __all__ = ["head"]
@@ -207,6 +208,20 @@ def test_attach_shows_a_sweep_of_another_process_to_its_end(tmp_path: Path, capf
     with driven(store.folder, "interrupted"):
         done = run("attach", "mine", "--storage", "s", "--json")
     assert (done.exit_code, json.loads(done.stdout)["exit_code"]) == (130, 130)
+
+
+def test_attach_tells_of_a_job_that_waits_for_nodes(tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "s" / "mine")
+    look = _Look(store)
+    look.update()
+    job = JobRecord(id="mine-1", address="http://127.0.0.1:9")
+    with store.lock():
+        store.write_record(store.read_record().model_copy(update={"job": job, "state": "created"}))
+        look.update()
+        assert look.monitor.phase == "its job joins the cluster, or waits for nodes"
+        store.write_record(store.read_record().model_copy(update={"state": "running"}))
+        look.update()
+        assert look.monitor.phase == "starting the trials"
 
 
 def test_attach_tells_of_a_driver_that_died_and_of_a_job_that_failed(head: Head, tmp_path: Path) -> None:

@@ -98,9 +98,7 @@ def test_a_sweep_that_is_asked_to_stop_does_not_wait_on(monkeypatch: pytest.Monk
     cluster = of(monkeypatch, 2)
     asked = iter([False, False, True])
     with pytest.raises(SweepInterrupted):
-        machine_that_fits(
-            SPEC, cluster.connection, 60, name="mine", progress="none", stop_requested=lambda: next(asked)
-        )
+        machine_that_fits(SPEC, cluster.connection, 3, name="mine", progress="none", stop_requested=lambda: next(asked))
     assert cluster.asked[-1] == []
 
 

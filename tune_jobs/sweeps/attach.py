@@ -136,6 +136,8 @@ class _Look:
             return "stopping: the running trials save a checkpoint"
         if record.state == "completed":
             return "confirming and filming the best policy, and writing the report"
+        if record.state == "created" and record.job is not None:
+            return "its job joins the cluster, or waits for nodes"
         if "running" in self.monitor.counts():
             self._has_run = True
         # Once a trial has run, the monitor says what the others wait for.
