@@ -247,4 +247,4 @@ def test_patience_has_an_end(faults: Faults, bucket: Bucket) -> None:
     began = time.monotonic()
     with pytest.raises(StorageError):
         bucket.listed()
-    assert 0.2 < time.monotonic() - began < 5
+    assert 1 < time.monotonic() - began < 20

@@ -94,7 +94,7 @@ class Parts:
             if found is None:
                 hint = "List the sweeps there with `tune-jobs list --storage`."
                 raise NotFoundError(f"No {what} at {self.bucket.name_of(key)}.", hint)
-            self._tags[key], data = found.tag, found.data
+            data = found.data
         # By the same code as a file's.
         path = self.own() / key
         with self._lock, self.named():
@@ -145,13 +145,15 @@ class Parts:
             return
         for _ in range(_ATTEMPTS):
             if key not in self._tags:
+                # Whoever is the owner after this look has written nothing yet, or what is written over is not this.
                 found = self.bucket.get(key)
+                self._check_ours()
                 self._tags[key] = found.tag if found is not None else None
             tag = self._tags[key]
             try:
                 self._tags[key] = self.bucket.put(key, data, over=tag, is_new=tag is None)
             except ConflictError:
-                self._check_ours()
+                # Looked at again, and whether it is still this process's.
                 del self._tags[key]
             else:
                 break

@@ -7,6 +7,8 @@ no head names any more is removed.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import secrets
 import shutil
 import threading
@@ -18,7 +20,7 @@ from policies.errors import CannotRunError, CheckpointError
 from policies.files import write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.manifests import described_files
-from tune_jobs.store.objects.bucket import ConflictError, Tag
+from tune_jobs.store.objects.bucket import ConflictError, StorageError, Tag
 from tune_jobs.store.objects.head import Chunk, Head, StoredCheckpoint, read_head
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
@@ -81,17 +83,18 @@ class TrialState:
                 self._token, self._is_lost, self._looked_at = token, False, time.monotonic()
                 self._begin_writing(new, new_tag)
             return
-        raise CannotRunError(
-            f"{self._name} is taken by one process after the other.", "End those that drive this sweep."
-        )
+        raise CannotRunError(f"{self._name} is taken by one after the other.", "End those that drive this sweep.")
 
     def _begin_writing(self, head: Head, tag: Tag | None) -> None:
-        self._head, self._tag, self._is_writing = head, tag, True
+        # Until all is here, what is here is not the newest state, and must not be written as if it were.
+        self._head, self._tag, self._is_writing = head, tag, False
         self._checkpoints = dict(head.checkpoints)
         self._damaged, self._results, self._has_results = dict(head.damaged), head.results, head.has_results
         self._keys.clear()
         shutil.rmtree(self.folder(), ignore_errors=True)
-        self._write_results(head)
+        if not self._write_results(head):
+            raise self._lacks_results()
+        self._is_writing = True
 
     def check(self) -> None:
         """Raise an error if another process has become the owner, as far as is known."""
@@ -190,14 +193,17 @@ class TrialState:
 
     def _look(self) -> None:
         """Bring the local results to what the store has."""
-        for _ in range(_ATTEMPTS):
-            head = self._look_head()
-            if self._write_results(head):
-                return
-            # An object went while it was fetched, because there is a newer head.
-        raise CheckpointError(
-            f"{self._name} names results that do not exist.", "Restore the objects, or an earlier version of the head."
-        )
+        # Two threads that look at once would both append what is new.
+        with self._lock:
+            for _ in range(_ATTEMPTS):
+                # An object goes while it is fetched when there is a newer head.
+                if self._write_results(self._look_head()):
+                    return
+        raise self._lacks_results()
+
+    def _lacks_results(self) -> CheckpointError:
+        message = f"{self._name} names results that do not exist."
+        return CheckpointError(message, "Restore the objects, or an earlier version of the head.")
 
     def _write_results(self, head: Head) -> bool:
         path = self.folder() / names.RESULTS
@@ -259,10 +265,7 @@ class TrialState:
         self.settle()
         with self._lock:
             stored = self._checkpoints.pop(iteration, None)
-            name, number = f"{iteration:06d}", 1
-            while name in self._damaged:
-                number += 1
-                name = f"{iteration:06d}-{number}"
+            name = self._free(f"{iteration:06d}")
             if stored is not None:
                 self._damaged[name] = stored.key
         self.changed(after_s=0.0)
@@ -272,24 +275,23 @@ class TrialState:
         """Take all results out of the state, and return their name among what is damaged."""
         self.settle()
         with self._lock:
-            name, number = names.RESULTS, 1
-            while name in self._damaged:
-                number += 1
-                name = f"{names.RESULTS}-{number}"
+            name = self._free(names.RESULTS)
             self._damaged[name] = " ".join(chunk.key for chunk in self._results)
             self._results, self._has_results = (), False
             (self.folder() / names.RESULTS).unlink(missing_ok=True)
         self.changed(after_s=0.0)
         return name
 
+    def _free(self, name: str) -> str:
+        numbered = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+        return next(free for free in numbered if free not in self._damaged)
+
     def _upload(self) -> None:
-        if self._is_lost:
-            raise lost(self._name)
+        self.check()
         with self._lock:
             wanted = dict(self._checkpoints)
             keys, damaged, has_results = dict(self._keys), dict(self._damaged), self._has_results
-            path = self.folder() / names.RESULTS
-            content = path.read_bytes() if has_results and path.exists() else b""
+            content = (self.folder() / names.RESULTS).read_bytes() if has_results else b""
             known = self._results
         stored: dict[int, StoredCheckpoint] = {}
         for iteration, present in sorted(wanted.items()):
@@ -314,7 +316,9 @@ class TrialState:
             for iteration, checkpoint in stored.items():
                 if iteration in self._checkpoints and self._keys.get(iteration, checkpoint.key) == checkpoint.key:
                     self._checkpoints[iteration] = checkpoint
-        self._remove_unnamed(before, head)
+        # What cannot be removed now is a leftover; the state itself is in the store.
+        with contextlib.suppress(StorageError):
+            self._remove_unnamed(before, head)
 
     def _commit(self, head: Head) -> None:
         try:
@@ -339,11 +343,13 @@ class TrialState:
             manifest = (folder / names.MANIFEST).read_text(encoding="utf-8")
             for name in described_files(folder):
                 self._bucket.put(f"{self._checkpoint_prefix(iteration, key)}/{name}", folder / name)
+            # It may have been replaced meanwhile: files of two are none. The other one's upload follows.
+            is_same = (folder / names.MANIFEST).read_text(encoding="utf-8") == manifest
         except (FileNotFoundError, CheckpointError):
             if iteration in self._checkpoints and self._keys.get(iteration) == key:
                 raise
             return None
-        return StoredCheckpoint(key=key, manifest=manifest)
+        return StoredCheckpoint(key=key, manifest=manifest) if is_same else None
 
     def _upload_results(self, content: bytes, known: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
         """Upload what is new of the results, with the last chunk while that is small; return all chunks."""
@@ -368,10 +374,10 @@ class TrialState:
     def _remove_unnamed(self, before: Head, now: Head) -> None:
         """Remove the objects that one head named, and no head names any more."""
         named = {chunk.key for chunk in now.results} | {key for text in now.damaged.values() for key in text.split()}
-        gone = [self._chunk_key(chunk.key) for chunk in before.results if chunk.key not in named]
-        for chunk in before.results:
-            if chunk.key not in named:
-                (self.folder() / "chunks" / chunk.key).unlink(missing_ok=True)
+        unnamed = {chunk.key for chunk in before.results} - named
+        gone = [self._chunk_key(key) for key in unnamed]
+        for key in unnamed:
+            (self.folder() / "chunks" / key).unlink(missing_ok=True)
         kept = {checkpoint.key for checkpoint in now.checkpoints.values()} | named
         for iteration, checkpoint in before.checkpoints.items():
             if checkpoint.key not in kept:
