@@ -17,7 +17,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 import pytest
 from s3_server import s3_endpoint
 
-from tune_jobs.store.objects import bucket, outbox, owners, trial_state
+from tune_jobs.store.objects import asked, bucket, outbox, owners, trial_state
 
 
 @dataclass
@@ -218,6 +218,7 @@ def faults(monkeypatch: pytest.MonkeyPatch) -> Iterator[Faults]:
     monkeypatch.setattr(outbox, "_LONGEST_PAUSE_S", 0.05)
     monkeypatch.setattr(owners, "_LOOK_EVERY_S", 0.0)
     monkeypatch.setattr(trial_state, "_LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(asked, "_EVERY_S", 0.0)
     monkeypatch.setattr(trial_state, "_RESULTS_AFTER_S", 0.02)
     made = Faults()
     yield made

@@ -18,7 +18,7 @@ from analysis.records import (
     TrialRecord,
 )
 from tune_jobs.store.contract import Sweep, Trial
-from tune_jobs.store.objects import owners, trial_state
+from tune_jobs.store.objects import asked, owners, trial_state
 
 SWEEP, TRIAL, RESULTS = "sweep.json", "trials/t0000/trial.json", "trials/t0000/results.jsonl"
 BEST, PACK = "best/evaluation.json", "packs/p00.json"
@@ -37,6 +37,7 @@ def harness(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     # What the store says of an owner is believed for a second, which no test waits for.
     monkeypatch.setattr(owners, "_LOOK_EVERY_S", 0.0)
     monkeypatch.setattr(trial_state, "_LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(asked, "_EVERY_S", 0.0)
     return HARNESSES[request.param](tmp_path)
 
 

@@ -50,8 +50,14 @@ def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Callab
         beating.end()
 
 
-def is_leased(bucket: Bucket, key: str) -> bool:
+def is_leased(bucket: Bucket, key: str, watch_s: float = 2.5 * _BEAT_S) -> bool:
     """Whether a process holds the lock; for a holder elsewhere that may be gone, this takes some seconds.
+
+    Args:
+        bucket: The sweep's objects.
+        key: The lock's object.
+        watch_s: Seconds for which a holder elsewhere is watched. Only `LEASE_S` makes sure that it is gone, as its
+            requests may be slow; two signs of life and a half are enough to show whether it lives.
 
     Raises:
         CannotRunError: The store cannot be read.
@@ -62,8 +68,7 @@ def is_leased(bucket: Bucket, key: str) -> bool:
     state = _is_here(_holder(found))
     if state is not None:
         return state
-    # Twice, because one may be lost.
-    deadline = time.monotonic() + 2.5 * _BEAT_S
+    deadline = time.monotonic() + watch_s
     while time.monotonic() < deadline:
         time.sleep(0.5)
         now = bucket.get(key)

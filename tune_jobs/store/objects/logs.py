@@ -40,7 +40,17 @@ class LogUploads:
 
     def now(self) -> None:
         """Upload the log if it has grown; what cannot be uploaded is tried again later."""
-        with self._lock, contextlib.suppress(OSError, TuneJobsError):
+        with contextlib.suppress(OSError, TuneJobsError):
+            self.bring()
+
+    def bring(self) -> None:
+        """Upload the log if it has grown.
+
+        Raises:
+            OSError: It cannot be read.
+            StorageError: It cannot be written.
+        """
+        with self._lock:
             found = self._path.stat()
             state = found.st_size, found.st_mtime_ns
             if state != self._uploaded:

@@ -16,8 +16,9 @@ from analysis.records import FINISHED, BestRecord, CheckpointRecord, FilmsRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
+from tune_jobs.store.objects.asked import Asked
 from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError, Tag
-from tune_jobs.store.objects.lease import is_leased, leased
+from tune_jobs.store.objects.lease import LEASE_S, is_leased, leased
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.object_pack import ObjectPack
 from tune_jobs.store.objects.object_trial import ObjectTrial
@@ -46,6 +47,7 @@ class ObjectSweep:
         self.url = url
         self._parts = Parts(url)
         self._bucket = self._parts.bucket
+        self._stop = Asked(lambda: self._bucket.get(_STOP) is not None)
         self._driver_uploads: LogUploads | None = None
         # One for all calls, so that what a trial has fetched is fetched once.
         self._trials: dict[str, ObjectTrial] = {}
@@ -165,7 +167,7 @@ class ObjectSweep:
         """Be the sweep's driver in the block; the lock is free half a minute after the process has ended."""
         watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
         with leased(self._bucket, _LOCK, f"Sweep {self.name} is being run by another process.", watch) as is_ours:
-            if is_leased(self._bucket, _DRIVER_LOCK):
+            if is_leased(self._bucket, _DRIVER_LOCK, watch_s=LEASE_S):
                 raise CannotRunError(*self._still_driven)
             self._parts.is_locked = is_ours
             try:
@@ -218,14 +220,16 @@ class ObjectSweep:
     def request_stop(self) -> None:
         """Ask the driver to stop; any process may."""
         self._bucket.put(_STOP, b"stop\n")
+        self._stop.forget()
 
     def stop_requested(self) -> bool:
         """Whether a stop was requested since `clear_stop_request`."""
-        return self._bucket.get(_STOP) is not None
+        return self._stop.answer()
 
     def clear_stop_request(self) -> None:
         """Forget the request."""
         self._bucket.delete([_STOP])
+        self._stop.forget()
 
     # -- its results: made in a folder that this machine's processes share, so that paths which users are told stay
 
@@ -322,7 +326,10 @@ class ObjectSweep:
 
     def current_report(self) -> Path | None:
         """Return the report's page if it was written after the sweep's record, the winner and the films; else None."""
-        listed = {item.key: item.modified_s for item in self._bucket.listed()}
+        # Not of all objects: the trials may have many thousands.
+        items = [*self._bucket.listed(f"{names.BEST_FOLDER}/"), *self._bucket.listed(f"{names.REPORT_FOLDER}/")]
+        record = self._bucket.look(names.SWEEP_RECORD)
+        listed = {item.key: item.modified_s for item in [*items, *([record] if record is not None else [])]}
         page = listed.get(f"{names.REPORT_FOLDER}/{names.REPORT_PAGE}")
         of_best = (names.BEST_RECORD, *names.FILMS.values())
         shown = [names.SWEEP_RECORD, *(f"{names.BEST_FOLDER}/{name}" for name in of_best)]

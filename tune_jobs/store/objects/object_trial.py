@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import secrets
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -13,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from policies.files import open_to_append
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
 from tune_jobs.store.manifests import described_files, files_of, read_manifest, verify_checkpoint
 from tune_jobs.store.objects.logs import LogUploads
+from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.trial_state import TrialState
 from tune_jobs.store.places import check_trial_id, within
@@ -219,9 +221,13 @@ class ObjectTrial:
         """Return a local folder with a copy; it does not exist if there is no copy."""
         folder = within(self._state.folder(), names.COPIES_FOLDER, f"{iteration:06d}")
         prefix = self._copy_prefix(iteration)
-        if not folder.exists() and self._parts.bucket.fetch(f"{prefix}/{names.MANIFEST}", folder / names.MANIFEST):
-            for name in described_files(folder):
-                self._parts.bucket.fetch(f"{prefix}/{name}", folder / name)
+        # Elsewhere first: a copy of which some files could not be fetched is none.
+        made = self._state.folder() / "fetched" / secrets.token_hex(8)
+        if not folder.exists() and self._parts.bucket.fetch(f"{prefix}/{names.MANIFEST}", made / names.MANIFEST):
+            for name in described_files(made):
+                self._parts.bucket.fetch(f"{prefix}/{name}", made / name)
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            made.rename(folder)
         return folder
 
     def remove_copies(self, keep: Collection[int] = ()) -> None:
@@ -296,10 +302,13 @@ class ObjectTrial:
     def write_log(self, text: str) -> None:
         """Append a line to the log, with the time and this process."""
         line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
-        with open_to_append(self.log_path) as file:
+        path = self.log_path
+        with open_to_append(path) as file:
             file.write(line.encode(errors="backslashreplace"))
         if self._log_uploads is None:
-            LogUploads(self._parts, self._log_key, self.log_path).now()
+            # Who says something of a trial does not wait for the store; of a log, nobody waits for the end.
+            with contextlib.suppress(TuneJobsError):
+                outbox().add(("log", self._log_key, id(self)), LogUploads(self._parts, self._log_key, path).bring)
 
     def log_tail(self, num_lines: int = 15) -> str:
         """Return the lines that say how the trial's last process ended."""

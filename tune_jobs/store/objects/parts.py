@@ -195,7 +195,11 @@ class Parts:
 
     def newest_log(self, key: str, local: Path) -> Path:
         """Return a local file with a log: this machine's, or a copy of the store's if that is newer."""
-        listed = self.bucket.look(key)
+        try:
+            listed = self.bucket.look(key)
+        except StorageError:
+            # It is asked for to say how something failed, which may be this.
+            return local
         with contextlib.suppress(OSError):
             if listed is None or local.stat().st_mtime >= listed.modified_s:
                 return local

@@ -18,6 +18,7 @@ import tempfile
 from pathlib import Path
 
 from policies.errors import CannotRunError
+from policies.files import write_atomic
 from policies.parents import is_gone, this_process
 from tune_jobs.store.objects.url import ObjectUrl
 
@@ -44,7 +45,7 @@ def _own(pid: int) -> Path:
     """Return a new folder of this process alone; `pid` is its id, as a forked process needs another."""
     folder = _root() / f"of-{pid}-{secrets.token_hex(4)}"
     _make(folder)
-    (folder / _PROCESS).write_text(this_process(), encoding="ascii")
+    write_atomic(folder / _PROCESS, this_process())
     _remove_abandoned()
     atexit.register(_remove, folder, pid)
     return folder

@@ -343,11 +343,11 @@ class TrialState:
             manifest = (folder / names.MANIFEST).read_text(encoding="utf-8")
             for name in described_files(folder):
                 self._bucket.put(f"{self._checkpoint_prefix(iteration, key)}/{name}", folder / name)
-            # It may have been replaced meanwhile: files of two are none. The other one's upload follows.
+            # It may be replaced meanwhile: files of two are none, and the next try finds the other one.
             is_same = (folder / names.MANIFEST).read_text(encoding="utf-8") == manifest
-        except (FileNotFoundError, CheckpointError):
+        except (FileNotFoundError, CheckpointError) as error:
             if iteration in self._checkpoints and self._keys.get(iteration) == key:
-                raise
+                raise StorageError(f"Checkpoint {iteration} of {self._name} is gone: {error}.", passes=True) from error
             return None
         return StoredCheckpoint(key=key, manifest=manifest) if is_same else None
 

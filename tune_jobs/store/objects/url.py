@@ -31,7 +31,10 @@ class ObjectUrl:
         Raises:
             SpecError: It names no bucket, has credentials in it, or a setting or a part that is not known.
         """
-        parts = urlsplit(text)
+        try:
+            parts = urlsplit(text)
+        except ValueError as error:
+            raise SpecError(f"{text!r} is no address: {error}.", "Write s3://BUCKET/PREFIX.") from error
         if "@" in parts.netloc:
             raise SpecError(
                 f"The storage at {parts.scheme}://{parts.netloc.rpartition('@')[2]} is given with credentials in it.",
@@ -45,8 +48,12 @@ class ObjectUrl:
         if not parts.netloc:
             raise SpecError(f"{text!r} names no bucket.", f"Write {parts.scheme}://BUCKET/PREFIX.")
         path = unquote(parts.path).strip("/")
-        if parts.fragment or any(part in ("", ".", "..") for part in path.split("/") if path):
-            raise SpecError(f"{text!r} has parts that no key of an object may have.", "Leave out #, //, . and ..")
+        if (
+            parts.fragment
+            or "%2f" in parts.path.lower()
+            or any(part in ("", ".", "..") for part in path.split("/") if path)
+        ):
+            raise SpecError(f"{text!r} has parts that no key of an object may have.", "Leave out #, //, %2F, . and ..")
         settings = dict(parse_qsl(parts.query, keep_blank_values=True))
         known = _SETTINGS[parts.scheme]
         for name, value in settings.items():
