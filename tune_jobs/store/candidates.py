@@ -30,11 +30,12 @@ def readable_trials(store: Sweep) -> list[TrialRecord]:
         CheckpointError: The trials cannot be listed.
     """
     records = []
-    for trial_id in store.trial_stamps():
-        try:
-            records.append(store.trial(trial_id).read_record())
-        except CheckpointError as error:
-            leave_out(error)
+    with store.reading(results=False):
+        for trial_id in store.trial_stamps():
+            try:
+                records.append(store.trial(trial_id).read_record())
+            except CheckpointError as error:
+                leave_out(error)
     return sorted(records, key=lambda record: record.index)
 
 
@@ -47,24 +48,26 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
         CheckpointError: The record of the sweep is damaged.
     """
     sweep = store.read_record()
-    records = [
-        record.model_copy(
-            update={**_place_of(record, sweep), "checkpoints": tuple(candidates(store.trial(record.trial_id)))}
-        )
-        for record in readable_trials(store)
-    ]
+    with store.reading():
+        records = [
+            record.model_copy(
+                update={**_place_of(record, sweep), "checkpoints": tuple(candidates(store.trial(record.trial_id)))}
+            )
+            for record in readable_trials(store)
+        ]
     return sorted(records, key=lambda record: record.index)
 
 
 def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
     """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
     found = {}
-    for record in readable_trials(store):
-        try:
-            found[record.trial_id] = store.trial(record.trial_id).read_iterations()
-        except CheckpointError as error:
-            leave_out(error)
-            found[record.trial_id] = []
+    with store.reading():
+        for record in readable_trials(store):
+            try:
+                found[record.trial_id] = store.trial(record.trial_id).read_iterations()
+            except CheckpointError as error:
+                leave_out(error)
+                found[record.trial_id] = []
     return found
 
 

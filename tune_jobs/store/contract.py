@@ -170,6 +170,19 @@ class Sweep(Protocol):
         """
         ...
 
+    def reading(self, *, results: bool = True) -> AbstractContextManager[None]:
+        """Read much of all trials in the block: it may be as it was at the block's beginning, or later.
+
+        A store that is far away fetches all of it at once, instead of one after the other.
+
+        Args:
+            results: Whether results and checkpoints are read, too, and not the records alone.
+
+        Raises:
+            CheckpointError: The trials cannot be listed.
+        """
+        ...
+
     def pack(self, pack_id: str) -> Pack:
         """Return a pack, which need not exist yet.
 

@@ -179,6 +179,10 @@ class SweepStore:
         """
         return TrialStore(self.folder, trial_id)
 
+    def reading(self, *, results: bool = True) -> AbstractContextManager[None]:  # noqa: ARG002 (nothing is fetched)
+        """Do nothing: a file is read when it is needed."""
+        return contextlib.nullcontext()
+
     def pack(self, pack_id: str) -> PackFiles:
         """Return the files of one pack.
 

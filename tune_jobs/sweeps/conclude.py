@@ -372,7 +372,8 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
             why_no_best = error
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None
-    record, trials, results = store.read_record(), read_trials(store), read_results(store)
+    with store.reading():
+        record, trials, results = store.read_record(), read_trials(store), read_results(store)
     threshold = goal_of(record, None) if best is None else best.confirmation.threshold
     films = store.films()
     videos = {name: films[key] for name, key in (("before", "before_mp4"), ("after", "after_mp4")) if key in films}

@@ -6,20 +6,20 @@ import contextlib
 import hashlib
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from analysis.records import FINISHED, BestRecord, CheckpointRecord, FilmsRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
-from policies.portable.file import PortablePolicy, save_policy
+from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
+from policies.errors import CannotRunError, CheckpointError, SpecError
 from tune_jobs.store import names
 from tune_jobs.store.objects.asked import Asked
-from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError, Tag
+from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError
 from tune_jobs.store.objects.lease import LEASE_S, is_leased, leased
 from tune_jobs.store.objects.logs import LogUploads
+from tune_jobs.store.objects.object_artifacts import AT_ONCE, Artifacts
 from tune_jobs.store.objects.object_pack import ObjectPack
 from tune_jobs.store.objects.object_trial import ObjectTrial
 from tune_jobs.store.objects.outbox import outbox
@@ -28,15 +28,12 @@ from tune_jobs.store.objects.parts import RECORDS, Parts
 from tune_jobs.store.objects.probe import ObjectProbe, probing
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.places import is_trial_id
-from tune_jobs.store.record_files import dump_sealed
 
 _LOCK, _DRIVER_LOCK, _RUN = "lock.json", "driver-lock.json", "run.json"
 _CLAIM, _STOP = "claim", "stop"
-_AT_ONCE = 32
-"""Requests side by side when many records are read."""
 
 
-class ObjectSweep:
+class ObjectSweep(Artifacts):
     """One sweep's objects; implements `Sweep`.
 
     Args:
@@ -45,8 +42,7 @@ class ObjectSweep:
 
     def __init__(self, url: ObjectUrl) -> None:
         self.url = url
-        self._parts = Parts(url)
-        self._bucket = self._parts.bucket
+        super().__init__(Parts(url))
         self._stop = Asked(lambda: self._bucket.get(_STOP) is not None)
         self._driver_uploads: LogUploads | None = None
         # One for all calls, so that what a trial has fetched is fetched once.
@@ -139,7 +135,7 @@ class ObjectSweep:
 
     def read_trials(self) -> list[TrialRecord]:
         """Read the records of all trials that have one, by index."""
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
+        with ThreadPoolExecutor(AT_ONCE) as pool:
             records = list(pool.map(lambda trial_id: self.trial(trial_id).read_record(), self.trial_stamps()))
         return sorted(records, key=lambda record: record.index)
 
@@ -151,6 +147,21 @@ class ObjectSweep:
             raise CheckpointError(error.message, error.hint) from error
         found = {item.key.removeprefix(f"{RECORDS}/").removesuffix(".json"): _stamp(item) for item in listed}
         return {trial_id: stamp for trial_id, stamp in found.items() if is_trial_id(trial_id)}
+
+    @contextlib.contextmanager
+    def reading(self, *, results: bool = True) -> Iterator[None]:
+        """Read much of all trials in the block: it is fetched at its beginning, many at once."""
+        if self._parts.snapshot is not None:
+            # A part of a larger block.
+            yield
+            return
+        self._parts.snapshot = object()
+        try:
+            with ThreadPoolExecutor(AT_ONCE) as pool:
+                list(pool.map(lambda trial_id: self.trial(trial_id).fetch(results=results), self.trial_stamps()))
+            yield
+        finally:
+            self._parts.snapshot = None
 
     def pack(self, pack_id: str) -> ObjectPack:
         """Return a pack, which need not exist yet."""
@@ -209,7 +220,7 @@ class ObjectSweep:
     def remove_leftovers(self) -> None:
         """Remove objects that killed processes left behind; the caller has to hold the lock."""
         ended = [trial.trial_id for trial in self.read_trials() if trial.status in FINISHED]
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
+        with ThreadPoolExecutor(AT_ONCE) as pool:
             list(pool.map(lambda trial_id: self.trial(trial_id).remove_leftovers(), ended))
         self._bucket.delete([item.key for item in self._bucket.listed("probe/")])
 
@@ -230,130 +241,6 @@ class ObjectSweep:
         """Forget the request."""
         self._bucket.delete([_STOP])
         self._stop.forget()
-
-    # -- its results: made in a folder that this machine's processes share, so that paths which users are told stay
-
-    def _shared(self, folder: str, *, fetched: bool = True) -> Path:
-        """Return the local folder of the winner or the report, with what the store has of it."""
-        local = self._parts.shared() / folder
-        local.mkdir(parents=True, exist_ok=True)
-        if fetched:
-            present = {item.key.removeprefix(f"{folder}/"): item for item in self._bucket.listed(f"{folder}/")}
-            stale = [name for name, item in present.items() if _differs(local / name, item)]
-            with ThreadPoolExecutor(_AT_ONCE) as pool:
-                list(pool.map(lambda name: self._fetch(folder, name, present[name]), stale))
-            for path in [path for path in local.rglob("*") if path.is_file()]:
-                name = path.relative_to(local).as_posix()
-                if name not in present and not path.name.startswith("."):
-                    path.unlink(missing_ok=True)
-        return local
-
-    def _fetch(self, folder: str, name: str, item: Listed) -> None:
-        path = self._parts.shared() / folder / name
-        if self._bucket.fetch(f"{folder}/{name}", path):
-            _mark(path, item.tag)
-
-    def _upload(self, folder: str, made: Path, paths: Sequence[Path]) -> None:
-        for path in paths:
-            self._bucket.put(f"{folder}/{path.relative_to(made).as_posix()}", path)
-
-    def has_best(self) -> bool:
-        """Whether a winner has been written."""
-        return self._bucket.get(f"{names.BEST_FOLDER}/{names.BEST_RECORD}") is not None
-
-    def read_best(self) -> BestRecord:
-        """Read the winner's record."""
-        key = f"{names.BEST_FOLDER}/{names.BEST_RECORD}"
-        try:
-            return self._parts.read_record(key, BestRecord, "best record", is_sealed=True)
-        except CheckpointError:
-            raise
-        except NotFoundError as error:
-            raise NotFoundError(
-                f"Sweep {self.name} has no best policy yet.", f"Choose it with `tune-jobs best {self.name}`."
-            ) from error
-
-    def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
-        """Replace the winner; the sealed record is written after the policy."""
-        if policy is not None:
-            made = self._parts.own() / "made" / names.BEST_FOLDER
-            save_policy(policy, made)
-            self._upload(names.BEST_FOLDER, made, sorted(made.iterdir()))
-        self._parts.write_record(f"{names.BEST_FOLDER}/{names.BEST_RECORD}", dump_sealed(record))
-
-    @property
-    def best_folder(self) -> Path:
-        """A local folder with the winner's portable policy."""
-        return self._shared(names.BEST_FOLDER)
-
-    @property
-    def best_policy_path(self) -> Path:
-        """The file in `best_folder` that a user is told to load."""
-        return self._shared(names.BEST_FOLDER, fetched=False) / names.BEST_POLICY
-
-    def films(self) -> dict[str, Path]:
-        """Return the films that exist of the present winner."""
-        folder = self.best_folder
-        films = {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
-        return films if films and self._are_of_the_winner() else {}
-
-    def _are_of_the_winner(self) -> bool:
-        key = f"{names.BEST_FOLDER}/{names.FILMS_RECORD}"
-        try:
-            record = self._parts.read_record(key, FilmsRecord, "films record", is_sealed=True)
-            return record.checkpoint == self.read_best().checkpoint
-        except NotFoundError:
-            return False
-
-    def current_films(self) -> dict[str, Path]:
-        """Return all films if they are there and show the present winner; else none."""
-        films = self.films()
-        return films if len(films) == len(names.FILMS) else {}
-
-    @contextlib.contextmanager
-    def writing_films(self) -> Iterator[Mapping[str, Path]]:
-        """Yield the path for each of the films of the present winner."""
-        # Not where others look: those bring that folder to what the store has.
-        made = self._parts.own() / "made" / f"films-{secrets.token_hex(4)}"
-        made.mkdir(parents=True)
-        shown = self.read_best().checkpoint
-        key = f"{names.BEST_FOLDER}/{names.FILMS_RECORD}"
-        self._bucket.delete([key])
-        paths = {film: made / name for film, name in names.FILMS.items()}
-        yield paths
-        self._upload(names.BEST_FOLDER, made, [path for path in paths.values() if path.is_file()])
-        self._parts.write_record(key, dump_sealed(FilmsRecord(checkpoint=shown)))
-
-    def current_report(self) -> Path | None:
-        """Return the report's page if it was written after the sweep's record, the winner and the films; else None."""
-        # Not of all objects: the trials may have many thousands.
-        items = [*self._bucket.listed(f"{names.BEST_FOLDER}/"), *self._bucket.listed(f"{names.REPORT_FOLDER}/")]
-        record = self._bucket.look(names.SWEEP_RECORD)
-        listed = {item.key: item.modified_s for item in [*items, *([record] if record is not None else [])]}
-        page = listed.get(f"{names.REPORT_FOLDER}/{names.REPORT_PAGE}")
-        of_best = (names.BEST_RECORD, *names.FILMS.values())
-        shown = [names.SWEEP_RECORD, *(f"{names.BEST_FOLDER}/{name}" for name in of_best)]
-        if page is None or any(listed.get(key, page) > page for key in shown):
-            return None
-        return self._shared(names.REPORT_FOLDER) / names.REPORT_PAGE
-
-    def report_files(self) -> dict[str, Path]:
-        """Return the files of the report that was written last, by their names."""
-        folder = self._shared(names.REPORT_FOLDER)
-        files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith("."))
-        return {path.relative_to(folder).as_posix(): path for path in files}
-
-    @contextlib.contextmanager
-    def writing_report(self) -> Iterator[Path]:
-        """Yield a local folder to write the report into, over the present one."""
-        folder = self._parts.own() / "made" / f"report-{secrets.token_hex(4)}"
-        shutil.copytree(self._shared(names.REPORT_FOLDER), folder, ignore=shutil.ignore_patterns(".*"))
-        yield folder
-        files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
-        page = folder / names.REPORT_PAGE
-        self._upload(names.REPORT_FOLDER, folder, [path for path in files if path != page])
-        # Last: a page whose figures are missing would be half a report.
-        self._upload(names.REPORT_FOLDER, folder, [page] if page.is_file() else [])
 
     # -- files of this machine and this run only
 
@@ -388,23 +275,3 @@ def _stamp(item: Listed | None) -> tuple[int, ...]:
         return ()
     digest = hashlib.sha256(repr(item.tag).encode()).digest()
     return int.from_bytes(digest[:8]), item.size, int(item.modified_s)
-
-
-def _marked(path: Path) -> Path:
-    return path.with_name(f".{path.name}.tag")
-
-
-def _mark(path: Path, tag: Tag) -> None:
-    """Note which content of an object a local file has."""
-    found = path.stat()
-    _marked(path).write_text(repr((tag, found.st_size, found.st_mtime_ns)), encoding="utf-8")
-
-
-def _differs(path: Path, item: Listed) -> bool:
-    """Whether a local file is missing, or is not the content that an object has."""
-    try:
-        found = path.stat()
-        noted = _marked(path).read_text(encoding="utf-8")
-    except OSError:
-        return True
-    return noted != repr((item.tag, found.st_size, found.st_mtime_ns))

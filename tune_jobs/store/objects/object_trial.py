@@ -94,6 +94,13 @@ class ObjectTrial:
         """Replace the record; see `Trial.write_record`."""
         self._parts.write_record(self._record_key, record, soon=soon)
 
+    def fetch(self, *, results: bool) -> None:
+        """Fetch the record, or all, for what is read in a moment; whatever fails is raised there."""
+        with contextlib.suppress(TuneJobsError):
+            self._parts.fetch_record(self._record_key)
+            if results:
+                self._state.local()
+
     @property
     def _record_key(self) -> str:
         return self._parts.record_key(self.trial_id)

@@ -42,6 +42,9 @@ class Parts:
         """The run that this process works for, which its records are written under."""
         self.is_locked: Callable[[], bool] | None = None
         """Whether this process still has the sweep's lock; None: it has not taken it."""
+        self.snapshot: object | None = None
+        """While much is read, what everything that was read since then is as of; None: all is read anew."""
+        self._read: dict[str, tuple[object, bytes]] = {}
         self._own: Path | None = None
         self._writer = secrets.token_hex(4)
         self.jobs: set[Hashable] = set()
@@ -89,18 +92,29 @@ class Parts:
             CheckpointError: It is damaged, of a newer format, or was changed; the message names it.
         """
         data = self._pending.get(key)
+        as_of, known = self._read.get(key, (None, b""))
+        if data is None and as_of is not None and as_of is self.snapshot:
+            data = known
         if data is None:
-            found = self.bucket.get(key)
-            if found is None:
+            data = self.fetch_record(key)
+            if data is None:
                 hint = "List the sweeps there with `tune-jobs list --storage`."
                 raise NotFoundError(f"No {what} at {self.bucket.name_of(key)}.", hint)
-            data = found.data
         # By the same code as a file's.
         path = self.own() / key
         with self._lock, self.named():
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
             return read_record(path, kind, what, is_sealed=is_sealed)
+
+    def fetch_record(self, key: str) -> bytes | None:
+        """Return a record's text from the store, which is kept while much is read; None: there is none."""
+        found, as_of = self.bucket.get(key), self.snapshot
+        if found is None:
+            return None
+        if as_of is not None:
+            self._read[key] = as_of, found.data
+        return found.data
 
     def write_record(self, key: str, record: BaseModel | str, *, soon: bool = False) -> None:
         """Replace a record, atomically.
@@ -116,6 +130,7 @@ class Parts:
         """
         data = (record if isinstance(record, str) else dump(record)).encode()
         self._pending[key] = data
+        self._read.pop(key, None)
         if soon:
             self.jobs.add(self._job(key))
             outbox().add(self._job(key), lambda: self._upload(key))

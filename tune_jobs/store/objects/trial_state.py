@@ -25,13 +25,13 @@ from tune_jobs.store.objects.head import Chunk, Head, StoredCheckpoint, read_hea
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
 from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.objects.result_chunks import ResultChunks
 from tune_jobs.store.trial_contract import Ownership
 from tune_jobs.store.trial_store import TrialStore
 
 _RESULTS_AFTER_S = 3.0
 """Seconds in which results are gathered, if no checkpoint is uploaded sooner."""
 _LOOK_EVERY_S = 1.0
-_CHUNK_BYTES = 2**18
 _ATTEMPTS = 20
 
 
@@ -62,6 +62,9 @@ class TrialState:
         self._results: tuple[Chunk, ...] = ()
         self._has_results = False
         self._lock = threading.RLock()
+        # What the head and the local results are as of, while much is read.
+        self._head_of: object | None = None
+        self._results_of: object | None = None
 
     # -- who writes
 
@@ -131,6 +134,10 @@ class TrialState:
 
     # -- what is read
 
+    @property
+    def _chunks(self) -> ResultChunks:
+        return ResultChunks(self._bucket, self._prefix, self.folder() / "chunks")
+
     def folder(self) -> Path:
         """Return the local folder of the trial, in one of this process."""
         if self._folder is None:
@@ -188,17 +195,25 @@ class TrialState:
         return f"{self._prefix}/{names.CHECKPOINTS_FOLDER}/{iteration:06d}-{key}"
 
     def _look_head(self) -> Head:
-        self._head, self._tag = read_head(self._bucket, self._head_key)
+        as_of = self._parts.snapshot
+        if as_of is None or as_of is not self._head_of:
+            self._head, self._tag = read_head(self._bucket, self._head_key)
+            self._head_of = as_of
         return self._head
 
     def _look(self) -> None:
         """Bring the local results to what the store has."""
         # Two threads that look at once would both append what is new.
         with self._lock:
+            as_of = self._parts.snapshot
+            if as_of is not None and as_of is self._results_of:
+                return
             for _ in range(_ATTEMPTS):
-                # An object goes while it is fetched when there is a newer head.
                 if self._write_results(self._look_head()):
+                    self._results_of = as_of
                     return
+                # An object went while it was fetched, as there is a newer head.
+                self._head_of = None
         raise self._lacks_results()
 
     def _lacks_results(self) -> CheckpointError:
@@ -210,12 +225,9 @@ class TrialState:
         if not head.has_results:
             path.unlink(missing_ok=True)
             return True
-        content = b""
-        for chunk in head.results:
-            kept = self.folder() / "chunks" / chunk.key
-            if not kept.exists() and not self._bucket.fetch(self._chunk_key(chunk.key), kept):
-                return False
-            content += kept.read_bytes()
+        content = self._chunks.read(head.results)
+        if content is None:
+            return False
         present = path.read_bytes() if path.exists() else None
         if present is not None and content.startswith(present):
             # The same file grows, so that who has read its beginning reads on.
@@ -224,9 +236,6 @@ class TrialState:
         else:
             write_atomic(path, content)
         return True
-
-    def _chunk_key(self, key: str) -> str:
-        return f"{self._prefix}/results/{key}.jsonl"
 
     # -- what is written
 
@@ -298,7 +307,7 @@ class TrialState:
             found = present if present is not None else self._upload_checkpoint(iteration, keys[iteration])
             if found is not None:
                 stored[iteration] = found
-        results = self._upload_results(content, known)
+        results = self._chunks.upload(content, known)
         head = self._head.model_copy(
             update={
                 "owner": self._token if self._token is not None else self._head.owner,
@@ -351,33 +360,11 @@ class TrialState:
             return None
         return StoredCheckpoint(key=key, manifest=manifest) if is_same else None
 
-    def _upload_results(self, content: bytes, known: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
-        """Upload what is new of the results, with the last chunk while that is small; return all chunks."""
-        kept: list[Chunk] = []
-        offset = 0
-        for chunk in known:
-            path = self.folder() / "chunks" / chunk.key
-            is_same = path.exists() and content[offset : offset + chunk.num_bytes] == path.read_bytes()
-            if not is_same:
-                break
-            kept.append(chunk)
-            offset += chunk.num_bytes
-        if offset == len(content):
-            return tuple(kept)
-        if kept and kept[-1].num_bytes < _CHUNK_BYTES:
-            offset -= kept.pop().num_bytes
-        new = Chunk(key=secrets.token_hex(8), num_bytes=len(content) - offset)
-        self._bucket.put(self._chunk_key(new.key), content[offset:])
-        write_atomic(self.folder() / "chunks" / new.key, content[offset:])
-        return (*kept, new)
-
     def _remove_unnamed(self, before: Head, now: Head) -> None:
         """Remove the objects that one head named, and no head names any more."""
         named = {chunk.key for chunk in now.results} | {key for text in now.damaged.values() for key in text.split()}
         unnamed = {chunk.key for chunk in before.results} - named
-        gone = [self._chunk_key(key) for key in unnamed]
-        for key in unnamed:
-            (self.folder() / "chunks" / key).unlink(missing_ok=True)
+        gone = self._chunks.forget(unnamed)
         kept = {checkpoint.key for checkpoint in now.checkpoints.values()} | named
         for iteration, checkpoint in before.checkpoints.items():
             if checkpoint.key not in kept:

@@ -1,0 +1,180 @@
+"""A sweep's results in an object store: winner, films and report; see `contract.Sweep`.
+
+They are made in a folder of this process, and fetched into one that this machine's processes share, so that paths which
+users are told stay.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from analysis.records import BestRecord, FilmsRecord
+from policies.errors import CheckpointError, NotFoundError
+from policies.portable.file import PortablePolicy, save_policy
+from tune_jobs.store import names
+from tune_jobs.store.objects.bucket import Listed, Tag
+from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.record_files import dump_sealed
+
+AT_ONCE = 32
+"""Requests side by side when much is read."""
+
+
+class Artifacts:
+    """What a sweep has come to; the part of `ObjectSweep` that has it.
+
+    Args:
+        parts: The sweep's objects.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._bucket = parts.bucket
+
+    def _shared(self, folder: str, *, fetched: bool = True) -> Path:
+        """Return the local folder of the winner or the report, with what the store has of it."""
+        local = self._parts.shared() / folder
+        local.mkdir(parents=True, exist_ok=True)
+        if fetched:
+            present = {item.key.removeprefix(f"{folder}/"): item for item in self._bucket.listed(f"{folder}/")}
+            stale = [name for name, item in present.items() if _differs(local / name, item)]
+            with ThreadPoolExecutor(AT_ONCE) as pool:
+                list(pool.map(lambda name: self._fetch(folder, name, present[name]), stale))
+            for path in [path for path in local.rglob("*") if path.is_file()]:
+                name = path.relative_to(local).as_posix()
+                if name not in present and not path.name.startswith("."):
+                    path.unlink(missing_ok=True)
+        return local
+
+    def _fetch(self, folder: str, name: str, item: Listed) -> None:
+        path = self._parts.shared() / folder / name
+        if self._bucket.fetch(f"{folder}/{name}", path):
+            _mark(path, item.tag)
+
+    def _upload(self, folder: str, made: Path, paths: Sequence[Path]) -> None:
+        for path in paths:
+            self._bucket.put(f"{folder}/{path.relative_to(made).as_posix()}", path)
+
+    def has_best(self) -> bool:
+        """Whether a winner has been written."""
+        return self._bucket.get(f"{names.BEST_FOLDER}/{names.BEST_RECORD}") is not None
+
+    def read_best(self) -> BestRecord:
+        """Read the winner's record."""
+        key = f"{names.BEST_FOLDER}/{names.BEST_RECORD}"
+        try:
+            return self._parts.read_record(key, BestRecord, "best record", is_sealed=True)
+        except CheckpointError:
+            raise
+        except NotFoundError as error:
+            raise NotFoundError(
+                f"Sweep {self._bucket.url.name} has no best policy yet.",
+                f"Choose it with `tune-jobs best {self._bucket.url.name}`.",
+            ) from error
+
+    def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
+        """Replace the winner; the sealed record is written after the policy."""
+        if policy is not None:
+            made = self._parts.own() / "made" / names.BEST_FOLDER
+            save_policy(policy, made)
+            self._upload(names.BEST_FOLDER, made, sorted(made.iterdir()))
+        self._parts.write_record(f"{names.BEST_FOLDER}/{names.BEST_RECORD}", dump_sealed(record))
+
+    @property
+    def best_folder(self) -> Path:
+        """A local folder with the winner's portable policy."""
+        return self._shared(names.BEST_FOLDER)
+
+    @property
+    def best_policy_path(self) -> Path:
+        """The file in `best_folder` that a user is told to load."""
+        return self._shared(names.BEST_FOLDER, fetched=False) / names.BEST_POLICY
+
+    def films(self) -> dict[str, Path]:
+        """Return the films that exist of the present winner."""
+        folder = self.best_folder
+        films = {key: folder / name for key, name in names.FILMS.items() if (folder / name).is_file()}
+        return films if films and self._are_of_the_winner() else {}
+
+    def _are_of_the_winner(self) -> bool:
+        key = f"{names.BEST_FOLDER}/{names.FILMS_RECORD}"
+        try:
+            record = self._parts.read_record(key, FilmsRecord, "films record", is_sealed=True)
+            return record.checkpoint == self.read_best().checkpoint
+        except NotFoundError:
+            return False
+
+    def current_films(self) -> dict[str, Path]:
+        """Return all films if they are there and show the present winner; else none."""
+        films = self.films()
+        return films if len(films) == len(names.FILMS) else {}
+
+    @contextlib.contextmanager
+    def writing_films(self) -> Iterator[Mapping[str, Path]]:
+        """Yield the path for each of the films of the present winner."""
+        # Not where others look: those bring that folder to what the store has.
+        made = self._parts.own() / "made" / f"films-{secrets.token_hex(4)}"
+        made.mkdir(parents=True)
+        shown = self.read_best().checkpoint
+        key = f"{names.BEST_FOLDER}/{names.FILMS_RECORD}"
+        self._bucket.delete([key])
+        paths = {film: made / name for film, name in names.FILMS.items()}
+        yield paths
+        self._upload(names.BEST_FOLDER, made, [path for path in paths.values() if path.is_file()])
+        self._parts.write_record(key, dump_sealed(FilmsRecord(checkpoint=shown)))
+
+    def current_report(self) -> Path | None:
+        """Return the report's page if it was written after the sweep's record, the winner and the films; else None."""
+        # Not of all objects: the trials may have many thousands.
+        items = [*self._bucket.listed(f"{names.BEST_FOLDER}/"), *self._bucket.listed(f"{names.REPORT_FOLDER}/")]
+        record = self._bucket.look(names.SWEEP_RECORD)
+        listed = {item.key: item.modified_s for item in [*items, *([record] if record is not None else [])]}
+        page = listed.get(f"{names.REPORT_FOLDER}/{names.REPORT_PAGE}")
+        of_best = (names.BEST_RECORD, *names.FILMS.values())
+        shown = [names.SWEEP_RECORD, *(f"{names.BEST_FOLDER}/{name}" for name in of_best)]
+        if page is None or any(listed.get(key, page) > page for key in shown):
+            return None
+        return self._shared(names.REPORT_FOLDER) / names.REPORT_PAGE
+
+    def report_files(self) -> dict[str, Path]:
+        """Return the files of the report that was written last, by their names."""
+        folder = self._shared(names.REPORT_FOLDER)
+        files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith("."))
+        return {path.relative_to(folder).as_posix(): path for path in files}
+
+    @contextlib.contextmanager
+    def writing_report(self) -> Iterator[Path]:
+        """Yield a local folder to write the report into, over the present one."""
+        folder = self._parts.own() / "made" / f"report-{secrets.token_hex(4)}"
+        shutil.copytree(self._shared(names.REPORT_FOLDER), folder, ignore=shutil.ignore_patterns(".*"))
+        yield folder
+        files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+        page = folder / names.REPORT_PAGE
+        self._upload(names.REPORT_FOLDER, folder, [path for path in files if path != page])
+        # Last: a page whose figures are missing would be half a report.
+        self._upload(names.REPORT_FOLDER, folder, [page] if page.is_file() else [])
+
+
+def _marked(path: Path) -> Path:
+    return path.with_name(f".{path.name}.tag")
+
+
+def _mark(path: Path, tag: Tag) -> None:
+    """Note which content of an object a local file has."""
+    found = path.stat()
+    _marked(path).write_text(repr((tag, found.st_size, found.st_mtime_ns)), encoding="utf-8")
+
+
+def _differs(path: Path, item: Listed) -> bool:
+    """Whether a local file is missing, or is not the content that an object has."""
+    try:
+        found = path.stat()
+        noted = _marked(path).read_text(encoding="utf-8")
+    except OSError:
+        return True
+    return noted != repr((item.tag, found.st_size, found.st_mtime_ns))
