@@ -10,7 +10,7 @@ import argparse
 from rich.console import Console
 from rich.table import Table
 
-from tests.benchmarks import dqn, ppo, workload
+from tests.benchmarks import dqn, objects, ppo, workload
 from tests.benchmarks.service import rows as service
 
 
@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--env-steps", type=int, default=workload.NUM_ENV_STEPS, help="of each of the 20 trials")
     parser.add_argument("--dqn-env-steps", type=int, default=dqn.NUM_ENV_STEPS, help="of each DQN trial")
-    parser.add_argument("--only", choices=["ppo", "many", "dqn", "service"], help="these rows alone")
+    parser.add_argument("--only", choices=["ppo", "many", "dqn", "service", "objects"], help="these rows alone")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--hours", type=float, default=24.0, help="of the service, simulated at speed")
     options = parser.parse_args()
@@ -33,6 +33,8 @@ def main() -> None:
         rows += dqn.rows(options.repeats, options.dqn_env_steps, peers=not options.no_peers)
     if options.only in (None, "service"):
         rows += service.rows(options.repeats, options.hours)
+    if options.only in (None, "objects"):
+        rows += objects.rows(options.repeats)
     table = Table(title=f"{ppo.machine_name()}, medians of {options.repeats}")
     for column in ("figure", "measured", "at most / at least"):
         table.add_column(column)
