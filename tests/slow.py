@@ -18,6 +18,7 @@ SLOW = {
         "the same, packed",
     "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[packed-drain]":
         "the same, rllib",
+    "tests/cluster/test_detached_sweeps.py": "tests/unit/test_detached.py, and tests/unit/test_jobs.py",
     "tests/learning/test_learning.py::test_dqn_learns_cartpole": _LEARN,
     "tests/learning/test_learning.py::test_ppo_learns_pendulum": _LEARN,
     "tests/learning/test_packed_dqn_learning.py::test_a_pack_of_dqn_trials_solves_cartpole": _LEARN,
@@ -25,6 +26,8 @@ SLOW = {
     "tests/package/test_docker.py": "tests/package/test_docker_files.py, and test_wheel.py for what is installed",
     "tests/ray/test_baseline_sweeps.py": "tests/integration/test_baseline_sweeps.py",
     "tests/ray/test_chosen_points.py::test_it_is_chosen_if_it_is_the_best_and_confirmed": "the others of its file",
+    "tests/ray/test_chosen_points.py::test_its_values_act_in_each_of_its_seeds_and_the_others_stay_as_they_are[rllib]":
+        "the same, packed",
     "tests/ray/test_confirming.py::test_an_interrupted_race_goes_on_as_it_would_have": "tests/ray/test_more_seeds.py",
     "tests/ray/test_confirming.py::test_more_samples_are_confirmed_anew_and_old_sweeps_are_left_alone":
         "tests/ray/test_more_seeds.py",

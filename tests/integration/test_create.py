@@ -130,13 +130,13 @@ def test_a_machine_that_is_too_small_is_refused_at_once(tmp_path: Path, monkeypa
 def test_a_launch_in_a_thread_leaves_nothing_if_nothing_began(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: CannotRunError | SweepInterrupted, begins: bool
 ) -> None:
-    def drive(folder: Path, **_: object) -> None:
-        store = SweepStore(folder)
+    def resume(place: str, **_: object) -> None:
+        store = SweepStore(Path(place))
         if begins:
             store.write_record(store.read_record().model_copy(update={"state": "interrupted"}))
         raise error
 
-    monkeypatch.setattr(verbs, "drive", drive)
+    monkeypatch.setattr(verbs, "resume", resume)
     with ThreadPoolExecutor(1) as pool, pytest.raises(type(error)):
         pool.submit(tune_jobs.launch, SPEC, name="mine", storage=tmp_path).result()
     assert (tmp_path / "mine").exists() == begins

@@ -52,6 +52,7 @@ def test_a_client_server_that_dies_every_time_is_an_error(monkeypatch: pytest.Mo
     def init(address: str, **_: Any) -> None:
         raise ConnectionAbortedError(FORK_FAILURE)
 
+    monkeypatch.setattr(cluster, "check_is_ray", lambda _: None)
     monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
     with pytest.raises(CannotRunError, match="cannot be joined: Initialization failure from server"):
         cluster._join("ray://host:10001")
@@ -65,6 +66,7 @@ def test_a_refused_token_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         os.write(2, b"W gcs_client.cc:210: Failed to get cluster ID: InvalidAuthToken: token is missing or incorrect\n")
         raise ConnectionError("Failed to connect")
 
+    monkeypatch.setattr(cluster, "check_is_ray", lambda _: None)
     monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
     with pytest.raises(CannotRunError, match="does not accept this machine's token"):
         cluster._join("host:6379")

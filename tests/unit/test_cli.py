@@ -23,7 +23,7 @@ HEAVY = ("ray", "torch", "pandas", "matplotlib", "imageio", "PIL")
 
 def options(**given: Any) -> dict[str, Any]:
     """What the commands that run trials pass on, unless told otherwise."""
-    return {"storage": None, "address": None, "finish": True, "progress": "auto", **given}
+    return {"storage": None, "address": None, "finish": True, "progress": "auto", "wait_for_nodes": 0.0, **given}
 
 
 LAUNCHED = {"overrides": ("a.b=1", "c=2"), "name": "n"}

@@ -14,7 +14,15 @@ Call = tuple[str, tuple[Any, ...], dict[str, Any]]
 
 COMPARED = {"objective": None, "top": 3, "html": None, "storage": None}
 EXPORTED = {"output": None, "top": None, "storage": None}
-REPLICATED = {"top": 5, "seeds": 5, "storage": None, "address": None, "finish": True, "progress": "auto"}
+REPLICATED = {
+    "wait_for_nodes": 0.0,
+    "top": 5,
+    "seeds": 5,
+    "storage": None,
+    "address": None,
+    "finish": True,
+    "progress": "auto",
+}
 REPRODUCED = {"output": None, "progress": "auto", "storage": None}
 COMMANDS: list[tuple[str, Call]] = [
     ("compare mine other", ("compare", (["mine", "other"],), COMPARED)),
@@ -38,7 +46,15 @@ COMMANDS: list[tuple[str, Call]] = [
         (
             "replicate",
             ("mine",),
-            {"top": 3, "seeds": 2, "storage": "s", "address": "auto", "finish": False, "progress": "none"},
+            {
+                "top": 3,
+                "seeds": 2,
+                "storage": "s",
+                "address": "auto",
+                "finish": False,
+                "progress": "none",
+                "wait_for_nodes": 0.0,
+            },
         ),
     ),
     ("reproduce mine/t0001", ("reproduce", ("mine/t0001",), REPRODUCED)),

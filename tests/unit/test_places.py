@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from fake_sweeps import BEST, SWEEP, TRIALS
 
 from analysis.wording import shown_part, shown_path
-from policies.errors import CannotRunError, SpecError
+from policies.errors import SpecError
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.output import show_result, show_status
 from tune_jobs.service.config import ServiceConfig
@@ -252,7 +252,5 @@ def test_tokens_are_in_the_folder_of_such_a_service(tmp_path: Path, monkeypatch:
     assert not (tmp_path / "s3:").exists()
 
 
-def test_a_place_without_a_store_is_told() -> None:
-    for open_it in (open_storage, open_sweep):
-        with pytest.raises(CannotRunError, match="s3://b/p"):
-            open_it("s3://b/p")
+def test_a_url_is_opened_without_a_request_and_says_its_place() -> None:
+    assert [open_it("s3://b/p").place for open_it in (open_storage, open_sweep)] == ["s3://b/p"] * 2
