@@ -39,6 +39,8 @@ SLOW = {
         "the same, packed",
     "tests/ray/test_pack_interruption.py::test_members_go_on_from_their_checkpoints_after_a_kill_and_an_interruption":
         "`make kills`, and tests/ray/test_interruption.py",
+    "tests/ray/test_schedulers.py::test_a_trial_without_a_finite_score_never_runs_on[hyperband]":
+        "the same, asha, and tests/ray/test_hyperband.py",
     "tests/ray/test_schedulers.py::test_every_scheduler_runs_to_the_end[hyperband]": "tests/ray/test_hyperband.py",
     "tests/ray/test_repetitions.py::test_a_trial_comes_to_the_same_by_itself[rllib]": "the same, packed",
     "tests/ray/test_resumed_rewards.py::test_the_statistics_of_a_resumed_trial_are_of_all_its_env_steps[rllib]":
