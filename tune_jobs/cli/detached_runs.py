@@ -114,13 +114,7 @@ def _show(begun: DetachedSweep, state: str, *, storage: str | None, as_json: boo
             "state": state.lower(), "commands": commands,
         })  # fmt: skip
         return
-    told = (
-        "runs"
-        if state == "RUNNING"
-        else "has run already"
-        if state not in ("PENDING", "RUNNING")
-        else "has not begun yet"
-    )
+    told = {"RUNNING": "runs", "PENDING": "has not begun yet"}.get(state, "has run already")
     click.echo(f"{begun.name}: job {begun.job.id} at {begun.job.address} {told}; this terminal is not needed any more.")
     for verb, command in commands.items():
         click.echo(f"  {verb:8}{command}")

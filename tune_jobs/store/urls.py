@@ -14,7 +14,7 @@ import re
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
-URL_SCHEMES = ("s3", "gs", "az", "abfs")
+URL_SCHEMES = ("s3", "gs", "az")
 """The schemes of the object stores there are."""
 
 _URL = re.compile(rf"({'|'.join(URL_SCHEMES)})://", re.IGNORECASE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
@@ -14,6 +15,7 @@ from tune_jobs.ray_tune.jobs import Job
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import name_for_commands
 from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
@@ -51,17 +53,17 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
         raise CannotRunError(
             f"Sweep {store.name} was removed while it was shown.", "List the others: `tune-jobs list`."
         )
-    record = store.read_record()
+    record, named = store.read_record(), shlex.quote(name_for_commands(store))
     if record.job is not None and job is not None and job.has_ended and not ran(job):
-        raise failure_of(store.name, record.job, job)
+        raise failure_of(store, record.job, job)
     if record.state == "created":
         raise CannotRunError(
-            f"Sweep {store.name} has not begun, and nothing runs it.", f"Run it with `tune-jobs resume {store.name}`."
+            f"Sweep {store.name} has not begun, and nothing runs it.", f"Run it with `tune-jobs resume {named}`."
         )
     if record.state == "running":
         raise CannotRunError(
             f"The process that ran sweep {store.name} has ended without finishing it.",
-            f"What is done is kept; continue with `tune-jobs resume {store.name}`.",
+            f"What is done is kept; continue with `tune-jobs resume {named}`.",
         )
     return _result(store, record, job)
 
@@ -183,7 +185,8 @@ def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
     page = store.current_report() if is_whole else None
     if page is not None:
         artifacts["report"] = page
-    why = f"none was chosen. `tune-jobs best {store.name}` does it, or says why not"
+    named = shlex.quote(name_for_commands(store))
+    why = f"none was chosen. `tune-jobs best {named}` does it, or says why not"
     return SweepResult(
         store.place,
         record,

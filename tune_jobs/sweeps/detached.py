@@ -17,7 +17,7 @@ from policies.guard.guard import guarding
 from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.ray_tune.jobs import Job, JobsApi, JobState, check_jobs_address
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import open_sweep
+from tune_jobs.store.opening import name_for_commands, open_sweep
 from tune_jobs.sweeps.create import removed_if_not_begun, write_created
 from tune_jobs.sweeps.own_job import environment_of, version_here
 from tune_jobs.sweeps.storage import stem_of, storage_place
@@ -116,7 +116,8 @@ def go_on_detached(
     address = check_jobs_address(address)
     store = find_sweep(sweep, storage)
     record = store.read_record()
-    watch = f"Watch it with `tune-jobs attach {store.name}`, or end it with `tune-jobs stop {store.name}`."
+    named = shlex.quote(name_for_commands(store))
+    watch = f"Watch it with `tune-jobs attach {named}`, or end it with `tune-jobs stop {named}`."
     if store.is_driven():
         raise CannotRunError(f"Sweep {store.name} is being run by another process.", watch)
     before = None if record.job is None else job_now(record.job)
@@ -150,7 +151,7 @@ def wait_until_begun(detached: DetachedSweep, *, timeout_s: float = _BEGIN_S) ->
             if found is not None and found.has_ended:
                 if not ran(found):
                     _forget(store)
-                    raise failure_of(store.name, detached.job, found)
+                    raise failure_of(store, detached.job, found)
                 return state
             record = store.read_record()
             if record.job == detached.job and record.state not in ("created", "completed") and store.is_driven():
@@ -180,16 +181,18 @@ def told_of(job: Job | None) -> str:
     return "ended" if job.has_ended and ran(job) else job.status.lower()
 
 
-def failure_of(name: str, job: JobRecord, found: Job) -> TuneJobsError:
+def failure_of(store: Sweep, job: JobRecord, found: Job) -> TuneJobsError:
     """Return the error that a job ended with: its own words, where it has said some."""
     said, hint = _said(found.message or "")
-    again = f"Continue with `tune-jobs resume {shlex.quote(name)} --address {job.address} --detach`."
+    again = (
+        f"Continue with `tune-jobs resume {shlex.quote(name_for_commands(store))} --address {job.address} --detach`."
+    )
     kind = {2: SpecError, 4: NotFoundError}.get(found.driver_exit_code or 0, CannotRunError)
     if found.driver_exit_code == NotFoundError.exit_code:
         kind, hint = CannotRunError, "The storage folder has to be the same on this machine and on the cluster's nodes."
     elif found.driver_exit_code == 127:
         hint = "tune-jobs has to be installed on the cluster's head, and to be found on its PATH."
-    return kind(f"Job {job.id} of sweep {name}, at {job.address}, failed: {said}", hint or again)
+    return kind(f"Job {job.id} of sweep {store.name}, at {job.address}, failed: {said}", hint or again)
 
 
 def cancel_waiting(store: Sweep) -> bool:

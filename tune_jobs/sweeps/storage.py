@@ -90,17 +90,14 @@ def _folder_named(found: re.Match[str]) -> str:
 
 def _refuse_secrets(scheme: str, url: re.Match[str]) -> None:
     """Raise an error if there may be credentials in a URL; it repeats nothing of it."""
-    account, at, _ = url["bucket"].rpartition("@")
     if ":" in url["bucket"]:
         # A secret may have a slash in it, so that its end stands in what looks like the prefix.
         raise SpecError(
             f"The {scheme}:// URL has a colon where its bucket is named: credentials, or a port.",
             f"{_WITHOUT_SECRETS} A server's address is a setting: {scheme}://BUCKET/PREFIX?endpoint=http://HOST:PORT.",
         )
-    # With Azure a container may stand before the account: abfs://container@account.
-    is_container = scheme in ("az", "abfs") and account != ""
     names = [name for name, value in parse_qsl(url["query"] or "") if _SECRET.search(name) or "@" in value]
-    if (at and not is_container) or names:
+    if "@" in url["bucket"] or names:
         where = f"in its settings ({', '.join(map(repr, names))})" if names else "before its bucket"
         raise SpecError(f"The {scheme}:// URL has credentials {where}.", _WITHOUT_SECRETS)
 

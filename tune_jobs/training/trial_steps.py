@@ -191,6 +191,8 @@ class TrialSteps:
             return  # nothing was trained since the copy, which is on disk; the last score belongs to other weights
         if self.iteration and not (self._checkpoints and self._checkpoints[-1].iteration == self.iteration):
             self._checkpoint(self._last.evaluation_return)
+        # Whoever goes on with it may do so before this process has brought it to a store that is far away.
+        self._store.settle()
 
     def before_iteration(self, *, stop: bool) -> Progress | None:
         """Return how the trial ended, or None if it continues; if asked to stop, it saves and pauses."""

@@ -273,10 +273,11 @@ class ObjectTrial:
         if prefix:
             name = f"{prefix}{path.name}"
             target = f"{self._folder}/{names.DAMAGED_FOLDER}/{name}"
-            for item in self._parts.bucket.listed(f"{self._copy_prefix(number)}/"):
+            source = f"{self._copy_prefix(number)}/"
+            for item in self._parts.bucket.listed(source):
                 found = self._parts.bucket.get(item.key)
                 if found is not None:
-                    self._parts.bucket.put(f"{target}/{item.key.rpartition('/')[2]}", found.data)
+                    self._parts.bucket.put(f"{target}/{item.key.removeprefix(source)}", found.data)
             self.remove_copies([copy for copy in self._copies() if copy != number])
             return f"{names.DAMAGED_FOLDER}/{name}"
         return f"{names.DAMAGED_FOLDER}/{self._state.set_aside(number)}"
@@ -296,7 +297,7 @@ class ObjectTrial:
     # -- its curves, log and tally
 
     def append_events(self, name: str, data: bytes) -> None:
-        """Append to one of the trial's event files: the objects of one name, in their order, are the file."""
+        """Append to one of the trial's event files, which is uploaded whole from time to time."""
         self._parts.append(f"{self._folder}/{names.EVENTS_FOLDER}/{Path(name).name}", data)
 
     @property

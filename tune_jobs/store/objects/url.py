@@ -8,8 +8,8 @@ from typing import Self
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
 
 from policies.errors import SpecError
+from tune_jobs.store.urls import URL_SCHEMES
 
-SCHEMES = ("s3", "gs", "az")
 _SETTINGS = {"s3": ("endpoint", "region"), "gs": ("endpoint",), "az": ("account", "endpoint")}
 
 
@@ -41,9 +41,10 @@ class ObjectUrl:
                 "Leave them out: they come from the environment (AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, say) "
                 "or from the machine's role.",
             )
-        if parts.scheme not in SCHEMES:
+        if parts.scheme not in URL_SCHEMES:
             raise SpecError(
-                f"{text!r} is not the address of an object store.", f"Begin it with {_or(f'{s}://' for s in SCHEMES)}."
+                f"{text!r} is not the address of an object store.",
+                f"Begin it with {_or(f'{s}://' for s in URL_SCHEMES)}.",
             )
         if not parts.netloc:
             raise SpecError(f"{text!r} names no bucket.", f"Write {parts.scheme}://BUCKET/PREFIX.")
