@@ -22,7 +22,9 @@ from policies.errors import CannotRunError
 from tune_jobs.service.logs import Redaction
 
 BUSY_TIMEOUT_S = 10.0
-"""How long a call waits for another one that writes."""
+"""How long a call waits for another process that writes."""
+TURN_TIMEOUT_S = 20.0
+"""How long a thread waits for its turn at a file that others of its process use."""
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
@@ -61,7 +63,7 @@ def open_database(url: str) -> Engine:
             )
         # SQLite lets one transaction at a time write, and whoever waits for it looks now and then, and may find it
         # taken each time: threads of this process queue for one connection instead.
-        one: dict[str, Any] = {"pool_size": 1, "max_overflow": 0, "pool_timeout": 2 * BUSY_TIMEOUT_S}
+        one: dict[str, Any] = {"pool_size": 1, "max_overflow": 0, "pool_timeout": TURN_TIMEOUT_S}
         engine = create_engine(parsed, pool_pre_ping=True, hide_parameters=True, **(one if _is_in_file(parsed) else {}))
     except (ArgumentError, NoSuchModuleError, ValueError) as error:
         raise CannotRunError(
