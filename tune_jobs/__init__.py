@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 from tune_jobs.process import own_packages as _own_packages
 
 if TYPE_CHECKING:
-    from policies.acting.load import load_policy as load_policy
     from policies.envs.modules import allow_modules as allow_modules
     from policies.errors import TuneJobsError as TuneJobsError
     from tune_jobs.spec.file import list_presets as list_presets
     from tune_jobs.spec.file import load_spec as load_spec
     from tune_jobs.spec.sweep_spec import SweepSpec as SweepSpec
     from tune_jobs.sweeps.interrupted import SweepInterrupted as SweepInterrupted
+    from tune_jobs.sweeps.loading import load_policy as load_policy
     from tune_jobs.sweeps.verbs import CreatedSweep as CreatedSweep
     from tune_jobs.sweeps.verbs import SweepResult as SweepResult
     from tune_jobs.sweeps.verbs import SweepStatus as SweepStatus
@@ -54,7 +54,7 @@ _SWEEPS = (
 _HOME = {
     "TuneJobsError": "policies.errors",
     "allow_modules": "policies.envs.modules",
-    "load_policy": "policies.acting.load",
+    "load_policy": "tune_jobs.sweeps.loading",
     "SweepInterrupted": "tune_jobs.sweeps.interrupted",
     "SweepSpec": "tune_jobs.spec.sweep_spec",
     "list_presets": "tune_jobs.spec.file",

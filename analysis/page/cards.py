@@ -127,7 +127,7 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
             interval = mean_with_ci(confirmation.returns, rng=rng)
         if _have_mean(random.returns) and random.seeds == confirmation.seeds:
             gain = paired_difference(confirmation.returns, random.returns, rng=rng)
-    # Of a sweep in an object store the sweep is what can be named: its best is what is evaluated.
+    # Of a sweep in an object store the sweep is what can be named: its best is what is evaluated and loaded.
     policy = shown_path(place if "://" in place else Path(place, "best", "policy.json"))
     return {
         "trial_id": best.checkpoint.trial_id,

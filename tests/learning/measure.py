@@ -17,7 +17,7 @@ from tune_jobs.spec.file import Preset, find_preset
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import read_results
 from tune_jobs.sweeps import verbs as sweeps
-from tune_jobs.sweeps.conclude import find_sweep
+from tune_jobs.sweeps.sources import find_sweep
 
 
 @dataclass(frozen=True)

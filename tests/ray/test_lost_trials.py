@@ -12,8 +12,9 @@ from policies.errors import CannotRunError, CheckpointError
 from tune_jobs.ray_tune.failures import going_on
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.processes import RayWatch
-from tune_jobs.ray_tune.run_trials import RunJob, _TrialEvents, run_trials
+from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 from tune_jobs.ray_tune.trainable import TrialTrainable, watchdog
+from tune_jobs.ray_tune.tune_events import TrialEvents
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.record_keeper import RecordKeeper
 
@@ -37,7 +38,7 @@ def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path: Pat
     keeper = RecordKeeper(store, ["t0000", "t0001"], lambda record: None)
     # Of a Ray that lives: no part of it is silent.
     losses = NodeLosses(lambda trial: 0, lambda error: None)
-    events = _TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0), losses)
+    events = TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0), losses)
     for trial_id, cause in (("t0000", OwnershipLostError("taken")), ("t0001", ValueError("broke"))):
         keeper.started(trial_id)
         losses._errors[trial_id] = RayTaskError("step", "a traceback", cause)

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 from fake_sweeps import run, sweeps
-from s3_faults import faults
+from s3_faults import faults, opened, url
 from store_parts import another, harness, sweep, trial
 
-__all__ = ["another", "faults", "harness", "in_double", "run", "sweep", "sweeps", "trial"]
+__all__ = ["another", "faults", "harness", "in_double", "opened", "run", "sweep", "sweeps", "trial", "url"]
 
 
 @pytest.fixture

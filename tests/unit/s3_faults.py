@@ -6,6 +6,7 @@ It runs in the process of the test. Requests are passed on as they are; the serv
 import contextlib
 import http.client
 import re
+import secrets
 import socket
 import threading
 import time
@@ -18,6 +19,8 @@ import pytest
 from s3_server import s3_endpoint
 
 from tune_jobs.store.objects import asked, bucket, outbox, owners, trial_state
+from tune_jobs.store.objects.object_sweep import ObjectSweep
+from tune_jobs.store.objects.url import ObjectUrl
 
 
 @dataclass
@@ -223,3 +226,23 @@ def faults(monkeypatch: pytest.MonkeyPatch) -> Iterator[Faults]:
     made = Faults()
     yield made
     made.clear()
+
+
+@pytest.fixture
+def url(faults: Faults) -> ObjectUrl:
+    return ObjectUrl("s3", "sweeps", f"{secrets.token_hex(4)}/mine", {"endpoint": faults.endpoint})
+
+
+Opened = Callable[[], ObjectSweep]
+"""Opens the sweep as another process does."""
+
+
+@pytest.fixture
+def opened(url: ObjectUrl) -> Opened:
+    """The sweep as another process opens it."""
+    return lambda: ObjectSweep(url)
+
+
+def iterations(opened: Opened) -> list[int]:
+    """The results that another process sees."""
+    return [record.iteration for record in opened().trial("t0000").read_iterations()]

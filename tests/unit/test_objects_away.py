@@ -1,7 +1,6 @@
 """What asks a store often, holds its lock or keeps files of it nearby, while the store or the machine fails."""
 
 import os
-import secrets
 import signal
 import subprocess
 import sys
@@ -23,11 +22,6 @@ from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.urls import join_place, name_of_place, outer_place
 
 WORDS = ("It is held.", "Wait.")
-
-
-@pytest.fixture
-def url(faults: Faults) -> ObjectUrl:
-    return ObjectUrl("s3", "sweeps", f"{secrets.token_hex(4)}/mine", {"endpoint": faults.endpoint})
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.narrowing import present
-from tune_jobs.store import contract, names, trial_contract
+from tune_jobs.store import contract, names, pack_contract, trial_contract
 
 ROOT = Path(__file__).parents[2]
 SOURCES = [path for path in sorted((ROOT / "tune_jobs").rglob("*.py")) if "store" not in path.relative_to(ROOT).parts]
@@ -25,7 +25,7 @@ FILE = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(FILES, key=len, 
 # The paths that a store hands out, and what they are called elsewhere.
 HANDED_OUT = {
     node.name
-    for module in (contract, trial_contract)
+    for module in (contract, trial_contract, pack_contract)
     for node in ast.walk(ast.parse(Path(present(module.__file__)).read_text()))
     if isinstance(node, ast.FunctionDef) and node.returns is not None and "Path" in ast.unparse(node.returns)
 } | {"folder", "place", "sweep_place", "storage"}

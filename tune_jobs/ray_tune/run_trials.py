@@ -22,7 +22,7 @@ from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
-from tune_jobs.ray_tune.failures import describe_failure, going_on, was_lost
+from tune_jobs.ray_tune.failures import going_on
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -32,13 +32,13 @@ from tune_jobs.ray_tune.reporter import reporter
 from tune_jobs.ray_tune.scheduling import EveryoneGoesOn
 from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
+from tune_jobs.ray_tune.tune_events import PackEvents, TrialEvents, pack_id_of, trial_id_of
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
 from tune_jobs.store.opening import name_for_commands, open_sweep
-from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 
 # How long running trials may take to save a checkpoint after they were asked to stop, before they are ended.
@@ -156,8 +156,8 @@ class _Run:
         choose = None if self._chooser is None else self._chooser.prepare
         rule = self._scheduler.scheduler
         driver = PackDriver(self._store, self._spec, plan, trial_ids, scheduler=rule, keeper=self.keeper, choose=choose)
-        losses = NodeLosses(lambda trial: driver.reached(_pack_id(trial)), self._watch.check_after)
-        events = _PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch, losses)
+        losses = NodeLosses(lambda trial: driver.reached(pack_id_of(trial)), self._watch.check_after)
+        events = PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch, losses)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
         tuner = tune.Tuner(
             tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
@@ -170,7 +170,7 @@ class _Run:
                 "num_env_processes": plan.num_env_processes,
             },
             tune_config=tune.TuneConfig(
-                scheduler=PackScheduler(driver), trial_name_creator=_pack_id, trial_dirname_creator=_pack_id
+                scheduler=PackScheduler(driver), trial_name_creator=pack_id_of, trial_dirname_creator=pack_id_of
             ),
             # The driver decides which of a dead pack's trials are retried, and the run ends when none is left.
             run_config=self._run_config(folder, events, -1, lambda: driver.is_finished),
@@ -183,7 +183,7 @@ class _Run:
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
         losses = NodeLosses(self._reached, self._watch.check_after)
-        events = _TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
+        events = TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
         searcher = None
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
@@ -199,8 +199,8 @@ class _Run:
                 # Without this setting Tune runs one trial at a time if there is a searcher.
                 max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
                 reuse_actors=True,
-                trial_name_creator=_trial_id,
-                trial_dirname_creator=_trial_id,
+                trial_name_creator=trial_id_of,
+                trial_dirname_creator=trial_id_of,
             ),
             run_config=self._run_config(folder, events, spec.max_retries),
         )
@@ -208,7 +208,7 @@ class _Run:
             tuner.fit()
 
     def _reached(self, trial: Trial) -> int:
-        return max(self._store.trial(_trial_id(trial)).checkpoint_iterations(), default=0)
+        return max(self._store.trial(trial_id_of(trial)).checkpoint_iterations(), default=0)
 
     def _run_config(
         self, name: str, events: tune.Callback, max_failures: int, is_finished: Callable[[], bool] = lambda: False
@@ -224,14 +224,6 @@ class _Run:
             checkpoint_config=tune.CheckpointConfig(checkpoint_frequency=0, checkpoint_at_end=False),
             callbacks=[events],
         )
-
-
-def _trial_id(trial: Trial) -> str:
-    return str(trial.config["trial_id"])
-
-
-def _pack_id(trial: Trial) -> str:
-    return str(trial.config["pack_id"])
 
 
 def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
@@ -253,7 +245,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         self._is_finished = is_finished
         self._asked_at: float | None = None
 
-    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:
+    def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:  # noqa: ARG002 (the signature of Tune's stoppers)
         return False
 
     def stop_all(self) -> bool:
@@ -270,127 +262,6 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
                 return False
             self._asked_at = time.monotonic()
         return not self._keeper.running or time.monotonic() - self._asked_at > STOP_GRACE_S
-
-
-class _TrialEvents(tune.Callback):  # type: ignore[misc]
-    """Tells the keeper of records what Tune does with the trials."""
-
-    def __init__(
-        self, store: Sweep, keeper: RecordKeeper, timeout_s: float, watch: RayWatch, losses: NodeLosses
-    ) -> None:
-        self._store = store
-        self._keeper = keeper
-        self._timeout_s = timeout_s
-        self._losses = losses
-        self._watch = watch
-
-    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note that a process has begun the trial."""
-        self._keeper.started(_trial_id(trial))
-
-    def on_trial_result(
-        self,
-        iteration: int,
-        trials: list[Trial],
-        trial: Trial,
-        result: dict[str, Any],
-        **info: Any,
-    ) -> None:
-        """Take a trial's report, which comes about once a second and after each evaluation."""
-        progress = Progress.model_validate(result["progress"])
-        self._keeper.progressed(_trial_id(trial), progress, node=result["node"], pid=result["pid"])
-
-    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
-        """Note paused trials, which schedulers do not report; they have saved and need not be waited for."""
-        for trial in trials:
-            trial_id = _trial_id(trial)
-            if trial.status == Trial.PAUSED and trial_id in self._keeper.running:
-                self._keeper.paused(trial_id)
-        self._keeper.flush()
-
-    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note a trial's end: its own, the scheduler's decision, or the end of the run."""
-        self._keeper.ended(_trial_id(trial))
-
-    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note a failure that will be retried."""
-        self._failed(trial, retried=True)
-
-    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note a failure that will not be retried."""
-        self._failed(trial, retried=False)
-
-    def _failed(self, trial: Trial, *, retried: bool) -> None:
-        trial_id, error = _trial_id(trial), self._losses.error_of(trial)
-        if was_lost(error):
-            self._keeper.lost(trial_id)
-            return
-        if left := self._losses.take(trial):
-            self._keeper.moved(trial_id, left)
-            return
-        self._watch.check_after(error)
-        message = describe_failure(error, self._store.trial(trial_id).log_tail(), timeout_s=self._timeout_s)
-        self._keeper.failed(trial_id, message, retried=retried)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Tune pickles its callbacks into a file that is never read back here; listeners and open files can't be.
-        return {}
-
-
-class _PackEvents(tune.Callback):  # type: ignore[misc]
-    """Tells the driver of the packs what happens to their processes."""
-
-    def __init__(
-        self, driver: PackDriver, keeper: RecordKeeper, timeout_s: float, watch: RayWatch, losses: NodeLosses
-    ) -> None:
-        self._losses = losses
-        self._watch = watch
-        self._driver = driver
-        self._keeper = keeper
-        self._timeout_s = timeout_s
-
-    def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note that the pack's process runs."""
-        self._driver.started(_pack_id(trial))
-
-    def on_trial_result(
-        self,
-        iteration: int,
-        trials: list[Trial],
-        trial: Trial,
-        result: dict[str, Any],
-        **info: Any,
-    ) -> None:
-        """Drop the report, which the scheduler has taken, so that Tune does not keep it."""
-        del result["reports"]
-
-    def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
-        """Do the work that packs need not wait for, now that they continue."""
-        self._keeper.flush()
-
-    def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note the end of the pack's process: it has nothing to do, or the run ends."""
-        self._driver.closed(_pack_id(trial))
-
-    def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note that the pack's process died; Tune starts another one."""
-        pack_id, tail, error = _pack_id(trial), self._driver.log_tail(_pack_id(trial)), self._losses.error_of(trial)
-        if was_lost(error):
-            self._driver.lost(pack_id)
-            return
-        if left := self._losses.take(trial):
-            self._driver.moved(pack_id, left)
-            return
-        self._watch.check_after(error)
-        self._driver.died(pack_id, describe_failure(error, tail, timeout_s=self._timeout_s, what="pack"))
-
-    def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
-        """Note that the pack's process died too often."""
-        self.on_trial_recover(iteration, trials, trial)
-        self._driver.closed(_pack_id(trial))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {}
 
 
 def _give_up(run: _Run, death: RayDiedError) -> None:

@@ -40,27 +40,11 @@ from typing import Protocol
 
 from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
 from policies.portable.file import PortablePolicy
-from tune_jobs.store.trial_contract import Assignment, Ownership, Pack, Trial
+from tune_jobs.store.pack_contract import Assignment, Pack
+from tune_jobs.store.probe import Probe
+from tune_jobs.store.trial_contract import Ownership, Trial
 
 __all__ = ["Assignment", "Ownership", "Pack", "Storage", "Sweep", "Trial"]
-
-
-class Probe(Protocol):
-    """A question that other machines answer, where a sweep is."""
-
-    @property
-    def place(self) -> str:
-        """The text that a machine has to pass to `opening.answer`."""
-        ...
-
-    def is_same(self, question: str, machine: str) -> bool:
-        """Whether a machine has read this question, and its answer can be seen here.
-
-        Args:
-            question: The result of `answer` on that machine.
-            machine: The machine's name, as passed to `answer`.
-        """
-        ...
 
 
 class Sweep(Protocol):

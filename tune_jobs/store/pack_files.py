@@ -13,8 +13,9 @@ from policies.files import read_regular, write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.logs import begin_log, log_tail
 from tune_jobs.store.ownership import Owner
+from tune_jobs.store.pack_contract import Assignment
 from tune_jobs.store.places import check_pack_id, check_trial_id, within
-from tune_jobs.store.trial_contract import Assignment, Ownership
+from tune_jobs.store.trial_contract import Ownership
 
 __all__ = ["Assignment", "PackFiles"]
 

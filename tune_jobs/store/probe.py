@@ -12,7 +12,7 @@ import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args
 
 from policies.errors import CannotRunError, said_by
 from policies.files import read_regular, write_atomic
@@ -44,8 +44,26 @@ class FailedOperationError(CannotRunError):
         self.operation, self.reason = operation, reason
 
 
-class Probe:
-    """A question in a sweep's folder.
+class Probe(Protocol):
+    """A question that other machines answer, where a sweep is."""
+
+    @property
+    def place(self) -> str:
+        """The text that a machine has to pass to `opening.answer`."""
+        ...
+
+    def is_same(self, question: str, machine: str) -> bool:
+        """Whether a machine has read this question, and its answer can be seen here.
+
+        Args:
+            question: The result of `answer` on that machine.
+            machine: The machine's name, as passed to `answer`.
+        """
+        ...
+
+
+class FolderProbe:
+    """A question in a sweep's folder; implements `Probe`.
 
     Args:
         folder: The folder of the question and the answers.
@@ -61,12 +79,7 @@ class Probe:
         return str(self._folder)
 
     def is_same(self, question: str, machine: str) -> bool:
-        """Whether a machine has read this question, and its answer can be seen here.
-
-        Args:
-            question: The result of `answer` on that machine.
-            machine: The machine's name, as passed to `answer`.
-        """
+        """Whether a machine has read this question, and its answer can be seen here."""
         try:
             return question == self._token == (self._folder / machine).read_text(encoding="utf-8")
         except OSError:
@@ -74,7 +87,7 @@ class Probe:
 
 
 @contextlib.contextmanager
-def probing(sweep_folder: Path) -> Iterator[Probe]:
+def probing(sweep_folder: Path) -> Iterator[FolderProbe]:
     """Ask a question in a sweep's folder, and remove it with its answers after the block.
 
     Raises:
@@ -86,7 +99,7 @@ def probing(sweep_folder: Path) -> Iterator[Probe]:
     write_atomic(folder / _QUESTION, token)
     try:
         with _locked(folder / _HELD):
-            yield Probe(folder, token)
+            yield FolderProbe(folder, token)
     finally:
         for path in folder.iterdir():
             path.unlink(missing_ok=True)

@@ -45,7 +45,7 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
         CannotRunError: Nothing runs it, and it is not done; or the process that ran it ended without saying so.
         SpecError: The job that was to run it found its arguments wrong.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     job = _follow(store, progress)

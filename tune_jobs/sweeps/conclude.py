@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,51 +21,21 @@ from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
 from policies.portable.file import is_policy_folder, read_policy
-from policies.suggestions import did_you_mean
 from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
-from tune_jobs.store.opening import is_url, name_for_commands, open_storage, open_sweep
-from tune_jobs.store.urls import join_place, outer_place
+from tune_jobs.store.opening import name_for_commands
 from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
 from tune_jobs.sweeps.settings import judged
-from tune_jobs.sweeps.storage import expanded, place_named, split_trial, storage_place
+from tune_jobs.sweeps.sources import find_sweep
+from tune_jobs.sweeps.storage import expanded, split_trial
 from tune_jobs.training.registry import engine_of_checkpoint
 
 # The first seed of `evaluate` if no sweep gives one; it is never one of training, evaluation or confirmation.
 FRESH_SEED = 2**31
-
-
-def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
-    """Find a sweep by its place, or by its name in the storage.
-
-    Raises:
-        NotFoundError: There is no such sweep.
-    """
-    by_place = open_sweep(place_named(sweep))
-    if by_place.exists():
-        return by_place
-    if is_url(by_place.place):
-        raise NotFoundError(
-            f"There is no sweep at {by_place.place}.",
-            f"List the sweeps with `tune-jobs list --storage {shlex.quote(outer_place(by_place.place))}`.",
-        )
-    root = storage_place(storage)
-    if is_url(root):
-        with contextlib.suppress(NotFoundError):  # it may be `SWEEP/TRIAL`
-            store = open_storage(root).sweep(str(sweep))
-            if store.exists():
-                return store
-    elif (store := open_sweep(join_place(root, str(sweep)))).exists():
-        return store
-    known = [item.name for item in open_storage(root).sweeps()]
-    raise NotFoundError(
-        f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
-        "List the sweeps with `tune-jobs list`; name another storage with --storage.",
-    )
 
 
 @guarding()

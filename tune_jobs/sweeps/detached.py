@@ -111,7 +111,7 @@ def go_on_detached(
         SpecError: The address is wrong.
         CannotRunError: A process or a job runs the sweep, or the cluster can't be reached or refuses the job.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     address = check_jobs_address(address)
     store = find_sweep(sweep, storage)

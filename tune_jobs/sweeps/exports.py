@@ -51,7 +51,7 @@ def dataframe(
         NotFoundError: There is no such sweep.
     """
     from analysis.exports.frames import make_frame
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     return make_frame(sweep_data(find_sweep(sweep, storage)), rows)
 
@@ -69,7 +69,7 @@ def study(sweep: str | Path, *, storage: str | Path | None = None) -> optuna.Stu
         SpecError: It is a sweep of population based training, whose trials have no one value of a hyperparameter.
     """
     from tune_jobs.search.study import make_study
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     return make_study(spec_of(store), sweep_data(store), store.name)
@@ -136,7 +136,7 @@ def export(
         SpecError: Several sweeps are given for a table, or the sweep has no form of this kind.
         CannotRunError: A file cannot be written, or a package is not installed.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     names = [sweeps] if isinstance(sweeps, str | Path) else list(sweeps)
     kind = format or _format_of(output)
@@ -193,7 +193,7 @@ def _figure(
     size: tuple[float, float],
 ) -> Figure:
     from analysis.exports.paper import learning_figure
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     if not names:
         raise SpecError("No sweep was given to draw.", "Give one sweep, or several of one environment.")

@@ -29,7 +29,8 @@ def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: 
     Raises:
         NotFoundError: There is no such sweep, or none of its trials can win (the message says why).
     """
-    from tune_jobs.sweeps.conclude import choose_best, find_sweep
+    from tune_jobs.sweeps.conclude import choose_best
+    from tune_jobs.sweeps.sources import find_sweep
 
     return choose_best(find_sweep(sweep, storage), num_episodes)
 

@@ -57,7 +57,7 @@ def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[Tria
         NotFoundError: There is no such sweep.
     """
     from tune_jobs.store.candidates import read_trials
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     return Trials(read_trials(find_sweep(sweep, storage)))
 
@@ -76,7 +76,7 @@ def importance(sweep: str | Path, *, storage: str | Path | None = None) -> WhatM
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     return importance_of(find_sweep(sweep, storage))
 
@@ -98,6 +98,7 @@ def report(sweep: str | Path, *, storage: str | Path | None = None) -> ReportPat
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from tune_jobs.sweeps.conclude import find_sweep, make_report
+    from tune_jobs.sweeps.conclude import make_report
+    from tune_jobs.sweeps.sources import find_sweep
 
     return ReportPath(make_report(find_sweep(sweep, storage)))

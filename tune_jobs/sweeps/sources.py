@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from pathlib import Path
 
@@ -10,9 +11,38 @@ from policies.errors import NotFoundError
 from policies.suggestions import did_you_mean
 from tune_jobs.store.candidates import read_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands, sweep_of_trial
-from tune_jobs.store.urls import name_of_place
-from tune_jobs.sweeps.storage import place_named, split_trial
+from tune_jobs.store.opening import is_url, name_for_commands, open_storage, open_sweep, sweep_of_trial
+from tune_jobs.store.urls import join_place, name_of_place, outer_place
+from tune_jobs.sweeps.storage import place_named, split_trial, storage_place
+
+
+def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
+    """Find a sweep by its place, or by its name in the storage.
+
+    Raises:
+        NotFoundError: There is no such sweep.
+    """
+    by_place = open_sweep(place_named(sweep))
+    if by_place.exists():
+        return by_place
+    if is_url(by_place.place):
+        raise NotFoundError(
+            f"There is no sweep at {by_place.place}.",
+            f"List the sweeps with `tune-jobs list --storage {shlex.quote(outer_place(by_place.place))}`.",
+        )
+    root = storage_place(storage)
+    if is_url(root):
+        with contextlib.suppress(NotFoundError):  # it may be `SWEEP/TRIAL`
+            store = open_storage(root).sweep(str(sweep))
+            if store.exists():
+                return store
+    elif (store := open_sweep(join_place(root, str(sweep)))).exists():
+        return store
+    known = [item.name for item in open_storage(root).sweeps()]
+    raise NotFoundError(
+        f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
+        "List the sweeps with `tune-jobs list`; name another storage with --storage.",
+    )
 
 
 def find_source(source: str | Path, storage: str | Path | None = None) -> tuple[Sweep, str | None]:
@@ -24,8 +54,6 @@ def find_source(source: str | Path, storage: str | Path | None = None) -> tuple[
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
-
     place = place_named(source)
     if (of_trial := sweep_of_trial(place)) is not None:
         return of_trial, name_of_place(place)

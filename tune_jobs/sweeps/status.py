@@ -168,7 +168,7 @@ def status(sweep: str | Path, *, storage: str | Path | None = None) -> SweepStat
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     return _status(find_sweep(sweep, storage))
 

@@ -101,7 +101,7 @@ def drive(
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
         SweepInterrupted: In the same cases as `launch`; what was created is kept.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     where = store.read_record().address if address is None else address
@@ -231,8 +231,8 @@ def resume(
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
         SweepInterrupted: In the same cases as `launch`.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.resume import go_on
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     return go_on(
@@ -269,8 +269,8 @@ def extend(
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
         SweepInterrupted: In the same cases as `launch`. `resume` goes on; this again would add as many samples more.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.resume import go_on
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     return go_on(
@@ -312,8 +312,8 @@ def inject(
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
         SweepInterrupted: In the same cases as `launch`.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.resume import go_on
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     return go_on(store, address, point=point, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes)
@@ -358,8 +358,8 @@ def replicate(
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
         SweepInterrupted: In the same cases as `launch`.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
     from tune_jobs.sweeps.replicate import run_race
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     return run_race(
@@ -374,7 +374,7 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
     Returns:
         Whether a process runs the sweep, or was about to: a job that has not begun with it is ended.
     """
-    from tune_jobs.sweeps.conclude import find_sweep
+    from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(sweep, storage)
     if not store.is_driven():

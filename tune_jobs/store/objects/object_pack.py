@@ -1,4 +1,4 @@
-"""A pack in an object store; see `trial_contract.Pack`."""
+"""A pack in an object store; see `pack_contract.Pack`."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.owners import ObjectOwner
 from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.pack_contract import Assignment
 from tune_jobs.store.places import check_pack_id, check_trial_id
-from tune_jobs.store.trial_contract import Assignment, Ownership
+from tune_jobs.store.trial_contract import Ownership
 
 _READ_EVERY_S = 0.25
 """Seconds between two looks at an assignment: a pack asks before every step, which must not wait for the store."""

@@ -14,7 +14,7 @@ _FOLDER, _QUESTION = "probe", "question"
 
 
 class ObjectProbe:
-    """A question in a sweep's objects; see `tune_jobs.store.probe.Probe`.
+    """A question in a sweep's objects; implements `Probe`.
 
     Args:
         bucket: The sweep's objects.

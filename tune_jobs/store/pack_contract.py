@@ -1,0 +1,66 @@
+"""The contract of a store for one pack; the rules for all of it are in `contract`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from tune_jobs.store.trial_contract import Ownership
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """The trials that a pack has to train."""
+
+    trial_ids: tuple[str, ...] = ()
+    """The pack's members, in the order in which they were added; a member that is not named has to be ended."""
+    num_failures: Mapping[str, int] = field(default_factory=dict)
+    """How often each member has failed by itself in this run; those that have not failed are left out."""
+
+
+class Pack(Protocol):
+    """One pack. The driver writes its assignment; the pack's process reads it, and prints to the log."""
+
+    @property
+    def pack_id(self) -> str:
+        """The pack's id: `p00` and so on."""
+        ...
+
+    def take(self, under: Ownership | None = None) -> Ownership:
+        """Become the process that runs this pack.
+
+        Raises:
+            OwnershipLostError: Another process has taken `under`.
+        """
+        ...
+
+    def write(self, assignment: Assignment) -> None:
+        """Replace the assignment, atomically.
+
+        Raises:
+            CannotRunError: It cannot be written.
+        """
+        ...
+
+    def read(self) -> Assignment:
+        """Read the assignment.
+
+        Raises:
+            CheckpointError: It does not exist, or cannot be read.
+        """
+        ...
+
+    @property
+    def log_path(self) -> Path:
+        """A local file that the pack's process appends its output to."""
+        ...
+
+    def begin_log(self) -> None:
+        """Print the line that separates this process's output from that of earlier ones in the log."""
+        ...
+
+    def log_tail(self, num_lines: int = 15) -> str:
+        """Return the lines that say how the pack's last process ended; empty without a log."""
+        ...
