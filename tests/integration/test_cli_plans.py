@@ -93,7 +93,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
     joined = contextlib.nullcontext(found)
     monkeypatch.setattr("tune_jobs.sweeps.dry_run.connected", lambda address, here: joined)
     check = "tune_jobs.sweeps.dry_run._check_nodes"
-    monkeypatch.setattr(check, lambda place, _: (found.checked.append(Path(place).is_dir()), [])[1])
+    monkeypatch.setattr(check, lambda place, *_: (found.checked.append(Path(place).is_dir()), [])[1])
     return found
 
 

@@ -84,7 +84,6 @@ def test_trials_do_not_depend_on_anything_else(change: str) -> None:
         (["resources.num_gpus=1"], Machine(64, 2), 2),
         (["resources.num_gpus=0.3333333333333333"], Machine(64, 2), 6),
         (["resources.num_gpus=0.6"], Machine(64, 2), 2),
-        (["resources.num_gpus=2"], Machine(64, 5), 2),
         (["resources.num_gpus=1"], Machine(64, 1, nodes=((4, 1), (60, 0))), 1),
     ],
 )
@@ -277,7 +276,19 @@ def test_available_memory_is_read(tmp_path: Path, text: str, expected: int | Non
 @pytest.mark.parametrize(("visible", "expected"), [("", 0), ("-1", 0), ("0", 1), ("0,2", 2)])
 def test_gpus_are_those_that_cuda_would_see(monkeypatch: pytest.MonkeyPatch, visible: str, expected: int) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    assert local_machine().num_gpus == expected
+    monkeypatch.setattr(machine_module, "uses_gpus", lambda: True)
+    assert (local_machine().num_gpus, local_machine().unusable_gpus) == (expected, 0)
+
+
+def test_gpus_that_pytorch_cannot_use_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    monkeypatch.setattr(machine_module, "uses_gpus", lambda: False)
+    machine = local_machine()
+    assert (machine.num_gpus, machine.unusable_gpus) == (0, 2)
+    spec = load_spec({"env": "CartPole-v1", "algorithm": "ppo"}, ["resources.num_gpus=0.5"])
+    with pytest.raises(CannotRunError, match=r"needs 0\.5 GPUs; this machine has 2, .* for CPUs alone") as caught:
+        make_plan(spec, machine)
+    assert "PyTorch's build for CUDA" in str(caught.value)
 
 
 def test_replications_add_seeds_to_points_and_change_no_trial() -> None:

@@ -142,7 +142,7 @@ def test_bodies_of_another_kind_are_no_json(shared: Service, kind: str) -> None:
 @pytest.mark.parametrize(
     ("resources", "told"),
     [
-        ({"num_gpus": 64}, "64 GPUs"), ({"num_cpus": 10_000}, "10,000|10000"),
+        ({"num_gpus": 1}, "1 GPU"), ({"num_cpus": 10_000}, "10,000|10000"),
         ({"num_env_runners": 1_000}, "1,001|1001"),
     ],
 )  # fmt: skip

@@ -48,8 +48,15 @@ def refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
             f"{hint[0].upper()}{hint[1:]}.",
         )
     if gpus > machine.num_gpus:
+        needs = f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}"
+        if machine.unusable_gpus:
+            raise CannotRunError(
+                f"{needs}; {machine.source} has {machine.unusable_gpus:g}, but its PyTorch is a build for CPUs alone.",
+                "Install PyTorch's build for CUDA (pytorch.org/get-started has the command), or set "
+                "resources.num_gpus to 0.",
+            )
         raise CannotRunError(
-            f"One trial needs {gpus:g} GPU{'s' * (gpus != 1)}; {machine.source} has {machine.num_gpus:g}. {FOR_EVER}",
+            f"{needs}; {machine.source} has {machine.num_gpus:g}. {FOR_EVER}",
             "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
         )
     main = cpus - runners

@@ -7,6 +7,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from tune_jobs.process.torch_build import uses_gpus
+
 _CGROUPS = Path("/sys/fs/cgroup")
 _MEMORY_INFO = Path("/proc/meminfo")
 
@@ -23,6 +25,8 @@ class Machine:
     memory_bytes: float | None = None
     """Available memory, in bytes; None: not known. On a cluster, every CPU counts with the memory per CPU of the node
     that has the least."""
+    unusable_gpus: float = 0.0
+    """GPUs that are there, and not counted: PyTorch is a build for CPUs alone."""
     more: str = "launch on a larger cluster with --address"
     """How to get more resources, for hints."""
 
@@ -52,14 +56,17 @@ class Machine:
 
 
 def local_machine() -> Machine:
-    """Return what this process may use: CPUs and memory within affinity and container limits, and visible GPUs."""
-    return Machine(num_cpus=_usable_cpus(), num_gpus=_visible_gpus(), memory_bytes=_usable_memory())
+    """Return what this process may use: CPUs and memory within affinity and container limits, and visible GPUs.
+
+    GPUs count if PyTorch can use them.
+    """
+    gpus = _visible_gpus()
+    unusable = gpus if gpus and not uses_gpus() else 0.0
+    return Machine(_usable_cpus(), gpus - unusable, unusable_gpus=unusable, memory_bytes=_usable_memory())
 
 
 def _times(available: float, wanted: float) -> int:
     """Return how often `wanted` GPUs fit; a share of a GPU is never split over two; 3 x 1/3 fit despite rounding."""
-    if wanted > 1:
-        return int(available // wanted)
     return int(available) * math.floor(1 / wanted + 1e-9)
 
 

@@ -30,6 +30,10 @@ _STORAGE = "Choose storage that every node reaches, and may write, (a network fi
 _VERSIONS = "Install the same versions everywhere, or use one image for all nodes."
 _WORKING = "Install the same version of tune-jobs on every node, or use its image."
 _MODULES = "Install the modules of --allow-module on every node, or put their folder on PYTHONPATH before `ray start`."
+_NO_CUDA = (
+    "Install PyTorch's build for CUDA there, or start the node with `ray start --num-gpus=0`, so that it gets no trial "
+    "that needs one."
+)
 _SILENT = "Check the nodes with `ray status`, and that their file systems respond."
 
 
@@ -42,7 +46,7 @@ class Problem:
     hint: str
 
 
-def check_nodes(sweep_place: str, modules: Sequence[str] = ()) -> tuple[str, ...]:
+def check_nodes(sweep_place: str, modules: Sequence[str] = (), *, num_gpus: float = 0.0) -> tuple[str, ...]:
     """Check, by a worker on every node, what a sweep needs there.
 
     That is the versions that this process has (of Python and torch, those that matter), the user's own modules, and
@@ -51,6 +55,7 @@ def check_nodes(sweep_place: str, modules: Sequence[str] = ()) -> tuple[str, ...
     Args:
         sweep_place: The place of the sweep; its lock has to be held.
         modules: The user's own modules that the sweep needs.
+        num_gpus: Of a trial; if it needs any, PyTorch has to be a build for them where there are some.
 
     Returns:
         Notes on differences that do not matter.
@@ -68,17 +73,19 @@ def check_nodes(sweep_place: str, modules: Sequence[str] = ()) -> tuple[str, ...
             task = ask.options(scheduling_strategy=strategy).remote(
                 PACKAGES, tuple(modules), probe.place, node["NodeID"]
             )
-            tasks[name] = (task, node["NodeID"])
+            tasks[name] = (task, node)
         deadline = time.monotonic() + _TIMEOUT_S
         found: dict[str, list[Problem]] = {}
         notes: list[str] = []
-        for name, (task, node_id) in tasks.items():
+        for name, (task, node) in tasks.items():
             told = _answer_of(task, max(0.0, deadline - time.monotonic()))
             if isinstance(told, Problem):
                 found[name] = [told]
                 continue
-            is_same = functools.partial(probe.is_same, machine=node_id)
+            is_same = functools.partial(probe.is_same, machine=node["NodeID"])
             found[name] = problems_of(told, versions(), sweep_place, is_same)
+            if num_gpus and node["Resources"].get("GPU"):
+                found[name] += _problems_of_gpus(told, node["Resources"]["GPU"])
             notes += _notes(name, told["versions"])
     refuse({name: problems for name, problems in found.items() if problems}, len(found))
     return tuple(notes)
@@ -105,10 +112,12 @@ def _question() -> Callable[..., dict[str, Any]]:  # noqa: C901 (it is sent in o
 
         told: dict[str, Any] = {"versions": found, "modules": {}}
         try:
+            from tune_jobs.process.torch_build import uses_gpus
             from tune_jobs.store.opening import answer
             from tune_jobs.store.probe import FailedOperationError
         except Exception as error:  # noqa: BLE001 (whatever its installation lacks)
             return {**told, "not_working": said(error)}
+        told["uses_gpus"] = uses_gpus()
         try:
             told["question"] = answer(place, machine)
         except FailedOperationError as error:
@@ -173,6 +182,13 @@ def problems_of(
     elif not is_same(told["question"]):
         problems.append(Problem(f"sees another folder under the name {place}", _STORAGE))
     return problems
+
+
+def _problems_of_gpus(told: Mapping[str, Any], num_gpus: float) -> list[Problem]:
+    if told.get("uses_gpus", True):
+        return []
+    text = f"offers {num_gpus:g} GPU{'s' * (num_gpus != 1)}, but its PyTorch {told['versions'].get('torch', '')} is a "
+    return [Problem(f"{text}build for CPUs alone", _NO_CUDA)]
 
 
 def _what_counts(name: str, version: str) -> str:

@@ -176,7 +176,9 @@ class ResourcesSpec(Section):
     """What one trial may use, and how many run at once."""
 
     num_cpus: PositiveWhole | None = Field(None, description="CPUs per trial; null: 1, and 1 for each env runner.")
-    num_gpus: Annotated[Number, Field(ge=0)] = Field(0.0, description="GPUs per trial, fractions allowed.")
+    num_gpus: Annotated[Number, Field(ge=0)] = Field(
+        0.0, description="GPUs per trial, or per pack of trials: 1, or a share of one such as 0.25."
+    )
     num_env_runners: Annotated[WholeNumber, Field(ge=0, le=SEEDS_PER_TRIAL)] = Field(
         0, description="Processes that sample for one trial; 0: the trial's own process samples."
     )

@@ -77,8 +77,11 @@ def _section_problems(spec: SweepFields) -> list[Problem]:
             f"{counted(resources.num_env_runners, 'env runner')} needs; leave it out to get just those"
         )
         problems.append(Problem("resources.num_cpus", text))
-    if resources.num_gpus > 1 and not resources.num_gpus.is_integer():
-        text = f"{resources.num_gpus:g} is not allowed: use a fraction of one GPU, or a whole number of GPUs"
+    if resources.num_gpus > 1:
+        text = (
+            f"{resources.num_gpus:g} is not allowed: a trial computes on one GPU at most, and so does a pack of "
+            "trials; use 1, or the share of one GPU that each takes, such as 0.25. More GPUs train more trials at once"
+        )
         problems.append(Problem("resources.num_gpus", text))
     wished = find_engine(spec.engine)
     if wished is not None and (reason := why_none(wished, spec)) is not None and not wished.gives_way:

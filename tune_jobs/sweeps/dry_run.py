@@ -38,11 +38,11 @@ def planned(
     with connected(address, None) as connection:
         plan = make_plan(spec, connection.machine)
         with store.rehearsal() as rehearsed:
-            plan = plan.with_notes(_check_nodes(rehearsed.place, modules_of(spec)))
+            plan = plan.with_notes(_check_nodes(rehearsed.place, modules_of(spec), spec.resources.num_gpus))
         return spec, plan
 
 
-def _check_nodes(place: str, modules: Sequence[str]) -> Sequence[str]:
+def _check_nodes(place: str, modules: Sequence[str], num_gpus: float) -> Sequence[str]:
     from tune_jobs.ray_tune.node_checks import check_nodes
 
-    return check_nodes(place, modules)
+    return check_nodes(place, modules, num_gpus=num_gpus)

@@ -107,5 +107,5 @@ def _taken_over(
         found = machine_that_fits(
             spec, connection, wait_for_nodes, name=store.name, progress=progress, stop_requested=store.stop_requested
         )
-        check_nodes(store.place, store.read_record().allowed_modules)
+        check_nodes(store.place, store.read_record().allowed_modules, num_gpus=spec.resources.num_gpus)
         yield None, found

@@ -189,7 +189,7 @@ def _launch_here(
             if address is not None:
                 from tune_jobs.ray_tune.node_checks import check_nodes
 
-                plan = plan.with_notes(check_nodes(store.place, modules_of(spec)))
+                plan = plan.with_notes(check_nodes(store.place, modules_of(spec), num_gpus=spec.resources.num_gpus))
             stack.enter_context(settled(store))
             write_new(store, spec, plan, address)
         except BaseException:

@@ -23,6 +23,7 @@ from policies.packed.state import STATE_FOLDER, check_shapes, load_member, save_
 from policies.portable.file import PortablePolicy
 from tune_jobs.plan.engine_choice import pack_key
 from tune_jobs.store.names import TRIAL_RECORD
+from tune_jobs.training.devices import device_for
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
 
@@ -34,7 +35,7 @@ class PackedEngine:
     Args:
         env_kind: How environments are stepped; None: `choose_kind` decides by a measurement.
         num_env_processes: Processes for environments, if the kind uses any.
-        device: Where updates are computed; None: on a GPU if this process has one, else on the CPU.
+        device: Where updates are computed; None: on a GPU if the trials are given one, else on the CPU.
         num_turns: The number of stacks that trials of one kind are spread over: one samples on the CPU while another's
             updates run on the GPU. None: two with a GPU, else one.
     """
@@ -57,7 +58,7 @@ class PackedEngine:
         """Add a trial, fresh or exactly as a checkpoint folder holds it."""
         # The values were validated with the sweep file; this turns JSON back into the typed object.
         hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
-        device = self._device or ("cuda" if task.num_gpus and torch.cuda.is_available() else "cpu")
+        device = self._device or device_for(task.num_gpus)
         key = self._place(task, hyperparams, device)
         is_new = key not in self._stacks
         stack = self._stacks.get(key) or self._make_stack(task, hyperparams, device)

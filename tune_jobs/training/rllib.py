@@ -19,6 +19,7 @@ from policies.rllib.config import build_algorithm_config
 from policies.rllib.dqn_algorithm import ReplayDQN
 from policies.rllib.env_runner import ArrayEnvRunner
 from policies.rllib.restore import portable_policy, restore_algorithm, take_over_state
+from tune_jobs.training.devices import device_for
 from tune_jobs.training.env_runner import EnvRunner
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
@@ -88,6 +89,8 @@ class RLlibEngine:
             self._continue_streams(checkpoint)
 
     def _new_algorithm(self, task: TrialTask, hyperparams: TrainedHyperparams) -> RLlibAlgorithm:
+        # RLlib would say so in its own words, after seconds, or not at all.
+        device_for(task.num_gpus)
         config = build_algorithm_config(
             hyperparams,
             env_id=task.env_id,
