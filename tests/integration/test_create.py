@@ -90,7 +90,7 @@ def test_a_sweep_is_driven_where_it_was_created_for_unless_somebody_says_where(
     monkeypatch.setattr(verbs, "resume", lambda _, **settings: asked.append(settings["address"]))
     monkeypatch.setattr(driving, "connected", lambda *_: pytest.fail("nothing is joined"))
     # Larger than any machine: whether the cluster can run it is known when it is driven.
-    large = SPEC | {"resources": {"num_cpus": 1000, "num_gpus": 50}, "engine": "rllib"}
+    large = SPEC | {"resources": {"num_cpus": 1000, "num_gpus": 1}, "engine": "rllib"}
     for spec, address in ((large, "ray://head:10001"), (SPEC, "ray://head:10001"), (SPEC, None)):
         created = tune_jobs.create(spec, storage=tmp_path, address=address)
         tune_jobs.drive(created.folder)
