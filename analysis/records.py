@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
 
 from analysis.notebook import Brief, facts_html
+from analysis.waits import WaitRecord
 
 FORMAT_VERSION = 2
 
@@ -388,6 +389,7 @@ class SweepRecord(_Record):
     address: str | None = None
     job: JobRecord | None = Field(None, description="The job that drove it last; None: another process did.")
     allowed_modules: tuple[str, ...] = Field((), description="Modules of the user's own that its trials may import.")
+    waiting: WaitRecord | None = Field(None, description="The nodes it waits for; if nothing runs it: waited, in vain.")
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
 

@@ -218,7 +218,7 @@ def test_attach_tells_of_a_job_that_waits_for_nodes(tmp_path: Path) -> None:
     with store.lock():
         store.write_record(store.read_record().model_copy(update={"job": job, "state": "created"}))
         look.update()
-        assert look.monitor.phase == "its job joins the cluster, or waits for nodes"
+        assert look.monitor.phase == "its job joins the cluster"
         store.write_record(store.read_record().model_copy(update={"state": "running"}))
         look.update()
         assert look.monitor.phase == "starting the trials"

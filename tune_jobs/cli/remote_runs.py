@@ -160,7 +160,9 @@ def _line(seen: Summary, elapsed_s: float) -> str:
         point = point if len(point) <= _MOST_POINT else f"{point[:_MOST_POINT]} ..."
         score, trial = return_text(seen.best["score"]), seen.best["trial_id"]
         words.append(f"best {score} ({trial}: {point or 'no searched values'})")
-    if seen.time_left_s:
+    if seen.waiting is not None:
+        words.append(f"waits for {seen.waiting.told(time.time())}")
+    elif seen.time_left_s:
         words.append(f"about {duration(seen.time_left_s, tenths=False, none=PLAIN_NONE)} left")
     return "; ".join(words)
 

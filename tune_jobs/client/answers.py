@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from analysis.records import TrialRecord
+from analysis.waits import WaitRecord
 
 
 class _Answer(BaseModel):
@@ -60,6 +61,7 @@ class Summary(_Answer):
     time_left_s: float | None
     run_time_s: float
     best: dict[str, Any] | None
+    waiting: WaitRecord | None = Field(None, description="The nodes of a cluster that it waits for now.")
 
 
 class Trial(TrialRecord):

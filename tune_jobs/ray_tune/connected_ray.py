@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import ray
+from ray.util.placement_group import placement_group, remove_placement_group
 
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
@@ -76,31 +77,48 @@ def present_machine(source: str) -> Machine:
     return cluster_machine(source) if is_of_a_sweep() else replace(connected_machine(), source=source)
 
 
-@contextlib.contextmanager
-def asking_for(bundles: list[dict[str, float]]) -> Iterator[None]:
-    """Ask the cluster's autoscaler, if it has one, for nodes that can hold these resources while the block runs.
-
-    A cluster knows one such request: another sweep that waits at the same time replaces it, or withdraws it.
+class Asked:
+    """Resources that the cluster was asked for.
 
     Args:
         bundles: Resources that have to be on one node each, by Ray's names.
     """
-    _request(bundles)
+
+    def __init__(self, bundles: list[dict[str, float]]) -> None:
+        self._group: Any = placement_group(bundles, strategy="PACK")
+        self._is_there = self._group.ready()
+
+    def let_go(self) -> None:
+        """Give the resources back if they are there by now: the trials ask for them themselves."""
+        if self._group is not None and ray.wait([self._is_there], timeout=0)[0]:
+            self.withdraw()
+
+    def withdraw(self) -> None:
+        """Ask no more."""
+        group, self._group = self._group, None
+        if group is not None:
+            remove_placement_group(group)
+
+
+@contextlib.contextmanager
+def asking_for(bundles: list[dict[str, float]]) -> Iterator[Asked]:
+    """Ask the cluster's autoscaler, if it has one, for nodes that can hold these resources while the block runs.
+
+    It is asked by a placement group that waits, as by Tune for the trials: several sweeps that wait are added up, and
+    Ray itself takes it back when this process ends, however it ends. What the autoscaler's own interface
+    takes is one request of the whole cluster, which each caller replaces, and which outlives them (ray issues 13534
+    and 19785).
+
+    Args:
+        bundles: Resources that have to be on one node each, by Ray's names.
+    """
+    asked = Asked(bundles)
     try:
-        yield
+        yield asked
     finally:
+        # Without the cluster there is no request either.
         with contextlib.suppress(Exception):
-            _request([])
-
-
-def _request(bundles: list[dict[str, float]]) -> None:
-    from ray.autoscaler.sdk import request_resources
-
-    if is_client():
-        # Ray 2.60 cannot ask from a client, so a worker does it.
-        ray.get(ray.remote(num_cpus=0)(request_resources).remote(bundles=bundles))
-    else:
-        request_resources(bundles=bundles)
+            asked.withdraw()
 
 
 def connected_machine() -> Machine:

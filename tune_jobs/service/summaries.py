@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from analysis.records import TrialRecord, TrialStatus
+from analysis.waits import WaitRecord
 from policies.errors import SpecError
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import Label
@@ -37,6 +38,7 @@ class SweepSummary(BaseModel):
     time_left_s: float | None
     run_time_s: float
     best: dict[str, Any] | None
+    waiting: WaitRecord | None = Field(description="The nodes of a cluster that it waits for now; null: it does not.")
 
 
 def summary(seen: Seen, label: Label, job: Job | None) -> SweepSummary:
@@ -63,6 +65,7 @@ def summary(seen: Seen, label: Label, job: Job | None) -> SweepSummary:
         time_left_s=status.time_left_s,
         run_time_s=record.run_time_s,
         best=None if status.best is None else to_json(status.best),
+        waiting=status.waits_for,
     )
 
 

@@ -138,8 +138,10 @@ class _Look:
             return "stopping: the running trials save a checkpoint"
         if record.state == "completed":
             return "confirming and filming the best policy, and writing the report"
+        if record.waiting is not None:
+            return f"waiting for {record.waiting.told(time.time())}"
         if record.state == "created" and record.job is not None:
-            return "its job joins the cluster, or waits for nodes"
+            return "its job joins the cluster"
         if "running" in self.monitor.counts():
             self._has_run = True
         # Once a trial has run, the monitor says what the others wait for.

@@ -13,6 +13,7 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.ray_tune.address import check_form
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.drive import machine_here, write_new
 from tune_jobs.sweeps.storage import choose_store, create_store, folder_at, shown_place
@@ -75,12 +76,21 @@ def _smallest_machine(spec: SweepSpec, address: str) -> Machine:
 
 @contextlib.contextmanager
 def removed_if_not_begun(created: CreatedSweep) -> Iterator[None]:
-    """Remove a sweep again if the block fails before any part of it has begun."""
+    """Remove a sweep again if the block fails before any part of it has begun, unless it waited for nodes in vain."""
     try:
         yield
     except BaseException:
         store = open_sweep(created.place)
         with contextlib.suppress(TuneJobsError), store.lock():
-            if store.read_record().state == "created":
-                store.discard()
+            remove_unless_it_waited(store)
         raise
+
+
+def remove_unless_it_waited(store: Sweep) -> None:
+    """Remove a sweep whose lock is held if it has not begun; one that waited for nodes is resumed when they are there.
+
+    Others may have seen it wait, for hours.
+    """
+    record = store.read_record()
+    if record.state == "created" and record.waiting is None:
+        store.discard()

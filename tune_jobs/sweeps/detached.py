@@ -18,7 +18,7 @@ from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.ray_tune.jobs import Job, JobsApi, JobState, check_jobs_address
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import name_for_commands, open_sweep
-from tune_jobs.sweeps.create import removed_if_not_begun, write_created
+from tune_jobs.sweeps.create import remove_unless_it_waited, removed_if_not_begun, write_created
 from tune_jobs.sweeps.own_job import environment_of, version_here
 from tune_jobs.sweeps.storage import stem_of, storage_place
 from tune_jobs.sweeps.travel import folder_to_send, packed
@@ -134,7 +134,7 @@ def go_on_detached(
 def wait_until_begun(detached: DetachedSweep, *, timeout_s: float = _BEGIN_S) -> JobState:
     """Wait until a job has begun with its sweep, and return its state; PENDING if it has not begun in time.
 
-    A new sweep whose job fails before it begins is removed.
+    A new sweep whose job fails before it begins is removed, unless it waited for nodes.
 
     Raises:
         TuneJobsError: The job failed before it began, with the error that it ended with.
@@ -254,7 +254,6 @@ def _submit(
 
 
 def _forget(store: Sweep) -> None:
-    """Remove a sweep that no job has begun with."""
+    """Remove a sweep that no job has begun with, nor waited for."""
     with contextlib.suppress(TuneJobsError), store.lock():
-        if store.read_record().state == "created":
-            store.discard()
+        remove_unless_it_waited(store)

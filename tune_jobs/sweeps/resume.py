@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, ParamSpec
 
 from analysis.records import ReplicationRecord
 from policies.envs.modules import allow_modules
@@ -18,8 +19,26 @@ from tune_jobs.sweeps.drive import connected, machine_here, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.own_job import note_own_job
 from tune_jobs.sweeps.stages import RACE, MoreSeeds, run_sweep
+from tune_jobs.sweeps.waiting import WaitEndedError, check_wait, machine_that_fits, note_wait
+
+_Arguments = ParamSpec("_Arguments")
 
 
+def _ending_a_wait_in_order(call: Callable[_Arguments, SweepResult]) -> Callable[_Arguments, SweepResult]:
+    """Decorate a function whose first argument is a sweep: an end before there were nodes is an interruption."""
+
+    @functools.wraps(call)
+    def run(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> SweepResult:
+        try:
+            return call(*args, **kwargs)
+        except WaitEndedError:
+            store: Any = args[0]
+            return SweepResult(store.place, store.read_record(), store.read_trials(), interrupted=True)
+
+    return run
+
+
+@_ending_a_wait_in_order
 @guarding()
 def go_on(
     store: Sweep,
@@ -38,7 +57,7 @@ def go_on(
         SpecError: The space has nothing to draw more samples from, or the point is wrong or known.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
-    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where):
+    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where, notes):
         record = store.read_record()
         spec = stored_spec(record)
         if num_samples:
@@ -46,10 +65,11 @@ def go_on(
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
         if point is not None:
             record = with_chosen_point(record, spec, store.read_trials(), point)
-        plan = add_what_is_missing(store, record, spec, where, address, retry_failed=retry_failed)
+        plan = add_what_is_missing(store, record, spec, where, address, retry_failed=retry_failed).with_notes(notes)
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 
 
+@_ending_a_wait_in_order
 @guarding()
 def replicate(
     store: Sweep,
@@ -74,11 +94,11 @@ def replicate(
         SpecError: The sweep cannot be replicated.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
-    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where):
+    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where, notes):
         record = store.read_record()
         spec = stored_spec(record)
         check_replicable(spec)
-        plan = add_what_is_missing(store, record, spec, where, address)
+        plan = add_what_is_missing(store, record, spec, where, address).with_notes(notes)
         more = MoreSeeds(next_round, RACE)
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress, more=more)
 
@@ -86,8 +106,12 @@ def replicate(
 @contextlib.contextmanager
 def _taken_over(
     store: Sweep, address: str | None, wait_for_nodes: float, progress: str
-) -> Iterator[tuple[Machine | None, Machine]]:
-    """Hold the sweep's lock for the block; gives the machine to start Ray on, if any, and what the sweep runs on."""
+) -> Iterator[tuple[Machine | None, Machine, tuple[str, ...]]]:
+    """Hold the sweep's lock for the block.
+
+    It gives the machine to start Ray on, if any, what the sweep runs on, and notes on its nodes.
+    """
+    check_wait(address, wait_for_nodes)
     with contextlib.ExitStack() as stack:
         stack.enter_context(store.lock())
         # The request was for a process that was killed.
@@ -97,15 +121,13 @@ def _taken_over(
         allow_modules(store.read_record().allowed_modules)
         machine = machine_here() if address is None else None
         if machine is not None:
-            yield machine, machine
+            note_wait(store, None)
+            yield machine, machine, ()
             return
         connection = stack.enter_context(connected(address, None))
         from tune_jobs.ray_tune.node_checks import check_nodes
-        from tune_jobs.sweeps.waiting import machine_that_fits
 
-        spec = stored_spec(store.read_record())
-        found = machine_that_fits(
-            spec, connection, wait_for_nodes, name=store.name, progress=progress, stop_requested=store.stop_requested
-        )
-        check_nodes(store.place, store.read_record().allowed_modules, num_gpus=spec.resources.num_gpus)
-        yield None, found
+        found = machine_that_fits(store, connection, wait_for_nodes, progress=progress)
+        record = store.read_record()
+        num_gpus = stored_spec(record).resources.num_gpus
+        yield None, found, check_nodes(store.place, record.allowed_modules, num_gpus=num_gpus)

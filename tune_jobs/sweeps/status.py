@@ -13,6 +13,7 @@ from typing import Any
 from analysis.notebook import BriefList, brief_repr, facts_html, rows_html
 from analysis.records import SweepRecord, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, select_best
+from analysis.waits import WaitRecord
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
 from policies.arguments import checked
 from policies.errors import CheckpointError, TuneJobsError
@@ -79,6 +80,7 @@ class SweepStatus:
         facts = {
             "sweep": self.sweep.name,
             "state": self.state,
+            **self._waits(),
             "progress": self._progress(),
             "trials": f"{self.sweep.num_trials:,}: {self.told_counts}",
             "best so far": _best_text(self.best),
@@ -87,6 +89,18 @@ class SweepStatus:
             "run time": self._run_time(),
         }
         return {name: text for name, text in facts.items() if text}
+
+    @property
+    def waits_for(self) -> WaitRecord | None:
+        """The nodes that the sweep waits for now; None: it doesn't wait."""
+        return self.sweep.waiting if self.alive else None
+
+    def _waits(self) -> dict[str, str]:
+        wait = self.sweep.waiting
+        if wait is None:
+            return {}
+        told = wait.told(time.time(), is_over=not self.alive)
+        return {"waits for" if self.alive else "waited for": told}
 
     def _progress(self) -> str:
         if self.max_env_steps is None:
@@ -105,6 +119,8 @@ class SweepStatus:
             return f"nothing runs; `{program} resume {named}` {verb} it"
         if self.sweep.state == "completed":
             return "the trials are done; the best is being confirmed and filmed, and the report written"
+        if self.waits_for is not None:
+            return "not known while it waits for nodes"
         if self.time_left_s is None:
             return self._why_unknown()
         return f"about {duration(self.time_left_s, tenths=False, none=PLAIN_NONE)}"

@@ -32,6 +32,7 @@ from tune_jobs.sweeps.results import importance, report, trials
 from tune_jobs.sweeps.stages import run_sweep
 from tune_jobs.sweeps.status import SweepStatus, list_sweeps, status
 from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storage_place
+from tune_jobs.sweeps.waiting import check_wait
 
 __all__ = [
     "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
@@ -133,8 +134,8 @@ def launch(
         finish: Whether to choose and confirm the best policy, film it and write the report afterwards.
         progress: `auto`: a table on a terminal, else lines, also in threads other than the main one; or `none`.
         rl_module: An RLModule class of your own, or its `module:Class`; None: the source's, mostly none.
-        wait_for_nodes: The most seconds to wait, before anything is written, until the cluster's nodes can hold one
-            trial; its autoscaler is asked for them. 0: a cluster that is too small is refused at once.
+        wait_for_nodes: The most seconds to wait until the cluster's nodes can hold one trial; its autoscaler is asked
+            for them. The sweep is written first, and kept if none come. 0: a cluster that is too small is refused.
 
     Returns:
         The records, and the path of each result. Failed trials are in the records; they raise no error.
@@ -145,11 +146,16 @@ def launch(
         SweepInterrupted: Ctrl-C, SIGTERM or SIGHUP ended it, and what is done is saved. It is a KeyboardInterrupt; an
             end by `stop` raises no error.
     """
+    check_wait(address, wait_for_nodes)
     if can_drive():
-        return _launch_here(
-            source, overrides, name, storage, address, finish=finish, progress=progress, rl_module=rl_module,
-            wait_for_nodes=wait_for_nodes,
-        )  # fmt: skip
+        given: tuple[Any, ...] = (source, overrides, name, storage, address)
+        if wait_for_nodes:
+            from tune_jobs.sweeps.patient_launch import launch_and_wait
+
+            return launch_and_wait(
+                *given, finish=finish, progress=progress, rl_module=rl_module, wait_for_nodes=wait_for_nodes
+            )
+        return _launch_here(*given, finish=finish, progress=progress, rl_module=rl_module)
     # The source may hold classes, and errors in it are raised here.
     created = create(source, overrides=overrides, name=name, storage=storage, address=address, rl_module=rl_module)
     with removed_if_not_begun(created):
@@ -168,7 +174,6 @@ def _launch_here(
     finish: bool,
     progress: Progress,
     rl_module: type[Any] | str | None,
-    wait_for_nodes: float,
 ) -> SweepResult:
     spec = load_source(source, overrides, rl_module)
     names = (name if name is not None else spec.name, stem_of(source), storage_place(storage))
@@ -179,10 +184,7 @@ def _launch_here(
     with contextlib.ExitStack() as stack:
         if plan is None:
             connection = stack.enter_context(connected(address, None))
-            from tune_jobs.sweeps.waiting import machine_that_fits
-
-            found = machine_that_fits(spec, connection, wait_for_nodes, name=names[0] or names[1], progress=progress)
-            plan = make_plan(spec, found)
+            plan = make_plan(spec, connection.machine)
         store = create_store(*names)
         try:
             stack.enter_context(store.lock())

@@ -1,7 +1,9 @@
 // What state a sweep is in for people: its own, and that of the job which the service has for it.
+import { waitText } from "./waits.js";
+
 const TONES = { running: "live", stopping: "live", waiting: "wait", completed: "good", failed: "bad" };
 
-export const isLive = (sweep) => sweep.state === "running" || sweep.job?.state === "running";
+export const isLive = (sweep) => sweep.state === "running" || sweep.job?.state === "running" || Boolean(sweep.waiting);
 export const isWaiting = (sweep) => !isLive(sweep) && ["waiting", "creating"].includes(sweep.job?.state);
 
 export function stateOf(sweep) {
@@ -11,7 +13,7 @@ export function stateOf(sweep) {
 
 function stateWord(sweep) {
   const job = sweep.job;
-  if (isLive(sweep)) return job?.stop_requested ? "stopping" : "running";
+  if (isLive(sweep)) return job?.stop_requested ? "stopping" : sweep.waiting ? "waiting" : "running";
   if (isWaiting(sweep)) return "waiting";
   if (job?.outcome === "failed") return "failed";
   if (sweep.state === "completed") return "completed";
@@ -29,6 +31,7 @@ export function stateReason(sweep) {
   const { word } = stateOf(sweep);
   if (word === "failed") return sweep.job?.message || "Its driver failed; the service's log has more.";
   if (word === "stopping") return "Its trials save first.";
+  if (sweep.waiting) return waitText(sweep.waiting);
   if (word === "waiting")
     return sweep.job?.verb === "drive" ? "It starts when its turn has come." : `${sweep.job.verb} waits for its turn.`;
   if (word === "interrupted") return "Its process is gone: resume it, and it goes on from what was saved.";

@@ -128,9 +128,11 @@ export class SweepHead {
     const left =
       sweep.state === "completed"
         ? "concluding"
-        : sweep.time_left_s === null
-          ? "not known yet"
-          : `about ${timeLeft(sweep.time_left_s)}`;
+        : sweep.waiting
+          ? "waits for nodes"
+          : sweep.time_left_s === null
+            ? "not known yet"
+            : `about ${timeLeft(sweep.time_left_s)}`;
     this.left.replaceChildren(el("b", {}, left), " ", el("small", {}, speed.trim()));
   }
 

@@ -265,9 +265,11 @@ function updateRow(row, sweep) {
       ? `${timeLeft(sweep.time_left_s)} left`
       : word === "failed"
         ? stateReason(sweep)
-        : "",
+        : sweep.waiting
+          ? "for nodes"
+          : "",
   );
-  setAttribute(state.lastElementChild, "title", state.lastElementChild.textContent || null);
+  setAttribute(state.lastElementChild, "title", (sweep.waiting ? stateReason(sweep) : state.lastElementChild.textContent) || null);
   const share = percent(sweep.num_env_steps, sweep.max_env_steps ?? 0);
   const bar = progress.firstElementChild;
   bar.firstElementChild.style.width = `${share}%`;
