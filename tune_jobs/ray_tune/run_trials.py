@@ -40,6 +40,7 @@ from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
 from tune_jobs.store.opening import name_for_commands, open_sweep
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
+from tune_jobs.store.storage_watch import StorageWatch
 
 # How long running trials may take to save a checkpoint after they were asked to stop, before they are ended.
 STOP_GRACE_S = 20.0
@@ -244,6 +245,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         self._keeper = keeper
         self._is_finished = is_finished
         self._asked_at: float | None = None
+        self._storage = StorageWatch(store)
 
     def __call__(self, trial_id: str, result: dict[str, Any]) -> bool:  # noqa: ARG002 (the signature of Tune's stoppers)
         return False
@@ -253,8 +255,10 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
 
         Raises:
             RayDiedError: A part of Ray is gone.
+            CannotRunError: The storage is.
         """
         self._watch.check()
+        self._storage.check()
         if self._is_finished():
             return True
         if self._asked_at is None:

@@ -51,7 +51,8 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
     job = _follow(store, progress)
     if not store.exists():
         raise CannotRunError(
-            f"Sweep {store.name} was removed while it was shown.", "List the others: `tune-jobs list`."
+            f"Sweep {store.name} was removed while it was shown, or its storage is gone: {store.place} has no record.",
+            "List the others: `tune-jobs list`.",
         )
     record, named = store.read_record(), shlex.quote(name_for_commands(store))
     if record.job is not None and job is not None and job.has_ended and not ran(job):

@@ -50,6 +50,8 @@ class SweepMonitor:
         self.stage = ""
         self.phase = ""
         """What is done before the trials train or after they have, such as "starting Ray"; empty while they do."""
+        self.reported_at: float | None = None
+        """When a trial last reported env steps, Unix time in seconds; None: none has."""
         self._caps = caps
         self._clock = clock
         self._start = clock()
@@ -109,6 +111,8 @@ class SweepMonitor:
         if record.status == "running":
             self.phase = ""
         before = self.records.get(record.trial_id)
+        if before is None or record.num_env_steps > before.num_env_steps:
+            self.reported_at = time.time()
         if before is not None and before.status == "running":
             self._idle_since = self._clock()
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)

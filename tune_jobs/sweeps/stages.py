@@ -18,6 +18,7 @@ from tune_jobs.sweeps.adding import add_what_is_missing
 from tune_jobs.sweeps.confirm import points_to_confirm
 from tune_jobs.sweeps.drive import Shared, close_if_open, run_trials_of
 from tune_jobs.sweeps.finishing import finish_sweep
+from tune_jobs.sweeps.lost_storage import told_if_it_is_gone
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.races import last_race, next_round
 
@@ -59,11 +60,15 @@ def run_sweep(
         more: What gives more seeds; None: a race that was interrupted, else `confirm`.
 
     Raises:
-        CannotRunError: Ray cannot run here, or died.
+        CannotRunError: Ray cannot run here, or died; or the storage is gone.
         TuneJobsError: As `more` raises it.
     """
+    shared = Shared()
     try:
-        return _run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress, more=more)
+        with told_if_it_is_gone(store, lambda: None if shared.monitor is None else shared.monitor.reported_at):
+            return _run_sweep(
+                store, plan, shared, address=address, machine=machine, finish=finish, progress=progress, more=more
+            )
     except KeyboardInterrupt:
         with current().shielded():
             current().came = True
@@ -74,6 +79,7 @@ def run_sweep(
 def _run_sweep(
     store: Sweep,
     plan: SweepPlan,
+    shared: Shared,
     *,
     address: str | None,
     machine: Machine | None,
@@ -83,7 +89,7 @@ def _run_sweep(
 ) -> SweepResult:
     notes = []
     had_all = all(trial.status in FINISHED for trial in store.read_trials())
-    with Shared() as shared:
+    with shared:
         result = run_trials_of(store, plan, shared, address=address, machine=machine, progress=progress)
         rounds = more or _own_rounds(store, finish=finish)
         while rounds is not None and not result.interrupted and not current().came and not store.stop_requested():

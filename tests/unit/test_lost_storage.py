@@ -1,0 +1,106 @@
+"""A run whose storage is gone in the middle says so, whatever error that led to, and how to go on."""
+
+import time
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+from sweep_folders import make_sweep_folder
+
+from policies.errors import CannotRunError, NotFoundError
+from tune_jobs.store.objects.bucket import StorageError
+from tune_jobs.store.objects.object_sweep import ObjectSweep
+from tune_jobs.store.objects.url import ObjectUrl
+from tune_jobs.store.ownership import OwnershipLostError
+from tune_jobs.store.storage_watch import StorageWatch
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import stages
+from tune_jobs.sweeps.drive import Shared
+from tune_jobs.sweeps.lost_storage import told_if_it_is_gone
+from tune_jobs.sweeps.monitor import SweepMonitor
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SweepStore:
+    return make_sweep_folder(tmp_path / "mounted" / "mine", iterations=1)
+
+
+def taken_away(store: SweepStore) -> None:
+    store.folder.parent.rename(store.folder.parent.with_name("elsewhere"))
+
+
+ERRORS = [
+    NotFoundError("No sweep at /x/sweep.json.", "List the sweeps here with `tune-jobs list`."),
+    OwnershipLostError("/x has been taken over by another process."),
+    FileNotFoundError(2, "No such file or directory"),
+]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_an_error_of_a_storage_that_is_gone_says_so(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def run(_: object, __: object, shared: Shared, **___: object) -> NoReturn:
+        shared.monitor = SweepMonitor("mine", [], caps={})
+        shared.monitor.reported_at = time.mktime((2026, 5, 4, 13, 2, 1, 0, 0, -1))
+        taken_away(store)
+        raise error
+
+    monkeypatch.setattr(stages, "_run_sweep", run)
+    plan: object = None
+    with pytest.raises(CannotRunError) as caught:
+        stages.run_sweep(store, plan, address=None, machine=None, finish=True, progress="none")  # type: ignore[arg-type]
+    assert type(caught.value) is CannotRunError
+    assert caught.value.exit_code == 5
+    assert f"The storage of sweep mine is gone: No sweep at {store.record_path}. It was missed at" in str(caught.value)
+    assert "; a trial last reported at 13:02:01." in caught.value.message
+    assert "`tune-jobs resume mine`" in caught.value.hint
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_an_error_of_a_storage_that_is_there_stays_as_it_is(store: SweepStore, error: Exception) -> None:
+    with pytest.raises(type(error)) as caught, told_if_it_is_gone(store, lambda: None):
+        raise error
+    assert caught.value is error
+
+
+def test_an_object_store_that_does_not_answer_is_gone_too(url: ObjectUrl) -> None:
+    store = ObjectSweep(url)
+    with pytest.raises(CannotRunError) as caught, told_if_it_is_gone(store, lambda: None):
+        raise StorageError("s3://x cannot be written: the connection was refused.", "Check it.", passes=True)
+    assert "is gone: s3://x cannot be written: the connection was refused. It was missed at" in caught.value.message
+    assert "tune-jobs resume" in caught.value.hint
+    refused = StorageError("s3://x cannot be written: AccessDenied.", "Check the credentials.")
+    with pytest.raises(StorageError) as refusal, told_if_it_is_gone(store, lambda: None):
+        raise refused
+    assert refusal.value is refused
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_folder_that_is_away_for_a_moment_is_waited_for_and_one_that_stays_away_ends_the_run(
+    store: SweepStore,
+) -> None:
+    clock = Clock()
+    watch = StorageWatch(store, clock)
+    away = store.folder.parent.with_name("elsewhere")
+    for clock.now in (1.0, 1.1, 2.0):
+        watch.check()
+    store.folder.parent.rename(away)
+    for clock.now in (2.5, 3.0, 4.0):
+        watch.check()
+    away.rename(store.folder.parent)
+    clock.now = 5.0
+    watch.check()
+    store.folder.parent.rename(away)
+    clock.now = 7.9
+    watch.check()
+    clock.now = 9.0
+    with pytest.raises(CannotRunError, match="has not been there for 4 s"):
+        watch.check()
