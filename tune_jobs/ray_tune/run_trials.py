@@ -78,8 +78,11 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     owner = store.take() if job.run is None else store.owner(job.run)
     with owner.held():
         store.clear_tune_folder()
-        for trial_id in job.trial_ids:
-            remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
+        # Only population based training makes copies.
+        if stored_spec(store.read_record()).scheduler.type == "pbt":
+            with store.reading(results=False):
+                for trial_id in job.trial_ids:
+                    remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
     with RayWatch.of_this_process() as watch:
         run = _Run(job, store, listener, owner, watch)
         watch.when_stuck = functools.partial(_give_up, run)

@@ -154,13 +154,16 @@ class Sweep(Protocol):
         """
         ...
 
-    def reading(self, *, results: bool = True) -> AbstractContextManager[None]:
+    def reading(
+        self, *, results: bool = True, checkpoints: Sequence[CheckpointRecord] = ()
+    ) -> AbstractContextManager[None]:
         """Read much of all trials in the block: it may be as it was at the block's beginning, or later.
 
         A store that is far away fetches all of it at once, instead of one after the other.
 
         Args:
-            results: Whether results and checkpoints are read, too, and not the records alone.
+            results: Whether results and checkpoints' manifests are read, too, and not the records alone.
+            checkpoints: Checkpoints whose files are read; one that is gone is found out where it is read.
 
         Raises:
             CheckpointError: The trials cannot be listed.

@@ -58,6 +58,11 @@ class ScalarWriter:
             event = Event(wall_time=now, step=iteration.num_env_steps, summary=Summary(value=values))
             writer.write(event.SerializeToString())
 
+    @property
+    def has_any(self) -> bool:
+        """Whether there is anything that `flush` would write."""
+        return bool(self._unwritten)
+
     def flush(self) -> None:
         """Append what was added to the files."""
         for trial_id, data in self._unwritten.items():

@@ -48,8 +48,9 @@ class RecordKeeper:
     ) -> None:
         self._store = store
         self._run = run
-        self._records = {name: store.trial(name).read_record() for name in trial_ids}
-        self._others = [record for record in store.read_trials() if record.trial_id not in self._records]
+        known = {record.trial_id: record for record in store.read_trials()}
+        self._records = {name: known.get(name) or store.trial(name).read_record() for name in trial_ids}
+        self._others = [record for name, record in known.items() if name not in self._records]
         self._listener = listener
         self._clock = clock
         self._scalars = ScalarWriter(store)
@@ -173,8 +174,9 @@ class RecordKeeper:
         self._store.settle()
 
     def _write_scalars(self) -> None:
-        with self.owned():
-            self._scalars.flush()
+        if self._scalars.has_any:
+            with self.owned():
+                self._scalars.flush()
 
     def _update(self, trial_id: str, record: TrialRecord) -> None:
         self._records[trial_id] = record

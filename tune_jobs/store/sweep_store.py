@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 from analysis.records import FINISHED, BestRecord, CheckpointRecord, FilmsRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
@@ -179,7 +180,7 @@ class SweepStore:
         """
         return TrialStore(self.folder, trial_id)
 
-    def reading(self, *, results: bool = True) -> AbstractContextManager[None]:  # noqa: ARG002 (nothing is fetched)
+    def reading(self, **_what: Any) -> AbstractContextManager[None]:
         """Do nothing: a file is read when it is needed."""
         return contextlib.nullcontext()
 

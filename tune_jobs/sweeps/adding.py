@@ -143,4 +143,5 @@ def _add_trials(
     changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
     store.write_record(record.model_copy(update={**changes, "state": "running"}))
     for trial_record in todo:
-        store.trial(trial_record.trial_id).write_record(trial_record)
+        store.trial(trial_record.trial_id).write_record(trial_record, soon=True)
+    store.settle()

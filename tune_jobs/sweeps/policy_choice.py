@@ -7,9 +7,10 @@ env steps of episodes, never on time: an equal sweep has an equal winner on any 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 from analysis.records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord, TrialRecord
@@ -224,30 +225,45 @@ def read_candidates(
         The candidates; and records of the others that were read, with the reason.
     """
     found: dict[str, Candidate] = {}
-    left_out = []
-    for num_read, scored in enumerate(known):
-        if len(found) == num_wanted or (found and num_read >= MOST_READ):
-            break
-        checkpoint = scored.checkpoint
-        try:
-            store.trial(checkpoint.trial_id).verify_checkpoint(checkpoint.iteration)
-            policy = read_policy(store.checkpoint_folder(checkpoint))
-        except NotFoundError as error:
-            leave_out(error)
-            # A record names no place on a machine.
-            left_out.append(_left_out(scored, error.message.replace(f"{store.place}/", "")))
-            continue
-        candidate, key = Candidate(scored, policy), _how_it_acts(policy)
-        if key in found:
-            same = found[key]
-            if scored.score == same.scored.score and tie_key(scored) < tie_key(same.scored):
-                found[key], candidate, same = candidate, same, candidate
-            first = same.scored.checkpoint
-            reason = f"the same policy as {first.trial_id} at {first.num_env_steps:,} env steps"
-            left_out.append(_left_out(candidate.scored, reason))
-        else:
-            found[key] = candidate
+    left_out: list[CandidateRecord] = []
+    with contextlib.closing(_fetched(store, known, num_wanted)) as fetched:
+        for num_read, scored in enumerate(fetched, 1):
+            _take(store, scored, found, left_out)
+            # Before the next ones are fetched.
+            if len(found) == num_wanted or (found and num_read >= MOST_READ):
+                break
     return list(found.values()), left_out
+
+
+def _fetched(store: Sweep, known: Sequence[TrialScore], num_wanted: int) -> Generator[TrialScore]:
+    """Yield what may be chosen, in order; as many as may be wanted are fetched together."""
+    for first in range(0, len(known), num_wanted):
+        some = known[first : first + num_wanted]
+        with store.reading(results=False, checkpoints=[scored.checkpoint for scored in some]):
+            yield from some
+
+
+def _take(store: Sweep, scored: TrialScore, found: dict[str, Candidate], left_out: list[CandidateRecord]) -> None:
+    """Read a policy, and add it to what plays, or to what is left out with the reason."""
+    checkpoint = scored.checkpoint
+    try:
+        store.trial(checkpoint.trial_id).verify_checkpoint(checkpoint.iteration)
+        policy = read_policy(store.checkpoint_folder(checkpoint))
+    except NotFoundError as error:
+        leave_out(error)
+        # A record names no place on a machine.
+        left_out.append(_left_out(scored, error.message.replace(f"{store.place}/", "")))
+        return
+    candidate, key = Candidate(scored, policy), _how_it_acts(policy)
+    if key in found:
+        same = found[key]
+        if scored.score == same.scored.score and tie_key(scored) < tie_key(same.scored):
+            found[key], candidate, same = candidate, same, candidate
+        first = same.scored.checkpoint
+        reason = f"the same policy as {first.trial_id} at {first.num_env_steps:,} env steps"
+        left_out.append(_left_out(candidate.scored, reason))
+    else:
+        found[key] = candidate
 
 
 def _left_out(scored: TrialScore, reason: str) -> CandidateRecord:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from policies.errors import CannotRunError
 from policies.files import atomic_path
+from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.reasons import reason_of
 from tune_jobs.store.objects.url import ObjectUrl
 
@@ -31,6 +34,8 @@ REQUEST_TIMEOUT_S = 30.0
 _PATIENCE_S = 30.0
 """Seconds in which requests that failed for reasons that pass are repeated."""
 _MAX_DELETED = 500
+_MAX_CLIENTS = 32
+"""Addresses whose connections a process keeps: they are the same for all that it has open there."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 4.0
 Tag = tuple[str | None, str | None]
 """What tells one content of an object from another: its entity tag and its version."""
@@ -91,7 +96,7 @@ class Bucket:
     def _store(self) -> obstore.store.ObjectStore:
         # Opened when it is needed: obstore takes 0.1 s to load, and an address alone needs none.
         if self._opened is None:
-            self._opened = _open(self.url)
+            self._opened = _client(self.url)
         return self._opened
 
     def get(self, key: str) -> Found | None:
@@ -207,6 +212,32 @@ class Bucket:
         found = self.get(key)
         return found.tag if found is not None and found.data == data else None
 
+    def put_all(self, files: Mapping[str, Path]) -> dict[str, Tag]:
+        """Write local files to objects, side by side, and return what each is known by; see `put`.
+
+        Args:
+            files: The files by the objects' keys.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            StorageError: One cannot be written; others may have been.
+        """
+        tags = side_by_side(lambda item: self.put(item[0], item[1]), files.items())
+        return dict(zip(files, tags, strict=True))
+
+    def fetch_all(self, paths: Mapping[str, Path]) -> dict[str, bool]:
+        """Write objects to local files, side by side, and return which there are; see `fetch`.
+
+        Args:
+            paths: The files by the objects' keys.
+
+        Raises:
+            StorageError: One cannot be read; others may have been.
+            CannotRunError: A file cannot be written.
+        """
+        found = side_by_side(lambda item: self.fetch(item[0], item[1]), paths.items())
+        return dict(zip(paths, found, strict=True))
+
     def delete(self, keys: Iterable[str]) -> None:
         """Remove objects; those that do not exist are none.
 
@@ -300,6 +331,17 @@ def _tag(meta: Any) -> Tag:
 
 def _listed(meta: Any) -> Listed:
     return Listed(meta["path"], meta["size"], _tag(meta), meta["last_modified"].timestamp())
+
+
+def _client(url: ObjectUrl) -> obstore.store.ObjectStore:
+    # What it was made from: a forked process has none of its parent's threads, and each has its credentials from there.
+    told = tuple(item for item in sorted(os.environ.items()) if item[0].startswith(("AWS_", "GOOGLE_", "AZURE_")))
+    return _client_of(os.getpid(), str(url), told)
+
+
+@functools.lru_cache(maxsize=_MAX_CLIENTS)
+def _client_of(_process: int, address: str, _told: tuple[tuple[str, str], ...]) -> obstore.store.ObjectStore:
+    return _open(ObjectUrl.parse(address))
 
 
 def _open(url: ObjectUrl) -> obstore.store.ObjectStore:

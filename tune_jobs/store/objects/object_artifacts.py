@@ -10,19 +10,17 @@ import contextlib
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from analysis.records import BestRecord, FilmsRecord
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from policies.files import atomic_path
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
+from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Listed, Tag
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.record_files import dump_sealed
-
-AT_ONCE = 32
-"""Requests side by side when much is read."""
 
 
 class Artifacts:
@@ -43,8 +41,7 @@ class Artifacts:
         if fetched:
             present = {item.key.removeprefix(f"{folder}/"): item for item in self._bucket.listed(f"{folder}/")}
             stale = [name for name, item in present.items() if _differs(local / name, item)]
-            with ThreadPoolExecutor(AT_ONCE) as pool:
-                list(pool.map(lambda name: self._fetch(folder, name, present[name]), stale))
+            side_by_side(lambda name: self._fetch(folder, name, present[name]), stale)
             for path in [path for path in local.rglob("*") if path.is_file()]:
                 name = path.relative_to(local).as_posix()
                 if name not in present and not path.name.startswith("."):
@@ -57,8 +54,18 @@ class Artifacts:
             _mark(path, item.tag)
 
     def _upload(self, folder: str, made: Path, paths: Sequence[Path]) -> None:
-        for path in paths:
-            self._bucket.put(f"{folder}/{path.relative_to(made).as_posix()}", path)
+        """Upload files that were made, and have them where they are looked for, so that none has to be fetched."""
+        keys = {f"{folder}/{path.relative_to(made).as_posix()}": path for path in paths}
+        tags = self._bucket.put_all(keys)
+        side_by_side(lambda key: self._keep(key, keys[key], tags[key]), keys)
+
+    def _keep(self, key: str, made: Path, tag: Tag) -> None:
+        # Where it cannot be kept, it is fetched when it is looked for, which says why.
+        with contextlib.suppress(OSError, CannotRunError):
+            local = self._parts.shared() / key
+            with atomic_path(local) as temporary:
+                shutil.copyfile(made, temporary)
+            _mark(local, tag)
 
     def has_best(self) -> bool:
         """Whether a winner has been written."""
@@ -167,7 +174,8 @@ def _marked(path: Path) -> Path:
 def _mark(path: Path, tag: Tag) -> None:
     """Note which content of an object a local file has."""
     found = path.stat()
-    _marked(path).write_text(repr((tag, found.st_size, found.st_mtime_ns)), encoding="utf-8")
+    # Listings and answers to writes agree in the entity tag; not all of them have the version.
+    _marked(path).write_text(repr((tag[0], found.st_size, found.st_mtime_ns)), encoding="utf-8")
 
 
 def _differs(path: Path, item: Listed) -> bool:
@@ -177,4 +185,4 @@ def _differs(path: Path, item: Listed) -> bool:
         noted = _marked(path).read_text(encoding="utf-8")
     except OSError:
         return True
-    return noted != repr((item.tag, found.st_size, found.st_mtime_ns))
+    return item.tag[0] is None or noted != repr((item.tag[0], found.st_size, found.st_mtime_ns))

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,10 +16,11 @@ from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecor
 from policies.errors import CannotRunError, CheckpointError, SpecError
 from tune_jobs.store import names
 from tune_jobs.store.objects.asked import Asked
+from tune_jobs.store.objects.at_once import AT_ONCE, side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError
 from tune_jobs.store.objects.lease import LEASE_S, is_leased, leased
 from tune_jobs.store.objects.logs import LogUploads
-from tune_jobs.store.objects.object_artifacts import AT_ONCE, Artifacts
+from tune_jobs.store.objects.object_artifacts import Artifacts
 from tune_jobs.store.objects.object_pack import ObjectPack
 from tune_jobs.store.objects.object_trial import ObjectTrial
 from tune_jobs.store.objects.outbox import outbox
@@ -45,6 +46,8 @@ class ObjectSweep(Artifacts):
         super().__init__(Parts(url))
         self._stop = Asked(lambda: self._bucket.get(_STOP) is not None)
         self._driver_uploads: LogUploads | None = None
+        self._has_results = False
+        """Whether results belong to what was fetched for those who read much."""
         # One for all calls, so that what a trial has fetched is fetched once.
         self._trials: dict[str, ObjectTrial] = {}
 
@@ -135,33 +138,43 @@ class ObjectSweep(Artifacts):
 
     def read_trials(self) -> list[TrialRecord]:
         """Read the records of all trials that have one, by index."""
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            records = list(pool.map(lambda trial_id: self.trial(trial_id).read_record(), self.trial_stamps()))
+        listed = self._listed_trials()
+        # Those whose present content this process knows are not fetched.
+        side_by_side(lambda trial_id: self.trial(trial_id).fetch(listed[trial_id], results=False), listed)
+        records = [self.trial(trial_id).read_record(item) for trial_id, item in listed.items()]
         return sorted(records, key=lambda record: record.index)
 
     def trial_stamps(self) -> dict[str, tuple[int, ...]]:
         """Return what changes whenever a trial's record is written, by id."""
+        return {trial_id: _stamp(item) for trial_id, item in self._listed_trials().items()}
+
+    def _listed_trials(self) -> dict[str, Listed]:
         try:
-            listed = self._bucket.listed(f"{RECORDS}/")
+            listed = self._parts.listed_records()
         except StorageError as error:
             raise CheckpointError(error.message, error.hint) from error
-        found = {item.key.removeprefix(f"{RECORDS}/").removesuffix(".json"): _stamp(item) for item in listed}
-        return {trial_id: stamp for trial_id, stamp in found.items() if is_trial_id(trial_id)}
+        found = {key.removeprefix(f"{RECORDS}/").removesuffix(".json"): item for key, item in listed.items()}
+        return {trial_id: item for trial_id, item in found.items() if is_trial_id(trial_id)}
 
     @contextlib.contextmanager
-    def reading(self, *, results: bool = True) -> Iterator[None]:
+    def reading(self, *, results: bool = True, checkpoints: Sequence[CheckpointRecord] = ()) -> Iterator[None]:
         """Read much of all trials in the block: it is fetched at its beginning, many at once."""
-        if self._parts.snapshot is not None:
-            # A part of a larger block.
-            yield
-            return
-        self._parts.snapshot = object()
+        # It may be a part of a larger block, which need not have fetched all that this one wants.
+        is_outermost, had_results = self._parts.snapshot is None, self._has_results
+        if is_outermost:
+            self._parts.snapshot = object()
         try:
-            with ThreadPoolExecutor(AT_ONCE) as pool:
-                list(pool.map(lambda trial_id: self.trial(trial_id).fetch(results=results), self.trial_stamps()))
+            if is_outermost or (results and not had_results):
+                self._has_results = results
+                listed = self._listed_trials()
+                side_by_side(lambda trial_id: self.trial(trial_id).fetch(listed[trial_id], results=results), listed)
+            if checkpoints:
+                with ThreadPoolExecutor(AT_ONCE) as pool:
+                    list(pool.map(lambda item: self.trial(item.trial_id).fetch_checkpoint(item.iteration), checkpoints))
             yield
         finally:
-            self._parts.snapshot = None
+            if is_outermost:
+                self._parts.snapshot, self._has_results = None, False
 
     def pack(self, pack_id: str) -> ObjectPack:
         """Return a pack, which need not exist yet."""
@@ -220,8 +233,7 @@ class ObjectSweep(Artifacts):
     def remove_leftovers(self) -> None:
         """Remove objects that killed processes left behind; the caller has to hold the lock."""
         ended = [trial.trial_id for trial in self.read_trials() if trial.status in FINISHED]
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            list(pool.map(lambda trial_id: self.trial(trial_id).remove_leftovers(), ended))
+        side_by_side(lambda trial_id: self.trial(trial_id).remove_leftovers(), ended)
         self._bucket.delete([item.key for item in self._bucket.listed("probe/")])
 
     def probing(self) -> AbstractContextManager[ObjectProbe]:

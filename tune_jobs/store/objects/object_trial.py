@@ -19,6 +19,7 @@ from policies.files import open_to_append
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
 from tune_jobs.store.manifests import described_files, files_of, read_manifest, verify_checkpoint
+from tune_jobs.store.objects.bucket import Listed
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.parts import Parts
@@ -79,9 +80,9 @@ class ObjectTrial:
 
     # -- its record
 
-    def read_record(self) -> TrialRecord:
-        """Read the record that the driver wrote last."""
-        record = self._parts.read_record(self._record_key, TrialRecord, "trial record")
+    def read_record(self, listed: Listed | None = None) -> TrialRecord:
+        """Read the record that the driver wrote last; `listed` is what a listing has just said of it."""
+        record = self._parts.read_record(self._record_key, TrialRecord, "trial record", listed=listed)
         if record.trial_id != self.trial_id:
             raise CheckpointError(
                 f"{self._parts.bucket.name_of(self._record_key)} is of trial {record.trial_id}, but it is that of "
@@ -94,12 +95,17 @@ class ObjectTrial:
         """Replace the record; see `Trial.write_record`."""
         self._parts.write_record(self._record_key, record, soon=soon)
 
-    def fetch(self, *, results: bool) -> None:
+    def fetch(self, listed: Listed, *, results: bool) -> None:
         """Fetch the record, or all, for what is read in a moment; whatever fails is raised there."""
         with contextlib.suppress(TuneJobsError):
-            self._parts.fetch_record(self._record_key)
+            self._parts.fetch_record(self._record_key, listed)
             if results:
                 self._state.local()
+
+    def fetch_checkpoint(self, iteration: int) -> None:
+        """Fetch a checkpoint's files for what is read in a moment; whatever fails is raised there."""
+        with contextlib.suppress(TuneJobsError, OSError):
+            self._state.checkpoint_folder(iteration)
 
     @property
     def _record_key(self) -> str:

@@ -26,7 +26,9 @@ from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.trial_contract import Ownership
 
 _LOOK_EVERY_S = 1.0
-"""Seconds for which an answer of the store to "who is the owner?" is believed."""
+"""Seconds after which the store is asked again who the owner is; its answer before that is believed."""
+_BELIEVED = 3
+"""How many times as long the answer before is believed while that is asked, so that who writes often never waits."""
 _TOKEN = re.compile(r"(\d{1,15})\.(\d{1,15}) ([0-9a-f]{16}) (\S+) (.*)")
 _ATTEMPTS = 20
 
@@ -89,6 +91,7 @@ class ObjectOwner:
         self.token = token
         self._lock = threading.Lock()
         self._looked_at, self._was_current = -float("inf"), True
+        self._looking: threading.Thread | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._bucket, self._key, self.token)
@@ -143,7 +146,7 @@ class ObjectOwner:
         yield
 
     def is_current(self) -> bool:
-        """Whether no other process has become the owner, as was seen within the last second.
+        """Whether no other process has become the owner, as was seen within the last three seconds.
 
         Raises:
             OSError: It cannot be read just now.
@@ -168,11 +171,25 @@ class ObjectOwner:
 
     def _is_current(self) -> bool:
         with self._lock:
+            age = time.monotonic() - self._looked_at
             # Who has lost it never has it again.
-            if self._was_current and time.monotonic() - self._looked_at > _LOOK_EVERY_S:
-                self._was_current = self._present() == self.token
-                self._looked_at = time.monotonic()
+            if self._was_current and age > _BELIEVED * _LOOK_EVERY_S:
+                self._look()
+            elif self._was_current and age > _LOOK_EVERY_S and not (self._looking and self._looking.is_alive()):
+                self._looking = threading.Thread(target=self._look_again, name="owner", daemon=True)
+                self._looking.start()
             return self._was_current
+
+    def _look(self) -> None:
+        asked_at = time.monotonic()
+        is_current = self._present() == self.token
+        self._was_current = self._was_current and is_current
+        self._looked_at = max(asked_at, self._looked_at)
+
+    def _look_again(self) -> None:
+        # A store that does not answer is asked by who needs to know, once the answer before is not believed any more.
+        with contextlib.suppress(StorageError):
+            self._look()
 
     def _present(self) -> str:
         found = self._bucket.get(self._key)

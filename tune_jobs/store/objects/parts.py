@@ -7,6 +7,7 @@ import re
 import secrets
 import threading
 from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +15,7 @@ from pydantic import BaseModel
 
 from policies.errors import NotFoundError, TuneJobsError
 from policies.files import open_to_append, write_atomic
-from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError, Tag
+from tune_jobs.store.objects.bucket import Bucket, ConflictError, Listed, StorageError, Tag
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import ObjectOwner
 from tune_jobs.store.objects.scratch import own_folder, shared_folder
@@ -27,6 +28,16 @@ _RecordT = TypeVar("_RecordT", bound=BaseModel)
 RECORDS = "records"
 _EVENTS_AFTER_S = 10.0
 _ATTEMPTS = 20
+
+
+@dataclass
+class _Known:
+    """A record's content in the store, as this process has seen or written it last."""
+
+    data: bytes
+    tag: Tag
+    as_of: object | None
+    """The snapshot that it belongs to."""
 
 
 class Parts:
@@ -44,7 +55,8 @@ class Parts:
         """Whether this process still has the sweep's lock; None: it has not taken it."""
         self.snapshot: object | None = None
         """While much is read, what everything that was read since then is as of; None: all is read anew."""
-        self._read: dict[str, tuple[object, bytes]] = {}
+        self._known: dict[str, _Known] = {}
+        self._listed: tuple[object, dict[str, Listed]] | None = None
         self._own: Path | None = None
         self._writer = secrets.token_hex(4)
         self.jobs: set[Hashable] = set()
@@ -84,17 +96,26 @@ class Parts:
         """Return the key of a trial's record: all lie side by side, so that they are listed together."""
         return f"{RECORDS}/{trial_id}.json"
 
-    def read_record(self, key: str, kind: type[_RecordT], what: str, *, is_sealed: bool = False) -> _RecordT:
+    def read_record(
+        self, key: str, kind: type[_RecordT], what: str, *, is_sealed: bool = False, listed: Listed | None = None
+    ) -> _RecordT:
         """Read a record.
+
+        Args:
+            key: Its object.
+            kind: Its model.
+            what: What it is, for messages.
+            is_sealed: Whether it has a checksum of itself.
+            listed: What a listing has just said of the object; it is not fetched if that content is known.
 
         Raises:
             NotFoundError: There is none.
             CheckpointError: It is damaged, of a newer format, or was changed; the message names it.
         """
         data = self._pending.get(key)
-        as_of, known = self._read.get(key, (None, b""))
-        if data is None and as_of is not None and as_of is self.snapshot:
-            data = known
+        known = self._known.get(key)
+        if data is None and known is not None and (self._is_of_snapshot(known) or _is_same(known, listed)):
+            data = known.data
         if data is None:
             data = self.fetch_record(key)
             if data is None:
@@ -107,14 +128,38 @@ class Parts:
             path.write_bytes(data)
             return read_record(path, kind, what, is_sealed=is_sealed)
 
-    def fetch_record(self, key: str) -> bytes | None:
-        """Return a record's text from the store, which is kept while much is read; None: there is none."""
-        found, as_of = self.bucket.get(key), self.snapshot
+    def _is_of_snapshot(self, known: _Known) -> bool:
+        return known.as_of is not None and known.as_of is self.snapshot
+
+    def fetch_record(self, key: str, listed: Listed | None = None) -> bytes | None:
+        """Return a record's text from the store, which is kept while much is read; None: there is none.
+
+        Args:
+            key: The record.
+            listed: What a listing has just said of it; it is not fetched if that content is known.
+        """
+        known, as_of = self._known.get(key), self.snapshot
+        if known is not None and _is_same(known, listed):
+            known.as_of = as_of
+            return known.data
+        found = self.bucket.get(key)
         if found is None:
             return None
-        if as_of is not None:
-            self._read[key] = as_of, found.data
+        self._known[key] = _Known(found.data, found.tag, as_of)
         return found.data
+
+    def listed_records(self) -> dict[str, Listed]:
+        """Return the records of trials by their keys; while much is read, they are listed once.
+
+        Raises:
+            StorageError: They cannot be listed.
+        """
+        as_of = self.snapshot
+        if as_of is not None and self._listed is not None and self._listed[0] is as_of:
+            return self._listed[1]
+        found = {item.key: item for item in self.bucket.listed(f"{RECORDS}/")}
+        self._listed = as_of, found
+        return found
 
     def write_record(self, key: str, record: BaseModel | str, *, soon: bool = False) -> None:
         """Replace a record, atomically.
@@ -130,7 +175,7 @@ class Parts:
         """
         data = (record if isinstance(record, str) else dump(record)).encode()
         self._pending[key] = data
-        self._read.pop(key, None)
+        self._listed = None
         if soon:
             self.jobs.add(self._job(key))
             outbox().add(self._job(key), lambda: self._upload(key))
@@ -171,6 +216,9 @@ class Parts:
                 # Looked at again, and whether it is still this process's.
                 del self._tags[key]
             else:
+                # What is read of it from now on, by a listing that has this tag or while much is read.
+                self._known[key] = _Known(data, self._tags[key] or (None, None), self.snapshot)
+                self._listed = None
                 break
         else:
             raise StorageError(
@@ -224,3 +272,8 @@ class Parts:
             return local
         write_atomic(copy, found.data)
         return copy
+
+
+def _is_same(known: _Known, listed: Listed | None) -> bool:
+    """Whether a listing says that an object still has the content that is known."""
+    return listed is not None and listed.tag[0] is not None and listed.tag[0] == known.tag[0]

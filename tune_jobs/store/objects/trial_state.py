@@ -14,13 +14,13 @@ import shutil
 import threading
 import time
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from policies.errors import CannotRunError, CheckpointError
 from policies.files import write_atomic
 from tune_jobs.store import names
-from tune_jobs.store.manifests import described_files
 from tune_jobs.store.objects.bucket import ConflictError, StorageError, Tag
+from tune_jobs.store.objects.checkpoint_objects import CheckpointObjects
 from tune_jobs.store.objects.head import Chunk, Head, StoredCheckpoint, read_head
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
@@ -61,6 +61,7 @@ class TrialState:
         self._damaged: dict[str, str] = {}
         self._results: tuple[Chunk, ...] = ()
         self._has_results = False
+        self._stored = CheckpointObjects(self._bucket, self._prefix)
         self._lock = threading.RLock()
         # What the head and the local results are as of, while much is read.
         self._head_of: object | None = None
@@ -166,7 +167,9 @@ class TrialState:
 
     def manifest_folder(self, iteration: int) -> Path:
         """Return a local folder with a checkpoint's manifest; the other files need not be there."""
-        stored = self.checkpoints().get(iteration)
+        return self._with_manifest(iteration, self.checkpoints().get(iteration))
+
+    def _with_manifest(self, iteration: int, stored: StoredCheckpoint | None) -> Path:
         folder = self._local_checkpoint(iteration, stored)
         if stored is not None and not (folder / names.MANIFEST).exists():
             write_atomic(folder / names.MANIFEST, stored.manifest)
@@ -175,24 +178,15 @@ class TrialState:
     def checkpoint_folder(self, iteration: int) -> Path:
         """Return a local folder with a checkpoint's files; it does not exist if there is no such checkpoint."""
         stored = self.checkpoints().get(iteration)
-        folder = self._local_checkpoint(iteration, stored)
+        folder = self._with_manifest(iteration, stored)
         if stored is not None and self._keys.get(iteration) != stored.key:
-            self.manifest_folder(iteration)
-            prefix = self._checkpoint_prefix(iteration, stored.key)
-            # All that is there, so that something which the manifest does not name is found out.
-            for item in self._bucket.listed(f"{prefix}/"):
-                name = PurePosixPath(item.key.removeprefix(f"{prefix}/"))
-                if ".." not in name.parts and not (folder / name).exists():
-                    self._bucket.fetch(item.key, folder / name)
+            self._stored.fetch(iteration, stored, folder)
         return folder
 
     def _local_checkpoint(self, iteration: int, stored: StoredCheckpoint | None) -> Path:
         if stored is None or self._keys.get(iteration) == stored.key:
             return self.folder() / names.CHECKPOINTS_FOLDER / f"{iteration:06d}"
         return self.folder() / "fetched" / stored.key / f"{iteration:06d}"
-
-    def _checkpoint_prefix(self, iteration: int, key: str) -> str:
-        return f"{self._prefix}/{names.CHECKPOINTS_FOLDER}/{iteration:06d}-{key}"
 
     def _look_head(self) -> Head:
         as_of = self._parts.snapshot
@@ -349,16 +343,12 @@ class TrialState:
         """Upload a checkpoint's files; None: it was removed meanwhile."""
         folder = self.folder() / names.CHECKPOINTS_FOLDER / f"{iteration:06d}"
         try:
-            manifest = (folder / names.MANIFEST).read_text(encoding="utf-8")
-            for name in described_files(folder):
-                self._bucket.put(f"{self._checkpoint_prefix(iteration, key)}/{name}", folder / name)
-            # It may be replaced meanwhile: files of two are none, and the next try finds the other one.
-            is_same = (folder / names.MANIFEST).read_text(encoding="utf-8") == manifest
+            # It may be replaced meanwhile; the next try finds the other one.
+            return self._stored.upload(iteration, key, folder)
         except (FileNotFoundError, CheckpointError) as error:
             if iteration in self._checkpoints and self._keys.get(iteration) == key:
                 raise StorageError(f"Checkpoint {iteration} of {self._name} is gone: {error}.", passes=True) from error
             return None
-        return StoredCheckpoint(key=key, manifest=manifest) if is_same else None
 
     def _remove_unnamed(self, before: Head, now: Head) -> None:
         """Remove the objects that one head named, and no head names any more."""
@@ -366,10 +356,8 @@ class TrialState:
         unnamed = {chunk.key for chunk in before.results} - named
         gone = self._chunks.forget(unnamed)
         kept = {checkpoint.key for checkpoint in now.checkpoints.values()} | named
-        for iteration, checkpoint in before.checkpoints.items():
-            if checkpoint.key not in kept:
-                prefix = self._checkpoint_prefix(iteration, checkpoint.key)
-                gone += [item.key for item in self._bucket.listed(f"{prefix}/")]
+        replaced = [(i, stored.key) for i, stored in before.checkpoints.items() if stored.key not in kept]
+        gone += self._stored.listed(replaced)
         if gone:
             self._bucket.delete(gone)
 

@@ -1,0 +1,117 @@
+"""How many requests a sweep in an object store takes, and which of them wait for each other."""
+
+import threading
+
+import pytest
+from s3_faults import Faults, Opened
+from store_parts import fill, make_checkpoint, make_iteration, make_trial
+
+from analysis.records import CheckpointRecord
+from tune_jobs.store import names
+from tune_jobs.store.objects import owners
+from tune_jobs.store.objects.object_sweep import ObjectSweep
+
+NUM_TRIALS = 3
+
+
+@pytest.fixture
+def sweep(opened: Opened, faults: Faults) -> ObjectSweep:
+    """Trials with a checkpoint each, opened by a reader."""
+    made = opened()
+    for index in range(NUM_TRIALS):
+        trial = made.trial(f"t{index:04d}")
+        trial.write_record(make_trial(index))
+        trial.take()
+        trial.append_iterations([make_iteration(1)])
+        trial.write_checkpoint(make_checkpoint(1, trial_id=trial.trial_id), fill)
+        trial.settle()
+    faults.clear()
+    return opened()
+
+
+def _checkpoints() -> list[CheckpointRecord]:
+    return [make_checkpoint(1, trial_id=f"t{index:04d}") for index in range(NUM_TRIALS)]
+
+
+def test_records_that_have_not_changed_are_not_fetched_again(
+    faults: Faults, opened: Opened, sweep: ObjectSweep
+) -> None:
+    assert len(sweep.read_trials()) == NUM_TRIALS
+    assert faults.counts() == {"GET": NUM_TRIALS, "LIST": 1}
+    faults.clear()
+    assert len(sweep.read_trials()) == NUM_TRIALS
+    assert faults.counts() == {"LIST": 1}
+    opened().trial("t0001").write_record(make_trial(1, status="failed"))
+    faults.clear()
+    assert [record.status for record in sweep.read_trials()] == ["pending", "failed", "pending"]
+    assert faults.counts() == {"GET": 1, "LIST": 1}
+
+
+def test_records_that_this_process_has_written_are_not_fetched(faults: Faults, sweep: ObjectSweep) -> None:
+    for index in range(NUM_TRIALS):
+        sweep.trial(f"t{index:04d}").write_record(make_trial(index, status="completed"))
+    faults.clear()
+    assert {record.status for record in sweep.read_trials()} == {"completed"}
+    assert faults.counts() == {"LIST": 1}
+
+
+def test_checkpoints_that_are_read_are_fetched_once_and_all_at_once(faults: Faults, sweep: ObjectSweep) -> None:
+    # Each of these requests is answered when all of them have come.
+    all_came = threading.Barrier(NUM_TRIALS, timeout=30)
+    faults.rule("slow", kinds="LIST", keys="/checkpoints/", times=NUM_TRIALS, then=all_came.wait)
+    with sweep.reading(results=False, checkpoints=_checkpoints()):
+        faults.requests.clear()
+        for record in _checkpoints():
+            sweep.trial(record.trial_id).verify_checkpoint(1)
+            assert sweep.checkpoint_folder(record).is_dir()
+    assert faults.counts() == {}
+    assert not all_came.broken
+
+
+def test_files_of_one_checkpoint_are_uploaded_side_by_side(faults: Faults, opened: Opened) -> None:
+    trial = opened().trial("t0000")
+    trial.take()
+    both_came = threading.Barrier(2, timeout=30)
+    faults.rule("slow", kinds="PUT", keys="/(weights|policy.safetensors)$", times=2, then=both_came.wait)
+    trial.write_checkpoint(make_checkpoint(1), fill)
+    trial.settle()
+    assert not both_came.broken
+
+
+def test_a_report_is_uploaded_side_by_side_and_not_fetched_where_it_was_made(faults: Faults, opened: Opened) -> None:
+    sweep = opened()
+    figures = ["figures/a.svg", "figures/b.svg", "figures/c.svg"]
+    all_came = threading.Barrier(len(figures), timeout=30)
+    faults.rule("slow", kinds="PUT", keys="/figures/", times=len(figures), then=all_came.wait)
+    with sweep.writing_report() as folder:
+        for name in [*figures, names.REPORT_PAGE]:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(name)
+    assert not all_came.broken
+    assert faults.requests[-1].key.endswith(names.REPORT_PAGE)
+    faults.clear()
+    assert {name: path.read_text() for name, path in sweep.report_files().items()} == {
+        name: name for name in [*figures, names.REPORT_PAGE]
+    }
+    assert faults.counts() == {"LIST": 1}
+
+
+def test_who_writes_often_does_not_wait_for_the_question_who_owns_it(
+    faults: Faults, opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, answered = opened().take(), threading.Event()
+    monkeypatch.setattr(owners, "_LOOK_EVERY_S", 1e-9)
+    monkeypatch.setattr(owners, "_BELIEVED", 1e12)
+    with run.held():
+        pass
+    other = opened()
+    faults.rule("slow", kinds="GET", keys="run.json$", then=lambda: answered.wait(30))
+    with run.held():
+        # The answer is on its way.
+        answered.set()
+    other.take()
+    for _ in range(1000):
+        if not run.is_current():
+            return
+        threading.Event().wait(0.01)
+    pytest.fail("The run does not learn that another one has taken over.")
