@@ -11,7 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.benchmarks import dqn, objects, ppo, workload
+from tests.benchmarks.cluster import rows as cluster
 from tests.benchmarks.service import rows as service
+
+_PARTS = ("ppo", "many", "dqn", "service", "objects", "cluster")
 
 
 def main() -> None:
@@ -20,9 +23,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--env-steps", type=int, default=workload.NUM_ENV_STEPS, help="of each of the 20 trials")
     parser.add_argument("--dqn-env-steps", type=int, default=dqn.NUM_ENV_STEPS, help="of each DQN trial")
-    parser.add_argument("--only", choices=["ppo", "many", "dqn", "service", "objects"], help="these rows alone")
+    parser.add_argument("--only", choices=_PARTS, help="these rows alone")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--hours", type=float, default=24.0, help="of the service, simulated at speed")
+    parser.add_argument("--trials", type=int, default=10_000, help="of the cluster's largest sweep, of 3 s each")
     options = parser.parse_args()
     rows = []
     if options.only in (None, "ppo"):
@@ -35,6 +39,9 @@ def main() -> None:
         rows += service.rows(options.repeats, options.hours)
     if options.only in (None, "objects"):
         rows += objects.rows(options.repeats)
+    if options.only == "cluster":
+        # Half an hour with 10,000 trials, and a cluster of its own: not among the others.
+        rows += cluster.rows(options.trials)
     table = Table(title=f"{ppo.machine_name()}, medians of {options.repeats}")
     for column in ("figure", "measured", "at most / at least"):
         table.add_column(column)

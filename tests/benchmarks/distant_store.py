@@ -2,7 +2,7 @@
 
 `python -m tests.benchmarks.distant_store MILLISECONDS` prints its address and serves until it is ended. It has what the
 object store of sweeps asks for (GET, HEAD, PUT with conditions, lists, deletion of one and of many), and knows nothing
-of signatures.
+of signatures. `GET /-/requests` tells how many requests of each method came so far, as JSON.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from __future__ import annotations
 import asyncio
 import functools
 import hashlib
+import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,6 +22,8 @@ from urllib.parse import parse_qs, unquote, urlsplit
 from xml.sax.saxutils import escape, unescape
 
 _PAGE = 1_000
+REQUESTS = "/-/requests"
+"""No bucket's path."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +41,16 @@ class Store:
 
     def __init__(self) -> None:
         self.objects: dict[str, _Object] = {}
-        self.num_requests = 0
+        self.num_requests: Counter[str] = Counter()
+
+    def requests(self) -> Answer:
+        """Tell how many requests came."""
+        return 200, {"Content-Type": "application/json"}, json.dumps(self.num_requests).encode()
 
     def answer(self, method: str, target: str, headers: Mapping[str, str], body: bytes) -> Answer:
         """Return status, headers and body for a request."""
-        self.num_requests += 1
         parts = urlsplit(target)
+        self.num_requests[method] += 1
         query = {name: values[0] for name, values in parse_qs(parts.query, keep_blank_values=True).items()}
         path = unquote(parts.path).lstrip("/")
         if method == "GET" and "list-type" in query:
@@ -106,8 +114,11 @@ async def _serve(store: Store, delay_s: float, reader: asyncio.StreamReader, wri
         method, target, _ = first.split(" ", 2)
         headers = {name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
         body = await reader.readexactly(int(headers.get("content-length", 0)))
-        status, told, data = store.answer(method, target, headers, body)
-        await asyncio.sleep(delay_s)
+        if target == REQUESTS:
+            status, told, data = store.requests()
+        else:
+            status, told, data = store.answer(method, target, headers, body)
+            await asyncio.sleep(delay_s)
         answered = {**told, "Content-Length": str(len(data))}
         text = "".join(f"{name}: {value}\r\n" for name, value in answered.items())
         writer.write(f"HTTP/1.1 {status} .\r\n{text}\r\n".encode() + (b"" if method == "HEAD" else data))

@@ -20,8 +20,9 @@ _MOST = 1.05
 
 
 @contextlib.contextmanager
-def _distant_store() -> Iterator[str]:
-    command = [sys.executable, "-m", "tests.benchmarks.distant_store", str(_LATENCY_MS)]
+def distant_store(latency_ms: int = _LATENCY_MS) -> Iterator[str]:
+    """Serve `tests.benchmarks.distant_store` for the block; gives its address."""
+    command = [sys.executable, "-m", "tests.benchmarks.distant_store", str(latency_ms)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         if server.stdout is None:
             raise RuntimeError("The server says nothing.")
@@ -36,7 +37,7 @@ def rows(repeats: int) -> list[tuple[str, str, str]]:
     # What the server takes as credentials: anything.
     os.environ |= {"AWS_ACCESS_KEY_ID": "bench", "AWS_SECRET_ACCESS_KEY": "bench"}
     times: dict[str, list[float]] = {"folder": [], "store": []}
-    with tempfile.TemporaryDirectory(prefix="tune-jobs-bench-") as folder, _distant_store() as endpoint:
+    with tempfile.TemporaryDirectory(prefix="tune-jobs-bench-") as folder, distant_store() as endpoint:
         places = {"folder": f"{folder}/sweeps", "store": f"s3://bench/sweeps?endpoint={endpoint}"}
         for turn in range(repeats):
             for kind, place in places.items():

@@ -84,7 +84,7 @@ class Node:
 
 
 class Cluster:
-    """A head with one CPU, and as many other nodes as a test starts; with Ray's token authentication on.
+    """A head, and as many other nodes as a test starts; with Ray's token authentication on.
 
     Args:
         folder: For logs; the token and Ray's own files lie in a folder with a short name, as sockets' names are.
@@ -116,8 +116,8 @@ class Cluster:
         }
         self.nodes: dict[str, Node] = {}
 
-    def start_head(self, dashboard_port: int | None = None) -> Node:
-        """Start the head; with a port, the dashboard answers there, and takes jobs."""
+    def start_head(self, dashboard_port: int | None = None, *, num_cpus: int = 1, prefix: Sequence[str] = ()) -> Node:
+        """Start the head; with a port, the dashboard answers there, and takes jobs. `prefix` is as for a worker."""
         self.jobs_address = f"http://127.0.0.1:{dashboard_port}"
         options = [
             "--head", f"--port={self.port}", f"--ray-client-server-port={self.client_port}",
@@ -125,7 +125,7 @@ class Cluster:
             f"--include-dashboard={'true' if dashboard_port else 'false'}",
             *self._at(self.host),
         ]  # fmt: skip
-        return self._start("head", options, 1, (), {})
+        return self._start("head", options, num_cpus, prefix, {})
 
     def start_worker(
         self,

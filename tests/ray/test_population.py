@@ -151,7 +151,7 @@ def simulated(seed: int, make: Make) -> list[list[Any]]:
             over = steps[trial] >= MAX_ENV_STEPS
             told = {
                 "num_env_steps": steps[trial], "score": score, "evaluated": bool(rng.random() < 0.8),
-                "progress/num_iterations": report,
+                "progress": SimpleNamespace(report=SimpleNamespace(num_iterations=report)),
             }  # fmt: skip
             num_saves, num_changes = len(controller.saves), len(records[name].changes)
             decision = "STOP" if over else judge.on_trial_result(controller, trial, told)

@@ -283,7 +283,6 @@ class PackScheduler(FIFOScheduler):  # type: ignore[misc]
         result: dict[str, Any],
     ) -> str:
         """Pass the reports to the driver, and return its decision."""
-        is_done = self._driver.take(
-            str(trial.config["pack_id"]), result["reports"], node=result["node"], pid=result["pid"]
-        )
+        reports: Sequence[MemberReport] = result["reports"].report
+        is_done = self._driver.take(str(trial.config["pack_id"]), reports, node=result["node"], pid=result["pid"])
         return str(TrialScheduler.STOP if is_done else TrialScheduler.CONTINUE)

@@ -16,6 +16,7 @@ from ray import tune
 from policies.acting.evaluate import Evaluator
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules
+from tune_jobs.ray_tune.lean import Sealed
 from tune_jobs.ray_tune.lost_nodes import DrainNotice
 from tune_jobs.ray_tune.trainable import (
     REPORT_INTERVAL_S,
@@ -75,7 +76,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
             traceback.print_exc()
             raise
         # The driver decides when there is nothing left to do.
-        return {"done": False, "reports": reports, "node": self._node}
+        return {"done": False, "reports": Sealed(reports), "node": self._node}
 
     def _leave(self, loop: PackLoop) -> None:
         """Save the members and end the pack here, as the node is taken away."""

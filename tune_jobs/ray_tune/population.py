@@ -184,7 +184,7 @@ class PopulationScheduler(TuneScheduler):
         pointer = self._pointer(decision.trial_id)
         record = self._read(name_of(trial))
         # The record is that of the previous report, because Tune asks its scheduler first.
-        iteration, num_env_steps = result["progress/num_iterations"], result["num_env_steps"]
+        iteration, num_env_steps = result["progress"].report.num_iterations, result["num_env_steps"]
         copied = copy_latest_checkpoint(
             self._store.trial(decision.trial_id), self._store.trial(record.trial_id), iteration
         )

@@ -15,6 +15,7 @@ from typing import Any
 from ray import tune
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
+from ray.tune.search import BasicVariantGenerator, SearchAlgorithm, Searcher
 
 from policies.errors import CannotRunError
 from policies.parents import this_process
@@ -23,6 +24,7 @@ from tune_jobs.process.interruption import current
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import going_on
+from tune_jobs.ray_tune.lean import without_state_of_trials
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -179,7 +181,7 @@ class _Run:
             # The driver decides which of a dead pack's trials are retried, and the run ends when none is left.
             run_config=self._run_config(folder, events, -1, lambda: driver.is_finished),
         )
-        with losses.not_counted():
+        with losses.not_counted(), without_state_of_trials():
             tuner.fit()
 
     def _single_trials(self, trial_ids: Sequence[str], folder: str) -> None:
@@ -188,27 +190,30 @@ class _Run:
         param_space: dict[str, Any] = dict(self._config)
         losses = NodeLosses(self._reached, self._watch.check_after)
         events = TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
-        searcher = None
+        at_once = None if waits_for_others(spec.scheduler) else job.max_concurrent
+        searcher: Searcher | SearchAlgorithm
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
         else:
-            param_space["trial_id"] = tune.grid_search(list(trial_ids))
+            # As a grid, Tune would copy the ids of all trials for each of them.
+            param_space["trial_id"] = None
+            searcher = BasicVariantGenerator([{"trial_id": name} for name in trial_ids], max_concurrent=at_once or 0)
         tuner = tune.Tuner(
             tune.with_resources(TrialTrainable, _resources(spec, job)),
             param_space=param_space,
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
-                num_samples=1 if searcher is None else len(trial_ids),
+                num_samples=len(trial_ids),
                 scheduler=self._scheduler,
-                # Without this setting Tune runs one trial at a time if there is a searcher.
-                max_concurrent_trials=None if waits_for_others(spec.scheduler) else job.max_concurrent,
+                # Without this setting Tune runs one trial at a time if there is a searcher that is not its own.
+                max_concurrent_trials=None if self._chooser is None else at_once,
                 reuse_actors=True,
                 trial_name_creator=trial_id_of,
                 trial_dirname_creator=trial_id_of,
             ),
             run_config=self._run_config(folder, events, spec.max_retries),
         )
-        with losses.not_counted():
+        with losses.not_counted(), without_state_of_trials():
             tuner.fit()
 
     def _reached(self, trial: Trial) -> int:

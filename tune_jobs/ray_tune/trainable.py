@@ -27,6 +27,7 @@ from policies.envs.tallies import end_tally
 from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
+from tune_jobs.ray_tune.lean import Sealed
 from tune_jobs.ray_tune.lost_nodes import DrainNotice
 from tune_jobs.ray_tune.scheduling import score_of
 from tune_jobs.ray_tune.tune_scheduler import METRIC
@@ -254,8 +255,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         return {
             "done": progress.status != "running",
             **compared_by(progress),
-            # Tune looks into results, and takes them apart.
-            "progress": progress.model_dump(),
+            "progress": Sealed(progress),
             "node": self._node,
             "host": socket.gethostname(),
         }

@@ -37,9 +37,12 @@ class TrialEvents(tune.Callback):  # type: ignore[misc]
         self._timeout_s = timeout_s
         self._losses = losses
         self._watch = watch
+        self._started: dict[str, Trial] = {}
+        """Tune's trials that were begun and not seen paused since."""
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Note that a process has begun the trial."""
+        self._started[trial_id_of(trial)] = trial
         self._keeper.started(trial_id_of(trial))
 
     def on_trial_result(
@@ -50,15 +53,21 @@ class TrialEvents(tune.Callback):  # type: ignore[misc]
         result: dict[str, Any],
         **info: Any,
     ) -> None:
-        """Take a trial's report, which comes about once a second and after each evaluation."""
-        progress = Progress.model_validate(result["progress"])
+        """Take a trial's report, which comes about once a second and after each evaluation.
+
+        It is taken out of the result, as Tune keeps the last result of every trial until the end of the run.
+        """
+        progress: Progress = result.pop("progress").report
         self._keeper.progressed(trial_id_of(trial), progress, node=result["node"], pid=result["pid"])
 
     def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
         """Note paused trials, which schedulers do not report; they have saved and need not be waited for."""
-        for trial in trials:
-            trial_id = trial_id_of(trial)
-            if trial.status == Trial.PAUSED and trial_id in self._keeper.running:
+        # Tune calls this at each of its events: of 10,000 trials, a look at all would cost more than the event.
+        for trial_id in [name for name in self._started if name not in self._keeper.running]:
+            del self._started[trial_id]
+        for trial_id, trial in list(self._started.items()):
+            if trial.status == Trial.PAUSED:
+                del self._started[trial_id]
                 self._keeper.paused(trial_id)
         self._keeper.flush()
 
