@@ -12,7 +12,9 @@ from store_parts import fill, make_checkpoint, make_iteration, make_trial
 
 from policies.errors import CheckpointError
 from tune_jobs.store.objects.bucket import Bucket, Tag
+from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.ownership import OwnershipLostError
+from tune_jobs.store.pack_contract import Assignment
 
 
 def test_an_owner_before_writes_nothing_with_its_upload_in_flight(faults: Faults, opened: Opened) -> None:
@@ -136,13 +138,16 @@ def test_a_run_before_writes_no_record_over_that_of_the_next_even_if_it_has_read
 
 
 def test_removing_what_no_head_names_may_fail(faults: Faults, opened: Opened) -> None:
-    trial = opened().trial("t0000")
+    sweep = opened()
+    trial = sweep.trial("t0000")
     trial.take()
     denied = "<Error><Code>AccessDenied</Code><Message>No.</Message></Error>"
     faults.rule("status", kinds="POST", status=403, body=denied, times=10_000)
     for number in (1, 2, 3):
         trial.append_iterations([make_iteration(number)])
         trial.settle()
+        outbox().settle(sweep._parts.jobs)
+    assert faults.counts()["POST"] == 2
     assert iterations(opened) == [1, 2, 3]
 
 
@@ -168,9 +173,20 @@ def test_requests_have_bounds(faults: Faults, opened: Opened) -> None:
 
     # The trial's head, and the run's owner.
     assert counted(lambda: trial.take(run_of_it)) == {"GET": 2, "PUT": 1}
-    # Three files, the results, the head, and the log; of the next one the results that were joined are removed.
+    # Three files, the results, the head, and the log; of the next one the results that were joined are removed
+    # later, which nobody waits for.
     assert counted(lambda: checkpoint(1)) == {"PUT": 5}
-    assert counted(lambda: checkpoint(2)) == {"POST": 1, "PUT": 5}
+    assert counted(lambda: checkpoint(2)) == {"PUT": 5}
+    assert counted(lambda: checkpoint(3)) == {"PUT": 5}
+    assert counted(lambda: outbox().settle(sweep._parts.jobs)) == {"POST": 1}
+    # What lies there that nobody names: there is none where no process wrote before.
+    assert counted(trial.remove_leftovers) == {}
+    assert counted(lambda: opened().trial("t0000").remove_leftovers()) == {"GET": 1, "LIST": 2}
+    # Whom a pack trains is written where it has changed: whether there is one, and whose the run is, at first.
+    pack = sweep.pack("p00")
+    assert counted(lambda: pack.write(Assignment(("t0000",)))) == {"GET": 2, "PUT": 1}
+    assert counted(lambda: pack.write(Assignment(("t0000",)))) == {}
+    assert counted(lambda: pack.write(Assignment(()))) == {"PUT": 1}
     # Whether there is one, and whose the run is; after that, none is asked for.
     assert counted(record) == {"GET": 2, "PUT": 1}
     assert counted(lambda: record(status="running")) == {"PUT": 1}
@@ -178,4 +194,4 @@ def test_requests_have_bounds(faults: Faults, opened: Opened) -> None:
     assert counted(reader.read_trials) == {"GET": 1, "LIST": 1}
     assert counted(reader.trial("t0000").read_iterations) == {"GET": 2}
     assert counted(reader.trial("t0000").read_iterations) == {"GET": 1}
-    assert counted(reader.trial("t0000").checkpoints) == {"GET": 3}
+    assert counted(reader.trial("t0000").checkpoints) == {"GET": 4}

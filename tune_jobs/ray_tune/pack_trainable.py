@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import traceback
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import IO, TYPE_CHECKING, Any
 
 from ray import tune
@@ -35,6 +36,8 @@ from tune_jobs.training.registry import make_pack_engine
 if TYPE_CHECKING:
     from policies.acting.evaluate import Episodes
     from policies.acting.policy import Policy
+
+_READ_AT_ONCE = 16
 
 
 class PackTrainable(tune.Trainable):  # type: ignore[misc]
@@ -120,14 +123,18 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         Raises:
             OwnershipLostError: Another process runs this pack by now, and reads the same assignment.
         """
-        self._owner.check()
-        assignment = self._files.read()
+        with self._owner.held():
+            assignment = self._files.read()
         for trial_id in loop.trial_ids:
             if trial_id not in assignment.trial_ids:
                 loop.end(trial_id)
-        for trial_id in assignment.trial_ids:
-            if trial_id not in loop.trial_ids:
-                loop.add(self._reader.read(trial_id), assignment.num_failures.get(trial_id, 0))
+        new = [trial_id for trial_id in assignment.trial_ids if trial_id not in loop.trial_ids]
+        if new:
+            # Side by side, as a store may be far away.
+            with ThreadPoolExecutor(min(len(new), _READ_AT_ONCE)) as pool:
+                tasks = list(pool.map(self._reader.read, new))
+            for task in tasks:
+                loop.add(task, assignment.num_failures.get(task.trial_id, 0))
 
     def cleanup(self) -> None:
         """Free everything, as the process may end."""

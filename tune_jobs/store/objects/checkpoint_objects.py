@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+import json
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from policies.errors import NotFoundError
+from policies.errors import MALFORMED, NotFoundError
 from tune_jobs.store import names
 from tune_jobs.store.manifests import described_files
 from tune_jobs.store.objects.at_once import side_by_side
@@ -72,11 +72,10 @@ class CheckpointObjects:
         is_same = (folder / names.MANIFEST).read_text(encoding="utf-8") == manifest
         return StoredCheckpoint(key=key, manifest=manifest) if is_same else None
 
-    def listed(self, checkpoints: Iterable[tuple[int, str]]) -> list[str]:
-        """Return the keys of the objects of some checkpoints, given by iteration and name.
-
-        Raises:
-            StorageError: The store cannot be read.
-        """
-        prefixes = [f"{self.prefix_of(iteration, key)}/" for iteration, key in checkpoints]
-        return [item.key for items in side_by_side(self.bucket.listed, prefixes) for item in items]
+    def keys_of(self, iteration: int, stored: StoredCheckpoint) -> list[str]:
+        """Return the objects of a checkpoint; none if its manifest cannot be read, which leaves leftovers."""
+        try:
+            described = json.loads(stored.manifest)["files"]
+        except MALFORMED:
+            return []
+        return [f"{self.prefix_of(iteration, stored.key)}/{name}" for name in described]

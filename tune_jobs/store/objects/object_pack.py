@@ -40,6 +40,7 @@ class ObjectPack:
         self._parts = parts
         self._known: Assignment | CheckpointError | StorageError | None = None
         self._uploads: LogUploads | None = None
+        self._written: dict[str, Any] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ObjectPack, (self._parts, self.pack_id)
@@ -55,9 +56,13 @@ class ObjectPack:
     def write(self, assignment: Assignment) -> None:
         """Replace the assignment."""
         data = {"trial_ids": list(assignment.trial_ids), "num_failures": dict(assignment.num_failures)}
+        if data == self._written:
+            # A driver writes it after every report; if it is not the pack's any more, it hears so elsewhere.
+            return
         # The members' records are read when they are begun.
         self._parts.settle()
         self._parts.write_record(f"{self._prefix}.json", json.dumps(data) + "\n")
+        self._written = data
 
     def read(self) -> Assignment:
         """Read the assignment, as it was a moment ago; see `Pack.read`."""

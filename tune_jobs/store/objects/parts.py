@@ -6,7 +6,7 @@ import contextlib
 import re
 import secrets
 import threading
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,6 +27,7 @@ _RecordT = TypeVar("_RecordT", bound=BaseModel)
 
 RECORDS = "records"
 _EVENTS_AFTER_S = 10.0
+_REMOVED_AFTER_S = 3.0
 _ATTEMPTS = 20
 
 
@@ -63,6 +64,7 @@ class Parts:
         """What this process may still have to upload here."""
         self._tags: dict[str, Tag | None] = {}
         self._pending: dict[str, bytes] = {}
+        self._gone: set[str] = set()
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -240,6 +242,25 @@ class Parts:
                 f"Another process drives {self.bucket.url.short} by now.",
                 "Leave it to that process; this one writes nothing there any more.",
             )
+
+    # -- what nobody needs any more
+
+    def remove_later(self, keys: Collection[str]) -> None:
+        """Remove objects that nothing names any more, together with others; it is not told if they cannot be."""
+        if not keys:
+            return
+        job = "gone", self._writer
+        with self._lock:
+            self._gone.update(keys)
+        self.jobs.add(job)
+        with contextlib.suppress(TuneJobsError):
+            outbox().add(job, self._remove, after_s=_REMOVED_AFTER_S)
+
+    def _remove(self) -> None:
+        with self._lock:
+            gone, self._gone = sorted(self._gone), set()
+        with contextlib.suppress(StorageError):
+            self.bucket.delete(gone)
 
     # -- files that grow
 

@@ -7,18 +7,18 @@ no head names any more is removed.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import secrets
 import shutil
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from policies.errors import CannotRunError, CheckpointError
 from policies.files import write_atomic
 from tune_jobs.store import names
+from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, StorageError, Tag
 from tune_jobs.store.objects.checkpoint_objects import CheckpointObjects
 from tune_jobs.store.objects.head import Chunk, Head, StoredCheckpoint, read_head
@@ -55,6 +55,7 @@ class TrialState:
         self._token: str | None = None
         self._is_lost, self._looked_at = False, -float("inf")
         self._is_writing = False
+        self._is_first = False  # Whether this process is the first one that has ever taken the trial.
         # What this process has written, as names of local folders by iteration, and what is to be in the next head.
         self._checkpoints: dict[int, StoredCheckpoint | None] = {}
         self._keys: dict[int, str] = {}
@@ -73,9 +74,11 @@ class TrialState:
         """Become the owner; see `Trial.take`."""
         outbox().forget([self._job])
         for _ in range(_ATTEMPTS):
-            head, tag = read_head(self._bucket, self._head_key)
+            # An owner of before, who is refused here, is one that was replaced before this call.
+            asked: list[Callable[[], tuple[Head, Tag | None] | None]] = [self._read_head]
             if under is not None:
-                under.check()
+                asked.append(under.check)
+            head, tag = side_by_side(lambda ask: ask(), asked)[0] or (Head(), None)
             epoch = Epoch.of(head.owner).next(under.token if under is not None else None, self._name)
             token = epoch.token()
             new = head.model_copy(update={"owner": token, "sequence": head.sequence + 1})
@@ -85,9 +88,13 @@ class TrialState:
                 continue
             with self._lock:
                 self._token, self._is_lost, self._looked_at = token, False, time.monotonic()
+                self._is_first = tag is None
                 self._begin_writing(new, new_tag)
             return
         raise CannotRunError(f"{self._name} is taken by one after the other.", "End those that drive this sweep.")
+
+    def _read_head(self) -> tuple[Head, Tag | None]:
+        return read_head(self._bucket, self._head_key)
 
     def _begin_writing(self, head: Head, tag: Tag | None) -> None:
         # Until all is here, what is here is not the newest state, and must not be written as if it were.
@@ -296,12 +303,7 @@ class TrialState:
             keys, damaged, has_results = dict(self._keys), dict(self._damaged), self._has_results
             content = (self.folder() / names.RESULTS).read_bytes() if has_results else b""
             known = self._results
-        stored: dict[int, StoredCheckpoint] = {}
-        for iteration, present in sorted(wanted.items()):
-            found = present if present is not None else self._upload_checkpoint(iteration, keys[iteration])
-            if found is not None:
-                stored[iteration] = found
-        results = self._chunks.upload(content, known)
+        stored, results = self._upload_objects(wanted, keys, content, known)
         head = self._head.model_copy(
             update={
                 "owner": self._token if self._token is not None else self._head.owner,
@@ -319,9 +321,29 @@ class TrialState:
             for iteration, checkpoint in stored.items():
                 if iteration in self._checkpoints and self._keys.get(iteration, checkpoint.key) == checkpoint.key:
                     self._checkpoints[iteration] = checkpoint
-        # What cannot be removed now is a leftover; the state itself is in the store.
-        with contextlib.suppress(StorageError):
-            self._remove_unnamed(before, head)
+        self._remove_unnamed(before, head)
+
+    def _upload_objects(
+        self,
+        wanted: Mapping[int, StoredCheckpoint | None],
+        keys: Mapping[int, str],
+        content: bytes,
+        known: Sequence[Chunk],
+    ) -> tuple[dict[int, StoredCheckpoint], tuple[Chunk, ...]]:
+        """Upload what the store lacks, side by side, and return all checkpoints and results for the head."""
+        results = list[Chunk]()
+        new = [iteration for iteration, stored in sorted(wanted.items()) if stored is None]
+
+        def upload(iteration: int | None) -> StoredCheckpoint | None:
+            if iteration is not None:
+                return self._upload_checkpoint(iteration, keys[iteration])
+            results.extend(self._chunks.upload(content, known))
+            return None
+
+        # The first is done by this thread, so that the files of a single checkpoint are side by side, too.
+        uploaded = dict(zip(new, side_by_side(upload, [*new, None]), strict=False))
+        found = {iteration: stored or uploaded[iteration] for iteration, stored in sorted(wanted.items())}
+        return {iteration: stored for iteration, stored in found.items() if stored is not None}, tuple(results)
 
     def _commit(self, head: Head) -> None:
         try:
@@ -356,13 +378,16 @@ class TrialState:
         unnamed = {chunk.key for chunk in before.results} - named
         gone = self._chunks.forget(unnamed)
         kept = {checkpoint.key for checkpoint in now.checkpoints.values()} | named
-        replaced = [(i, stored.key) for i, stored in before.checkpoints.items() if stored.key not in kept]
-        gone += self._stored.listed(replaced)
-        if gone:
-            self._bucket.delete(gone)
+        for iteration, checkpoint in before.checkpoints.items():
+            if checkpoint.key not in kept:
+                gone += self._stored.keys_of(iteration, checkpoint)
+        # Nobody waits for it: what is not removed is a leftover.
+        self._parts.remove_later(gone)
 
     def remove_leftovers(self) -> None:
         """Remove objects that no head names: those of a process that ended before it wrote its head."""
+        if self._is_first:
+            return
         head = self._head if self._is_writing else self._look_head()
         named = {chunk.key for chunk in head.results} | {item.key for item in head.checkpoints.values()}
         named |= {key for text in head.damaged.values() for key in text.split()} | set(self._keys.values())
