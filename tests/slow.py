@@ -19,6 +19,7 @@ SLOW = {
     "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[packed-drain]":
         "the same, rllib",
     "tests/cluster/test_detached_sweeps.py": "tests/unit/test_detached.py, and tests/unit/test_jobs.py",
+    "tests/cluster/test_joining_nodes.py": "tests/ray/test_pack_driver.py",
     "tests/learning/test_learning.py::test_dqn_learns_cartpole": _LEARN,
     "tests/learning/test_learning.py::test_ppo_learns_pendulum": _LEARN,
     "tests/learning/test_packed_dqn_learning.py::test_a_pack_of_dqn_trials_solves_cartpole": _LEARN,

@@ -151,16 +151,18 @@ def run_packs(
     pause_s: float = 0.0,
     listener: Listener | None = None,
     trial_ids: tuple[str, ...] | None = None,
+    cpus_per_pack: float = 1.0,
+    more_packs: int = 0,
 ) -> list[TrialRecord]:
     """Run the trials of a sweep that have not ended, in packs; returns their records."""
     from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
     todo = tuple(record.trial_id for record in store.read_trials() if record.status in ("pending", "paused", "running"))
     packs = PackPlan(
-        num_packs=num_packs, slots=slots, cpus_per_pack=1.0, gpus_per_pack=0.0, trial_ids=trial_ids or todo,
+        num_packs=num_packs, slots=slots, cpus_per_pack=cpus_per_pack, gpus_per_pack=0.0, trial_ids=trial_ids or todo,
         env_kind="scalar", env_step_us=None, num_env_processes=0,
     )  # fmt: skip
-    job = RunJob(store.place, todo, 1.0, 0.0, 2, packs=packs)
+    job = RunJob(store.place, todo, 1.0, 0.0, 2, packs=packs, more_packs=more_packs)
     with mock.patch("tune_jobs.ray_tune.run_trials.PackTrainable", scripted_trainable(scripts or {}, pause_s)):
         run_trials(job, listener or (lambda record: None))
     return store.read_trials()

@@ -35,6 +35,7 @@ class Driven:
         num_packs: int = 2,
         slots: int = 2,
         choose: Callable[[str], None] | None = None,
+        more_packs: int = 0,
         **spec: Any,
     ) -> None:
         self.store = make_sweep(folder / "mine", num_trials, **spec)
@@ -44,9 +45,10 @@ class Driven:
         plan = PackPlan(num_packs, slots, 1.0, 0.0, tuple(names), "scalar", None, 0)
         scheduler = build_scheduler(self.spec.scheduler, self.spec.stop.num_env_steps)
         self.driver = PackDriver(
-            self.store, self.spec, plan, names, scheduler=scheduler, keeper=self.keeper, choose=choose
-        )
-        for pack_id in self.driver.pack_ids:
+            self.store, self.spec, plan, names, scheduler=scheduler, keeper=self.keeper, choose=choose,
+            more_packs=more_packs,
+        )  # fmt: skip
+        for pack_id in self.driver.pack_ids[:num_packs]:
             self.driver.started(pack_id)
 
     def assigned(self, pack_id: str = "p00") -> list[int]:
@@ -104,6 +106,52 @@ def test_free_slots_are_filled_until_nobody_waits(tmp_path: Path) -> None:
     assert driven.tell(t0001=(1000, "completed"), t0004=(1000, "completed")) is True
     assert driven.driver.is_finished
     assert [driven.status(number)[0] for number in (0, 3)] == ["completed", "failed"]
+
+
+@pytest.mark.parametrize(
+    ("num_trials", "more_packs", "num_packs"), [(4, 9, 2), (5, 9, 3), (9, 9, 5), (9, 1, 3), (1, 9, 1)]
+)
+def test_there_are_no_more_packs_than_trials_that_wait_would_fill(
+    tmp_path: Path, num_trials: int, more_packs: int, num_packs: int
+) -> None:
+    assert len(Driven(tmp_path, num_trials, more_packs=more_packs).driver.pack_ids) == num_packs
+
+
+def test_a_pack_on_a_node_that_joins_takes_trials_that_wait(tmp_path: Path) -> None:
+    driven = Driven(tmp_path, 9, more_packs=9)
+    assert [driven.assigned(name) for name in driven.driver.pack_ids] == [[0, 1], [2, 3], [], [], []]
+    driven.driver.started("p02")
+    assert driven.assigned("p02") == [4, 5]
+    assert driven.status(4) == ("running", 0)
+    driven.tell("p02", t0004=(1000, "completed"))
+    assert driven.assigned("p02") == [5, 6]
+    # Those that train stay where they are.
+    assert [driven.assigned("p00"), driven.assigned("p01")] == [[0, 1], [2, 3]]
+    assert not driven.driver.is_of_no_use("p03")
+    driven.tell(t0000=(1000, "completed"), t0001=(1000, "completed"))
+    assert driven.assigned() == [7, 8]
+    assert [driven.driver.is_of_no_use(name) for name in driven.driver.pack_ids] == [False, False, False, True, True]
+    # One that gets its node too late has nothing to do, and none that has none is waited for.
+    driven.driver.started("p03")
+    assert driven.tell("p03") is True
+    driven.driver.closed("p03")
+    driven.tell(t0007=(1000, "completed"), t0008=(1000, "completed"))
+    driven.tell("p01", t0002=(1000, "completed"), t0003=(1000, "completed"))
+    assert not driven.driver.is_finished
+    driven.tell("p02", t0005=(1000, "completed"), t0006=(1000, "completed"))
+    assert driven.driver.is_finished
+
+
+def test_a_pack_on_a_node_that_joins_takes_trials_whose_node_was_lost_first(tmp_path: Path) -> None:
+    driven = Driven(tmp_path, 7, more_packs=9)
+    driven.driver.moved("p01", "Node 192.0.2.1 was lost.")
+    assert driven.status(2)[0] != "running"
+    driven.driver.started("p02")
+    assert [driven.assigned("p01"), driven.assigned("p02")] == [[], [2, 3]]
+    assert driven.status(2) == ("running", 0)
+    # Now the lost one waits for a node, and goes on as one that joins.
+    driven.driver.started("p01")
+    assert driven.assigned("p01") == [4, 5]
 
 
 def test_points_are_chosen_when_trials_are_handed_out_and_once(tmp_path: Path) -> None:

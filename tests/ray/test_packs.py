@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import ray
 from scripted_packs import STEPS, make_sweep, run_packs
 from test_schedulers import MIXED
 
@@ -63,6 +64,24 @@ def test_fewer_trials_than_slots_are_spread_evenly(tmp_path: Path) -> None:
     records = run_packs(make_sweep(tmp_path / "mine", 5), slots=64)
     pids = [record.pid for record in records]
     assert pids[0] == pids[1] == pids[2] != pids[3] == pids[4]
+
+
+def test_packs_that_never_get_a_node_do_not_hold_up_the_end(tmp_path: Path) -> None:
+    store, all_cpus = make_sweep(tmp_path / "mine", 3), ray.cluster_resources()["CPU"]
+    asked: list[int] = []
+
+    def listen(_: TrialRecord) -> None:
+        groups = ray.util.placement_group_table().values()
+        asked.append(sum(group["state"] == "PENDING" for group in groups))
+
+    records = run_packs(
+        store, num_packs=1, slots=1, cpus_per_pack=all_cpus, more_packs=9, listener=listen, pause_s=0.2
+    )  # fmt: skip
+    assert [(record.status, record.num_failures) for record in records] == [("completed", 0)] * 3
+    assert len({record.pid for record in records}) == 1
+    # A pack each for the two that wait; and none once the last one has begun.
+    assert max(asked) == 2
+    assert asked[-1] == 0
 
 
 def test_trials_that_are_not_packed_run_too(tmp_path: Path) -> None:

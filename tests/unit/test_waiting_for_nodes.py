@@ -12,6 +12,7 @@ from sweep_folders import make_sweep_folder
 from analysis.waits import WaitRecord
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.plan.concurrency import max_concurrent
+from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import taking_signals
 from tune_jobs.ray_tune import connected_ray
@@ -263,3 +264,26 @@ def test_trials_may_begin_on_nodes_that_join(tmp_path: Path, changes: dict[str, 
     store = make_sweep_folder(tmp_path / "mine")
     store.write_record(store.read_record().model_copy(update={"spec": spec.model_dump(mode="json")}))
     assert drive.most_at_once(store, now, num_trials=6) == at_once
+
+
+@pytest.mark.parametrize(
+    ("changes", "slots", "more"),
+    [
+        ({}, 12, 0),
+        ({}, 5, 2),
+        ({"resources": {"max_concurrent": 10}}, 5, 1),
+        ({"resources": {"max_concurrent": 9}}, 5, 0),
+        ({"search": {"type": "tpe"}}, 5, 0),
+    ],
+    ids=["none waits", "those that wait", "as many as the user lets", "not half a pack", "a search keeps its number"],
+)
+def test_packs_may_begin_on_nodes_that_join(tmp_path: Path, changes: dict[str, Any], slots: int, more: int) -> None:
+    space = {"lr": {"loguniform": [1e-3, 1e-2]}}
+    given = {**SPEC.model_dump(exclude_unset=True), "engine": "auto", "resources": {}, "space": space, **changes}
+    store = make_sweep_folder(tmp_path / "mine")
+    spec = load_spec({**given, "num_samples": 12}).model_dump(mode="json")
+    store.write_record(store.read_record().model_copy(update={"spec": spec}))
+    names = tuple(f"t{index:04d}" for index in range(12))
+    plan = PackPlan(1, slots, 1.0, 0.0, names, "scalar", None, 0)
+    assert drive.packs_for_more_nodes(store, plan) == more
+    assert drive.packs_for_more_nodes(store, None) == 0

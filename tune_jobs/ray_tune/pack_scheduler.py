@@ -4,6 +4,9 @@ For Ray Tune, each pack is one trial. Tune calls its scheduler with a pack's rep
 so a decision takes effect in the pack's next step. The sweep's own scheduler (`tune_jobs.ray_tune.scheduling`)
 compares the members, whichever pack they are in.
 
+On a cluster there may be more packs than the nodes hold, which Tune starts on nodes that join: they train trials that
+wait, and those of a pack that has lost its node and got no other. A trial that a process trains stays with it.
+
 A pack whose process died is started again, and its members go on from their latest checkpoints. One of them may be
 the cause: a member that was twice in a pack that died continues alone, and only its failures alone count against its
 retries.
@@ -61,6 +64,7 @@ class PackDriver:
         scheduler: Compares the trials and ends the worse.
         keeper: Keeps their records.
         choose: Called with a trial that is being assigned, to choose its point; None: all points are known.
+        more_packs: The most packs beside those of the plan, for nodes that join.
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class PackDriver:
         scheduler: Scheduler,
         keeper: RecordKeeper,
         choose: Callable[[str], None] | None = None,
+        more_packs: int = 0,
     ) -> None:
         self._store = store
         self._slots = plan.slots
@@ -86,10 +91,13 @@ class PackDriver:
         self._num_failures: Counter[str] = Counter()
         self._num_deaths: Counter[str] = Counter()
         num_packs = min(plan.num_packs, len(trial_ids))
-        self._packs = {f"p{i:02d}": _Pack(store.pack(f"p{i:02d}")) for i in range(num_packs)}
+        num_waiting = max(0, len(trial_ids) - num_packs * self._slots)
+        num_more = min(more_packs, math.ceil(num_waiting / self._slots))
+        self._packs = {f"p{i:02d}": _Pack(store.pack(f"p{i:02d}")) for i in range(num_packs + num_more)}
         for index, pack in enumerate(self._packs.values()):
-            # If there are fewer trials than room, they are spread evenly.
-            self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))
+            if index < num_packs:
+                # If there are fewer trials than room, they are spread evenly.
+                self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))
             self._write(pack)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -112,11 +120,31 @@ class PackDriver:
         return self._packs[pack_id].files.log_tail()
 
     def started(self, pack_id: str) -> None:
-        """Note that a pack's process runs."""
+        """Note that a pack's process runs; one that has no trials yet is given some."""
         pack = self._packs[pack_id]
+        if not pack.members:
+            self._begin(pack)
         pack.is_up = True
         for trial_id in pack.members:
             self._keeper.started(trial_id)
+
+    def is_of_no_use(self, pack_id: str) -> bool:
+        """Whether a pack would have nothing to do if it got a node: all trials have one, or have ended."""
+        if self._waiting or self._alone:
+            return False
+        pack = self._packs[pack_id]
+        return not pack.members and all(other.is_up for other in self._packs.values() if other.members)
+
+    def _begin(self, pack: _Pack) -> None:
+        """Give trials to a pack that has a node and none: those of one that has none, else those that wait."""
+        others = (other for other in self._packs.values() if other.members and not other.is_up)
+        if (other := next(others, None)) is not None:
+            # The other one is up later, and then in the place of this one.
+            pack.members, other.members = other.members, pack.members
+            self._write(other)
+        else:
+            self._fill(pack, self._slots)
+        self._write(pack)
 
     def take(self, pack_id: str, reports: Sequence[MemberReport], *, node: str, pid: int) -> bool:
         """Take a pack's reports and decide what it does next; return whether it has nothing left to do."""
@@ -278,11 +306,15 @@ class PackScheduler(FIFOScheduler):  # type: ignore[misc]
 
     def on_trial_result(
         self,
-        tune_controller: TuneController,  # noqa: ARG002 - Tune's signature
+        tune_controller: TuneController,
         trial: Trial,
         result: dict[str, Any],
     ) -> str:
-        """Pass the reports to the driver, and return its decision."""
+        """Pass the reports to the driver, and return its decision; packs that would have nothing to do ask no more."""
         reports: Sequence[MemberReport] = result["reports"].report
         is_done = self._driver.take(str(trial.config["pack_id"]), reports, node=result["node"], pid=result["pid"])
+        for other in tune_controller.get_trials():
+            # An autoscaler adds nodes for those that wait for one.
+            if other.status == other.PENDING and self._driver.is_of_no_use(str(other.config["pack_id"])):
+                tune_controller.stop_trial(other)
         return str(TrialScheduler.STOP if is_done else TrialScheduler.CONTINUE)

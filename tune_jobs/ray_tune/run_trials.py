@@ -60,6 +60,8 @@ class RunJob:
     max_concurrent: int
     packs: PackPlan | None = None
     """How the packed trials are run; None: no trial is packed."""
+    more_packs: int = 0
+    """The most packs beside those of the plan, for nodes that join."""
     run: str | None = None
     """The run's token, as in `Owner`; None: the job makes one."""
 
@@ -161,7 +163,10 @@ class _Run:
         assert isinstance(self._scheduler, TuneScheduler)
         choose = None if self._chooser is None else self._chooser.prepare
         rule = self._scheduler.scheduler
-        driver = PackDriver(self._store, self._spec, plan, trial_ids, scheduler=rule, keeper=self.keeper, choose=choose)
+        driver = PackDriver(
+            self._store, self._spec, plan, trial_ids, scheduler=rule, keeper=self.keeper, choose=choose,
+            more_packs=self._job.more_packs,
+        )  # fmt: skip
         losses = NodeLosses(lambda trial: driver.reached(pack_id_of(trial)), self._watch.check_after)
         events = PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch, losses)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})

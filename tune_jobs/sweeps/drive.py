@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from analysis.records import FINISHED, SweepRecord, SweepState
 from policies.errors import CannotRunError, TuneJobsError
+from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
@@ -240,6 +242,7 @@ def _run_trials(
             plan.gpus_per_trial,
             plan.max_concurrent if address is None else most_at_once(store, plan.max_concurrent, num_trials=len(todo)),
             packs=plan.packs,
+            more_packs=0 if address is None else packs_for_more_nodes(store, plan.packs),
             run=run.token,
         )
 
@@ -280,6 +283,22 @@ def most_at_once(store: Sweep, now: int, *, num_trials: int) -> int:
     spec = stored_spec(store.read_record())
     # What a search proposes depends on how many trials run at once.
     return now if spec.search.type == "tpe" else spec.resources.max_concurrent or num_trials
+
+
+def packs_for_more_nodes(store: Sweep, packs: PackPlan | None) -> int:
+    """Return how many more packs may begin on nodes that join a cluster: as many as the trials that wait would fill.
+
+    Args:
+        store: The sweep.
+        packs: The packs that the present nodes hold; None: there are none.
+    """
+    spec = stored_spec(store.read_record())
+    if packs is None or spec.search.type == "tpe":
+        return 0
+    at_once = packs.num_packs * packs.slots
+    needed = math.ceil(max(0, len(packs.trial_ids) - at_once) / packs.slots)
+    most = spec.resources.max_concurrent
+    return needed if most is None else min(needed, max(0, most - at_once) // packs.slots)
 
 
 @contextlib.contextmanager
