@@ -4,6 +4,7 @@ A store's harness opens it, and reaches past it: to what is kept of a sweep, und
 """
 
 import contextlib
+import os
 import re
 import secrets
 from collections.abc import Callable
@@ -82,7 +83,12 @@ class ObjectHarness:
     """Objects of an S3 server on this machine; a reader comes when what was written is uploaded."""
 
     def __init__(self, folder: Path) -> None:
-        self._url = ObjectUrl.parse(f"s3://sweeps/{folder.name}-{secrets.token_hex(4)}?endpoint={s3_endpoint()}")
+        path = f"{folder.name}-{secrets.token_hex(4)}"
+        self._url = ObjectUrl.parse(self._address(path))
+
+    @staticmethod
+    def _address(path: str) -> str:
+        return f"s3://sweeps/{path}?endpoint={s3_endpoint()}"
 
     def storage(self) -> Storage:
         self._settle()
@@ -176,11 +182,27 @@ class ObjectHarness:
         return _shown(key)
 
 
+class RunningHarness(ObjectHarness):
+    """Objects of a server that somebody has started, in a container of its own: Azurite, or a real store."""
+
+    @staticmethod
+    def _address(path: str) -> str:
+        place, mark, settings = os.environ[STORAGE_VARIABLE].partition("?")
+        return f"{place}/{path}{mark}{settings}"
+
+
 def _shown(key: str) -> str:
     """Where an object store has a record."""
     found = re.fullmatch(r"trials/(t\d+)/trial\.json", key)
     return f"records/{found[1]}.json" if found is not None else key
 
 
-HARNESSES: dict[str, Callable[[Path], Harness]] = {"local": LocalHarness, "s3": ObjectHarness}
+STORAGE_VARIABLE = "TUNE_JOBS_TEST_STORAGE"
+"""Names the address, such as `az://container?endpoint=...`, of a store that runs, for one more harness."""
+
+HARNESSES: dict[str, Callable[[Path], Harness]] = {
+    "local": LocalHarness,
+    "s3": ObjectHarness,
+    **({"running": RunningHarness} if STORAGE_VARIABLE in os.environ else {}),
+}
 """By name; each takes an empty folder."""

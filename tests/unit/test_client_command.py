@@ -15,6 +15,7 @@ from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixtur
 from sweep_folders import make_sweep_folder
 from test_service_downloads import FILM, PAGE, make_finished
 
+from analysis.records import JobRecord
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.server import THERE
 from tune_jobs.client import Client
@@ -104,6 +105,18 @@ def test_numbers_that_json_lacks_are_printed_as_there(
 def test_commands_in_hints_go_to_the_same_service(run: RunCommand, site: Live) -> None:
     printed = run("--server", site.url, "status", "stopped").stdout
     assert f"`tune-jobs --server {site.url} resume stopped` continues it" in printed
+
+
+def test_a_cluster_is_not_asked_for_the_job_of_a_services_sweep(
+    run: RunCommand, site: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = make_sweep_folder(site.storage / "by-job")
+    job = JobRecord(id="by-job-1", address="http://head:8265")
+    store.write_record(store.read_record().model_copy(update={"job": job, "state": "interrupted"}))
+    monkeypatch.setattr("tune_jobs.sweeps.detached.job_now", lambda *_: pytest.fail("the cluster was asked"))
+    told = run("--server", site.url, "status", "by-job")
+    assert told.exit_code == 0, told.output
+    assert f"`tune-jobs --server {site.url} resume by-job` continues it" in told.stdout
 
 
 def test_a_plan_is_the_services(run: RunCommand, site: Live, tmp_path: Path) -> None:

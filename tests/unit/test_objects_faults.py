@@ -166,6 +166,37 @@ def test_what_does_not_pass_is_one_error_at_once_without_secrets(
         assert error.__suppress_context__
 
 
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [("ContainerNotFound", "It does not exist.\nRequestId:1\nTime:2"), ("", "The specified bucket does not exist.")],
+    ids=["Azure", "Google"],
+)
+def test_a_bucket_of_another_kind_of_store_that_is_missing_is_told_in_one_line(
+    faults: Faults, bucket: Bucket, tmp_path: Path, code: str, said: str
+) -> None:
+    body = f"<Error>{f'<Code>{code}</Code>' if code else ''}<Message>{said}</Message></Error>"
+    for name, use in uses(bucket, tmp_path / "a").items():
+        faults.clear()
+        faults.rule("status", status=404, body=body, times=100)
+        with pytest.raises(StorageError, match="Make the bucket") as raised:
+            use()
+        assert "\n" not in raised.value.message, name
+
+
+def test_googles_store_is_where_its_endpoint_says(
+    faults: Faults, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    account = tmp_path / "account.json"
+    account.write_text('{"disable_oauth": true, "client_email": "", "private_key": "", "private_key_id": ""}')
+    monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(account))
+    bucket = Bucket(ObjectUrl("gs", "sweeps", "mine", {"endpoint": faults.endpoint}))
+    faults.rule("status", status=403, body="<Error><Message>Not you.</Message></Error>", times=9)
+    with pytest.raises(StorageError, match=r"gs://sweeps/mine/a cannot be read: status code: 403.*Not you.") as raised:
+        bucket.get("a")
+    assert "GOOGLE_SERVICE_ACCOUNT" in raised.value.hint
+    assert "AWS" not in raised.value.hint
+
+
 def test_a_store_that_is_away_is_named_with_what_happened(faults: Faults, bucket: Bucket) -> None:
     faults.away()
     with pytest.raises(StorageError, match=r"/a cannot be read: the connection was refused\.") as raised:

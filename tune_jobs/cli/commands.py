@@ -131,7 +131,8 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
     sweeps = verbs()
     with stdout_for(as_json=as_json):
         state = sweeps.status(sweep, storage=storage)
-        job = job_facts(state)
+        # Who asks a service may have neither a way to the cluster nor its token, and resumes it there, not by a job.
+        job = job_facts(state) if server_of() is None else None
     cli_output.show_status(state, sweep=sweep, storage=storage, program=program(), job=job, as_json=as_json)
 
 

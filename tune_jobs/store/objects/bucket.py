@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from policies.errors import CannotRunError
 from policies.files import atomic_path
 from tune_jobs.store.objects.at_once import side_by_side
-from tune_jobs.store.objects.reasons import reason_of
+from tune_jobs.store.objects.reasons import MISSING_BUCKET, reason_of
 from tune_jobs.store.objects.url import ObjectUrl
 
 if TYPE_CHECKING:
@@ -296,7 +296,8 @@ class Bucket:
         return f"{self.url.short}/{key}" if key else self.url.short
 
     def _refuse_missing_bucket(self, error: Exception) -> None:
-        if "NoSuchBucket" in str(error):
+        # Azure's word, and Google's sentence, for it.
+        if any(said in str(error) for said in MISSING_BUCKET):
             raise error
 
     def _doing(self, what: str, key: str, do: Callable[[], _T]) -> _T:
@@ -365,6 +366,8 @@ def _open(url: ObjectUrl) -> obstore.store.ObjectStore:
             options["region"] = region
         return S3Store(url.bucket, prefix=prefix, **options)
     if url.scheme == "gs":
+        if endpoint:
+            options["base_url"] = endpoint
         return GCSStore(url.bucket, prefix=prefix, **options)
     if account := url.settings.get("account"):
         options["account_name"] = account

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 _CODE, _MESSAGE = re.compile(r"<Code>([^<]{1,80})</Code>"), re.compile(r"<Message>([^<]{1,300})</Message>")
 _STATUS = re.compile(r"status code: (\d{3})[^:\n]{0,40}")
+MISSING_BUCKET = ("NoSuchBucket", "ContainerNotFound", "The specified bucket does not exist")
+"""What S3, Azure and Google say of a bucket that does not exist."""
 _PASSING_CODES = ("RequestTimeout", "OperationAborted", "ConditionalRequestConflict", "SlowDown")
 _EXPIRED = ("ExpiredToken", "TokenRefreshRequired", "InvalidToken", "ExpiredTokenException", "RequestExpired")
 _REGION = ("PermanentRedirect", "AuthorizationHeaderMalformed", "IllegalLocationConstraintException")
@@ -27,10 +29,11 @@ _CONNECTIONS = {
 # Variables with a secret of any store: the id of a key, a secret, a token.
 _SECRET_NAMES = re.compile(r"(AWS|AZURE|GOOGLE|GCP|GCS|MINIO|S3)_.*(KEY|SECRET|TOKEN|PASSWORD|CREDENTIAL|SAS)")
 _SIGNATURE = re.compile(r"(?i)\b(signature|x-amz-[a-z-]+|credential|sig)=[^\s&,;\"]+")
-_CREDENTIALS = (
-    "Check the credentials in this process's environment (AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, say) or its "
-    "machine's role, and what they allow."
-)
+_VARIABLES = {
+    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    "gs": "GOOGLE_SERVICE_ACCOUNT",
+    "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+}
 
 
 @dataclass(frozen=True)
@@ -57,11 +60,11 @@ def reason_of(error: Exception, place: str) -> Reason:
     code, number = found[1] if found else "", int(status[1]) if status else 0
     reach = f"Check that {place} is reached from this machine, and try again."
     if found is not None or status is not None:
-        parts = [status[0].rstrip() if status else "", code, said[1].rstrip(".") if said else ""]
+        parts = [status[0].rstrip() if status else "", code, _first_line(said[1]) if said else ""]
         passes = number >= 500 or number in (408, 429) or code in _PASSING_CODES
-        why, hint = ", ".join(part for part in parts if part), _hint(number, code) or reach
+        why, hint = ", ".join(part for part in parts if part), _hint(number, code, text, place) or reach
     elif "redirect without LOCATION" in text:
-        why, passes, hint = "the store sends to another place (status code: 301)", False, _hint(301, "")
+        why, passes, hint = "the store sends to another place (status code: 301)", False, _hint(301, "", text, place)
     elif "invalid path" in text:
         why, passes, hint = _first_line(text), False, f"Remove that object from {place}: it is none of a sweep's."
     elif "certificate" in text.lower() or "InvalidContentType" in text:
@@ -69,15 +72,22 @@ def reason_of(error: Exception, place: str) -> Reason:
         hint = "Check the endpoint: whether it begins with http or https, and whether its certificate is known here."
     elif "169.254." in text or "metadata" in text.lower():
         # Without any in the environment, obstore asks the machine for those of its role.
-        why, passes, hint = "there are no credentials", True, _CREDENTIALS
+        why, passes, hint = "there are no credentials", True, _credentials(place)
     else:
         happened = (reason for pattern, reason in _CONNECTIONS.items() if re.search(pattern, text))
         why, passes, hint = next(happened, None) or _first_line(text), True, reach
     return Reason(_without_secrets(why), passes=passes, hint=hint)
 
 
-def _hint(status: int, code: str) -> str:
-    if code == "NoSuchBucket":
+def _credentials(place: str) -> str:
+    return (
+        f"Check the credentials in this process's environment ({_VARIABLES[place.partition(':')[0]]}, say) or its "
+        "machine's role, and what they allow."
+    )
+
+
+def _hint(status: int, code: str, text: str, place: str) -> str:
+    if any(said in text for said in MISSING_BUCKET):
         return "Make the bucket, or correct its name in the storage's address."
     if code in _EXPIRED:
         return (
@@ -89,7 +99,7 @@ def _hint(status: int, code: str) -> str:
     if status == 301 or code in _REGION:
         return "The bucket is in another region: add ?region=REGION to the storage's address."
     if status in (401, 403) or (status == 400 and not code):
-        return _CREDENTIALS
+        return _credentials(place)
     return ""
 
 
