@@ -47,11 +47,12 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
         CheckpointError: The record of the sweep or of a trial is damaged.
         EnvError: The environment raised an error, hung, or ended its process.
     """
-    sweep = _trusted(store).read_record()
-    # Of a sweep with a damaged trial nothing is chosen anew: the trial may be the one that would win.
-    store.read_trials()
-    spec = stored_spec(sweep)
-    trials = read_trials(store)
+    with store.reading():
+        sweep = _trusted(store).read_record()
+        # Of a sweep with a damaged trial nothing is chosen anew: the trial may be the one that would win.
+        store.read_trials()
+        spec = stored_spec(sweep)
+        trials, results = read_trials(store), read_results(store)
     chosen = choose_policy(store, spec, trials)
     winner = chosen.choice.winner
     seeds = confirmation_seeds(spec.seed, num_episodes)
@@ -66,7 +67,7 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
         selection_score=winner.score,
         confirmation=confirmation,
         random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
-        settings=judged(spec, trials, read_results(store), confirmation.threshold),
+        settings=judged(spec, trials, results, confirmation.threshold),
         choice=with_runners_up(chosen, confirmation, timeout_s),
     )
     store.write_best(record, chosen.policy)

@@ -41,7 +41,8 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
     if not may_confirm(spec) or any(item.by != "confirm" for item in rounds):
         return ()
     threshold = threshold_for(spec)
-    trials, results = read_trials(store), read_results(store)
+    with store.reading():
+        trials, results = read_trials(store), read_results(store)
     before = trials_before(trials, rounds)
     contenders = [item.point_index for item in ranked(spec, before, results, threshold)]
     race = confirming_race(spec, contenders, before)

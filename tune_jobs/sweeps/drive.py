@@ -206,9 +206,10 @@ def run_trials_of(
         close_if_open(store)
     from tune_jobs.store.candidates import read_trials
 
-    records = read_trials(store)
+    with store.reading():
+        records, record = read_trials(store), store.read_record()
     interrupted = any(trial.status not in FINISHED for trial in records)
-    return SweepResult(store.place, store.read_record(), records, interrupted=interrupted)
+    return SweepResult(store.place, record, records, interrupted=interrupted)
 
 
 def _run_trials(
