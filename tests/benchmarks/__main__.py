@@ -6,6 +6,7 @@ Run it on a machine that does nothing else.
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -27,6 +28,7 @@ def main() -> None:
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--hours", type=float, default=24.0, help="of the service, simulated at speed")
     parser.add_argument("--trials", type=int, default=10_000, help="of the cluster's largest sweep, of 3 s each")
+    parser.add_argument("--save", type=Path, help="a file for what the cluster's sweeps cost; see cluster/model.py")
     options = parser.parse_args()
     rows = []
     if options.only in (None, "ppo"):
@@ -41,7 +43,7 @@ def main() -> None:
         rows += objects.rows(options.repeats)
     if options.only == "cluster":
         # Half an hour with 10,000 trials, and a cluster of its own: not among the others.
-        rows += cluster.rows(options.trials)
+        rows += cluster.rows(options.repeats, options.trials, options.save)
     table = Table(title=f"{ppo.machine_name()}, medians of {options.repeats}")
     for column in ("figure", "measured", "at most / at least"):
         table.add_column(column)

@@ -7,17 +7,23 @@ those of engine rllib are. Those of engine packed are small PPO trials on CartPo
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.cluster import nodes
 from tests.benchmarks.cluster.asleep import NUM_STEPS
 from tests.benchmarks.cluster.measured import Driven
+from tests.benchmarks.ppo import machine_name
 
 Row = tuple[str, str, str]
 _MOST_MS, _MOST_BYTES = 9.0, 2 * 1024**3
 _NUM_NODES, _CPUS_A_NODE = 3, 8
 WORK_S = 3.0
+_FEW = 300
 
 
 def waiting(num_trials: int, at_once: int, *, work_s: float = WORK_S, reports: int = 3) -> dict[str, Any]:
@@ -62,23 +68,53 @@ def packed(num_trials: int) -> dict[str, Any]:
     }
 
 
-def rows(num_trials: int) -> list[Row]:
-    """Measure and return the rows.
+@dataclass(frozen=True)
+class Case:
+    """A sweep that is driven and measured."""
+
+    kind: str
+    """`single`, `objects` or `packed`."""
+    name: str
+    settings: dict[str, Any]
+
+
+def cases(num_trials: int) -> list[Case]:
+    """What is measured.
 
     Args:
         num_trials: Of the largest sweep.
     """
-    at_once = _NUM_NODES * _CPUS_A_NODE
+    few, at_once = min(num_trials, _FEW), _NUM_NODES * _CPUS_A_NODE
+    found = [
+        Case("single", f"{few:,} single trials, 1 report each", waiting(few, at_once, reports=1)),
+        Case("single", f"{few:,} single trials, 6 reports each", waiting(few, at_once, reports=6)),
+        Case("objects", f"{few:,} single trials in an object store", waiting(few, at_once)),
+        Case("packed", f"{few:,} packed trials", packed(few)),
+    ]
+    return [
+        *found, *(Case("single", f"{num:,} single trials x {WORK_S:g} s", waiting(num, at_once)) for num in
+                  sorted({few, num_trials})),
+    ]  # fmt: skip
+
+
+def rows(num_trials: int, save: Path | None = None) -> list[Row]:
+    """Measure and return the rows.
+
+    Args:
+        num_trials: Of the largest sweep.
+        save: A file for what was measured, which `model` reads; None: it is only told.
+    """
     found: list[Row] = []
+    kept = []
     with nodes.cluster(_NUM_NODES, _CPUS_A_NODE) as here:
-        for num in sorted({min(num_trials, size) for size in (300, num_trials)}):
-            found += _told(f"{num:,} single trials x {WORK_S:g} s", nodes.drive(here, waiting(num, at_once)))
-        few = min(num_trials, 300)
-        found += _told(f"{few:,} single trials, 1 report each", nodes.drive(here, waiting(few, at_once, reports=1)))
-        found += _told(
-            f"{few:,} single trials, in an object store", nodes.drive(here, waiting(few, at_once), objects=True)
-        )
-        found += _told(f"{few:,} packed trials", nodes.drive(here, packed(few)))
+        for case in cases(num_trials):
+            driven = nodes.drive(here, case.settings, objects=case.kind == "objects")
+            found += _told(case.name, driven)
+            kept.append({"kind": case.kind, "name": case.name, "driven": driven.as_json()})
+            if save is not None:
+                # After each, as the last one takes long.
+                told = {"machine": machine_name(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "sweeps": kept}
+                save.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return found
 
 

@@ -82,6 +82,9 @@ def main() -> None:
         launch_wall_s=time.perf_counter() - began,
         peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         work_s=sum(trial.time_s for trial in result.trials),
+        num_env_steps=sum(trial.num_env_steps for trial in result.trials),
+        training_s=max(trial.ended_at or 0.0 for trial in result.trials)
+        - min(trial.started_at or 0.0 for trial in result.trials),
     )
     print(json.dumps(told.as_json()), flush=True)
 

@@ -22,6 +22,9 @@ class Driven:
     peak_bytes: int
     work_s: float
     """Sum of what the trials trained."""
+    num_env_steps: int = 0
+    training_s: float = 0.0
+    """From the first trial's start to the last one's end."""
     daemons_cpu_s: dict[str, float] = dataclasses.field(default_factory=dict)
     """Of the cluster's other processes while it was driven, by kind."""
     num_requests: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -40,6 +43,11 @@ class Driven:
     def run_ms_a_trial(self) -> float:
         """CPU milliseconds of the driver a trial, from joining Ray to the last record."""
         return 1e3 * self.run_cpu_s / self.num_trials
+
+    @property
+    def env_steps_per_s(self) -> float:
+        """Of all trials, while any trains."""
+        return self.num_env_steps / self.training_s
 
     @property
     def reports_a_trial(self) -> float:

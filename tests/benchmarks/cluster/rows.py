@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from tests.benchmarks.cluster import costs
+from pathlib import Path
+
+from tests.benchmarks.cluster import costs, scaling
 
 Row = tuple[str, str, str]
 
 
-def rows(num_trials: int) -> list[Row]:
+def rows(repeats: int, num_trials: int, save: Path | None) -> list[Row]:
     """Measure all of them.
 
     Args:
+        repeats: Of what is measured several times.
         num_trials: Of the largest sweep.
+        save: As for `costs.rows`.
     """
-    return costs.rows(num_trials)
+    return [*scaling.rows(repeats), *costs.rows(num_trials, save)]
