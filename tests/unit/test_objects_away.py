@@ -92,11 +92,11 @@ def test_whether_a_report_is_current_is_found_out_without_the_trials_objects(fau
 
 
 def test_a_holder_whose_beats_answers_are_lost_keeps_the_lock(faults: Faults, bucket: Bucket) -> None:
-    with leased(bucket, "lock", *WORDS) as is_ours:
+    with leased(bucket, "lock", *WORDS) as beating:
         before = len(faults.requests)
         faults.rule("after", kinds="PUT", times=4)
         soon(lambda: not faults.rules[0].times and len(faults.requests) > before + 12)
-        assert is_ours()
+        assert beating.is_ours()
         with pytest.raises(CannotRunError, match="It is held"), leased(Bucket(bucket.url), "lock", *WORDS):
             pass
     assert not is_leased(bucket, "lock")

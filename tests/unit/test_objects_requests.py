@@ -1,15 +1,19 @@
 """How many requests a sweep in an object store takes, and which of them wait for each other."""
 
 import threading
+import time
 
 import pytest
 from s3_faults import Faults, Opened
-from store_parts import fill, make_checkpoint, make_iteration, make_trial
+from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
 
 from analysis.records import CheckpointRecord
 from tune_jobs.store import names
-from tune_jobs.store.objects import owners
+from tune_jobs.store.objects import lease, owners
+from tune_jobs.store.objects.bucket import Found
+from tune_jobs.store.objects.held import Held
 from tune_jobs.store.objects.object_sweep import ObjectSweep
+from tune_jobs.store.opening import others_write
 
 NUM_TRIALS = 3
 
@@ -115,3 +119,104 @@ def test_who_writes_often_does_not_wait_for_the_question_who_owns_it(
             return
         threading.Event().wait(0.01)
     pytest.fail("The run does not learn that another one has taken over.")
+
+
+def test_who_holds_the_lock_asks_for_nothing_that_it_has_read_or_written(faults: Faults, opened: Opened) -> None:
+    driver = opened()
+    with driver.lock():
+        driver.write_record(make_sweep(state="interrupted"))
+        # The same process opens it again for its trials.
+        again, run = opened(), driver.take()
+        owner = again.owner(run.token)
+        assert [record.trial_id for record in again.read_trials()] == []
+        faults.clear()
+        for index in range(2):
+            again.trial(f"t{index:04d}").write_record(make_trial(index), soon=True)
+        again.settle()
+        driver.write_record(driver.read_record().model_copy(update={"state": "running"}))
+        for sweep in (driver, again):
+            assert sweep.read_record().state == "running"
+            assert [record.trial_id for record in sweep.read_trials()] == ["t0000", "t0001"]
+            assert set(sweep.trial_stamps()) == {"t0000", "t0001"}
+        # What was not there before is looked for, and so is whether the run is still this process's.
+        asked = [one.key.rpartition("/")[2] for one in faults.requests if one.kind != "PUT"]
+        assert sorted(name for name in asked if name != "run.json") == ["t0000.json", "t0001.json"]
+        assert faults.counts()["PUT"] == 3
+        faults.clear()
+        with owner.held():
+            pass
+        assert again.read_record() == driver.read_record()
+        assert "LIST" not in faults.counts()
+        assert {one.key.rpartition("/")[2] for one in faults.requests} <= {"run.json"}
+    faults.clear()
+    driver.read_record()
+    assert len(driver.read_trials()) == 2
+    assert faults.counts()["GET"] >= 1
+    assert faults.counts()["LIST"] == 1
+
+
+def test_who_holds_the_lock_asks_again_when_another_process_writes_for_it(faults: Faults, opened: Opened) -> None:
+    driver = opened()
+    with driver.lock():
+        driver.write_record(make_sweep())
+        assert driver.read_trials() == []
+        others_write(driver.place)
+        faults.clear()
+        assert driver.read_record().num_trials == 2
+        assert driver.read_trials() == []
+        assert faults.counts() == {"GET": 1, "LIST": 1}
+
+
+def test_who_is_not_sure_of_the_lock_asks(faults: Faults, opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = opened()
+    monkeypatch.setattr(lease, "_BEAT_S", 1000.0)
+    with driver.lock():
+        driver.write_record(make_sweep())
+        run = driver.take()
+        with run.held():
+            pass
+        # Its latest sign of life is old, so that another process may have the lock by now.
+        now = lease._now()
+        monkeypatch.setattr(lease, "_now", lambda: now + lease.LEASE_S / 2)
+        monkeypatch.setattr(owners, "_LOOK_EVERY_S", 1e-9)
+        faults.clear()
+        driver.read_record()
+        with run.held():
+            pass
+        assert {one.key.rpartition("/")[2] for one in faults.requests} == {"sweep.json", "run.json"}
+
+
+def test_who_holds_the_lock_does_not_wait_for_the_question_who_owns_the_run(faults: Faults, opened: Opened) -> None:
+    driver, went_on = opened(), threading.Event()
+    with driver.lock():
+        run = driver.take()
+        faults.rule("slow", kinds="GET", keys="run.json$", then=lambda: went_on.wait(5))
+        begun = time.monotonic()
+        with run.held():
+            assert time.monotonic() < begun + 4
+        went_on.set()
+        # Whoever takes the run without the lock is seen all the same, a moment later.
+        opened().take()
+        while run.is_current():
+            assert time.monotonic() < begun + 10
+            time.sleep(0.01)
+
+
+def test_what_was_on_its_way_while_it_was_written_is_not_believed() -> None:
+    known = Held(lambda: True)
+    mark = known.mark()
+    write = known.begin("records/t0000.json")
+    assert known.mark() is None
+    known.end(write, b"new", ("new", None))
+    known.note("records/t0000.json", Found(b"old", ("old", None)), mark)
+    known.note_listed("records/", {}, mark)
+    assert known.found("records/t0000.json") == Found(b"new", ("new", None))
+    assert known.listed("records/") is None
+    known.note_listed("records/", {}, known.mark())
+    # Of two writes at once, the store alone knows which came last.
+    first, second = known.begin("records/t0000.json"), known.begin("records/t0000.json")
+    known.end(second, b"two", ("two", None))
+    known.end(first, b"one", ("one", None))
+    assert known.listed("records/") is None
+    known.end(known.begin("sweep.json"), b"text", None)
+    assert known.found("sweep.json") is None

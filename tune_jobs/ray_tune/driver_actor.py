@@ -19,7 +19,7 @@ from ray.exceptions import RayActorError
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError
 from tune_jobs.ray_tune.run_trials import RunJob, run_trials
-from tune_jobs.store.opening import open_sweep
+from tune_jobs.store.opening import open_sweep, others_write
 from tune_jobs.store.record_keeper import Listener
 
 _POLL_INTERVAL_S = 0.5
@@ -60,6 +60,7 @@ def run_trials_remotely(job: RunJob, listener: Listener) -> None:
     Raises:
         CannotRunError: The actor or the connection to the cluster was lost.
     """
+    others_write(job.sweep_place)
     driver: Any = ray.remote(num_cpus=0, max_concurrency=2, resources=_ON_THE_HEAD)(RemoteDriver).remote()
     try:
         running = driver.run.remote(job)

@@ -12,7 +12,7 @@ from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
-__all__ = ["is_url", "name_for_commands", "open_storage", "open_sweep", "sweep_of_trial"]
+__all__ = ["is_url", "name_for_commands", "open_storage", "open_sweep", "others_write", "sweep_of_trial"]
 
 
 def open_storage(place: str | Path) -> Storage:
@@ -40,6 +40,15 @@ def open_sweep(place: str | Path) -> Sweep:
 
         return ObjectSweep(ObjectUrl.parse(str(place)))
     return SweepStore(folder_of(place))
+
+
+def others_write(place: str | Path) -> None:
+    """Read a sweep anew from now on, whose lock this process holds: another process writes its records for this one."""
+    if is_url(place):
+        from tune_jobs.store.objects.held import held
+
+        if (known := held(ObjectUrl.parse(str(place)))) is not None:
+            known.let_others_write()
 
 
 def name_for_commands(sweep: Sweep) -> str:

@@ -13,7 +13,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from policies.errors import CannotRunError
@@ -28,10 +28,10 @@ _FREE = b"{}"
 
 
 @contextlib.contextmanager
-def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Callable[[], bool]]:
+def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Beating]:
     """Hold the lock in the block, or raise; it takes up to half a minute to find out that a holder elsewhere is gone.
 
-    The block gets a function that says whether the lock is still this process's.
+    The block gets what says whether the lock is still this process's.
 
     Args:
         bucket: The sweep's objects.
@@ -43,9 +43,9 @@ def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Callab
         CannotRunError: Another process holds it, or the store cannot be written.
     """
     own = secrets.token_hex(8)
-    beating = _Beating(bucket, key, _take(bucket, key, own, message, hint), own)
+    beating = Beating(bucket, key, own, *_take(bucket, key, own, message, hint))
     try:
-        yield beating.is_ours
+        yield beating
     finally:
         beating.end()
 
@@ -77,7 +77,7 @@ def is_leased(bucket: Bucket, key: str, watch_s: float = 2.5 * _BEAT_S) -> bool:
     return False
 
 
-def _take(bucket: Bucket, key: str, own: str, message: str, hint: str) -> Tag:
+def _take(bucket: Bucket, key: str, own: str, message: str, hint: str) -> tuple[Tag, float]:
     seen: bytes | None = None
     since = time.monotonic()
     while True:
@@ -94,9 +94,10 @@ def _take(bucket: Bucket, key: str, own: str, message: str, hint: str) -> Tag:
                     time.sleep(0.5)
                     continue
         try:
+            begun_at = _now()
             if found is None:
-                return bucket.put(key, _sign(own, 0), is_new=True)
-            return bucket.put(key, _sign(own, 0), over=found.tag)
+                return bucket.put(key, _sign(own, 0), is_new=True), begun_at
+            return bucket.put(key, _sign(own, 0), over=found.tag), begun_at
         except ConflictError:
             # Somebody else took it, or let it go; a new holder counts as one that lives.
             seen = seen if seen is not None else b""
@@ -126,11 +127,25 @@ def _is_here(holder: dict[str, Any]) -> bool | None:
     return not is_gone(process)
 
 
-class _Beating:
-    """Writes signs of life in a thread of its own, until the end."""
+def _now() -> float:
+    """Return seconds that go on while the machine sleeps, as they do for who watches it."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
-    def __init__(self, bucket: Bucket, key: str, tag: Tag, own: str) -> None:
+
+class Beating:
+    """Writes signs of life in a thread of its own, until the end.
+
+    Args:
+        bucket: The sweep's objects.
+        key: The lock's object.
+        own: The holder's own word in its signs.
+        tag: The content of its first sign.
+        signed_at: When it began to write that, by `_now`.
+    """
+
+    def __init__(self, bucket: Bucket, key: str, own: str, tag: Tag, signed_at: float) -> None:
         self._bucket, self._key, self._tag, self._own = bucket, key, tag, own
+        self._signed_at = signed_at
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="lease", daemon=True)
         self._thread.start()
@@ -140,14 +155,21 @@ class _Beating:
         while not self._over.wait(_BEAT_S):
             beat += 1
             try:
+                begun_at = _now()
                 self._tag = self._bucket.put(self._key, _sign(self._own, beat), over=self._tag)
+                self._signed_at = begun_at
             except ConflictError:
                 if not self.is_ours():
                     # Another process took it for gone. It has taken the run too, so this one's writes are refused.
+                    self._signed_at = -float("inf")
                     return
             except StorageError:
                 # The store is away; it may be back for the next one.
                 continue
+
+    def is_sure(self) -> bool:
+        """Whether nobody can have taken the lock: who wants it has not watched the latest sign for long enough."""
+        return not self._over.is_set() and _now() - self._signed_at < LEASE_S / 2
 
     def is_ours(self) -> bool:
         """Whether the sign that is there is one of this holder's, whose writing had seemed to fail."""

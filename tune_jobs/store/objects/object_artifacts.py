@@ -69,7 +69,7 @@ class Artifacts:
 
     def has_best(self) -> bool:
         """Whether a winner has been written."""
-        return self._bucket.get(f"{names.BEST_FOLDER}/{names.BEST_RECORD}") is not None
+        return self._parts.fetch_record(f"{names.BEST_FOLDER}/{names.BEST_RECORD}") is not None
 
     def read_best(self) -> BestRecord:
         """Read the winner's record."""
@@ -129,7 +129,7 @@ class Artifacts:
         made.mkdir(parents=True)
         shown = self.read_best().checkpoint
         key = f"{names.BEST_FOLDER}/{names.FILMS_RECORD}"
-        self._bucket.delete([key])
+        self._parts.remove_record(key)
         paths = {film: made / name for film, name in names.FILMS.items()}
         yield paths
         self._upload(names.BEST_FOLDER, made, [path for path in paths.values() if path.is_file()])

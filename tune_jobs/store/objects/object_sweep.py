@@ -18,19 +18,20 @@ from tune_jobs.store import names
 from tune_jobs.store.objects.asked import Asked
 from tune_jobs.store.objects.at_once import AT_ONCE, side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError
+from tune_jobs.store.objects.held import holding
 from tune_jobs.store.objects.lease import LEASE_S, is_leased, leased
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.object_artifacts import Artifacts
 from tune_jobs.store.objects.object_pack import ObjectPack
 from tune_jobs.store.objects.object_trial import ObjectTrial
 from tune_jobs.store.objects.outbox import outbox
-from tune_jobs.store.objects.owners import ObjectOwner
+from tune_jobs.store.objects.owners import RUN, ObjectOwner
 from tune_jobs.store.objects.parts import RECORDS, Parts
 from tune_jobs.store.objects.probe import ObjectProbe, probing
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.places import is_trial_id
 
-_LOCK, _DRIVER_LOCK, _RUN = "lock.json", "driver-lock.json", "run.json"
+_LOCK, _DRIVER_LOCK = "lock.json", "driver-lock.json"
 _CLAIM, _STOP = "claim", "stop"
 
 
@@ -190,10 +191,11 @@ class ObjectSweep(Artifacts):
     def lock(self) -> Iterator[None]:
         """Be the sweep's driver in the block; the lock is free half a minute after the process has ended."""
         watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
-        with leased(self._bucket, _LOCK, f"Sweep {self.name} is being run by another process.", watch) as is_ours:
+        told = f"Sweep {self.name} is being run by another process."
+        with leased(self._bucket, _LOCK, told, watch) as beating, holding(self.url, beating.is_sure):
             if is_leased(self._bucket, _DRIVER_LOCK, watch_s=LEASE_S):
                 raise CannotRunError(*self._still_driven)
-            self._parts.is_locked = is_ours
+            self._parts.is_locked = beating.is_ours
             try:
                 yield
             finally:
@@ -222,12 +224,12 @@ class ObjectSweep(Artifacts):
 
     def take(self) -> ObjectOwner:
         """Become the sweep's run: no process of an earlier run can take a trial or a pack any more."""
-        self._parts.run = ObjectOwner.take(self._bucket, _RUN)
+        self._parts.run = ObjectOwner.take(self._bucket, RUN)
         return self._parts.run
 
     def owner(self, token: str) -> ObjectOwner:
         """Return the run whose token another process has passed on."""
-        self._parts.run = ObjectOwner(self._bucket, _RUN, token)
+        self._parts.run = ObjectOwner(self._bucket, RUN, token)
         return self._parts.run
 
     def remove_leftovers(self) -> None:

@@ -22,9 +22,12 @@ from typing import Any, Self
 
 from policies.errors import CannotRunError
 from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError
+from tune_jobs.store.objects.held import held
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.trial_contract import Ownership
 
+RUN = "run.json"
+"""The object with the owner of a sweep's run; only who holds the sweep's lock takes it."""
 _LOOK_EVERY_S = 1.0
 """Seconds after which the store is asked again who the owner is; its answer before that is believed."""
 _BELIEVED = 3
@@ -162,8 +165,10 @@ class ObjectOwner:
         Raises:
             OwnershipLostError: Another process has.
         """
-        self._looked_at = -float("inf")
-        if not self._is_current():
+        with self._lock:
+            if self._was_current:
+                self._look()
+        if not self._was_current:
             raise lost(self._bucket.name_of(self._key), self._present())
 
     def release(self) -> None:
@@ -173,12 +178,17 @@ class ObjectOwner:
         with self._lock:
             age = time.monotonic() - self._looked_at
             # Who has lost it never has it again.
-            if self._was_current and age > _BELIEVED * _LOOK_EVERY_S:
+            if self._was_current and age > _BELIEVED * _LOOK_EVERY_S and not self._is_held():
                 self._look()
             elif self._was_current and age > _LOOK_EVERY_S and not (self._looking and self._looking.is_alive()):
                 self._looking = threading.Thread(target=self._look_again, name="owner", daemon=True)
                 self._looking.start()
             return self._was_current
+
+    def _is_held(self) -> bool:
+        # Nobody else takes the run as long as this process has the sweep's lock; it is asked for without waiting.
+        known = held(self._bucket.url) if self._key == RUN else None
+        return known is not None and known.is_known
 
     def _look(self) -> None:
         asked_at = time.monotonic()

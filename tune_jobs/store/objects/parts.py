@@ -15,7 +15,8 @@ from pydantic import BaseModel
 
 from policies.errors import NotFoundError, TuneJobsError
 from policies.files import open_to_append, write_atomic
-from tune_jobs.store.objects.bucket import Bucket, ConflictError, Listed, StorageError, Tag
+from tune_jobs.store.objects.bucket import Bucket, ConflictError, Found, Listed, StorageError, Tag
+from tune_jobs.store.objects.held import held
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import ObjectOwner
 from tune_jobs.store.objects.scratch import own_folder, shared_folder
@@ -144,11 +145,21 @@ class Parts:
         if known is not None and _is_same(known, listed):
             known.as_of = as_of
             return known.data
-        found = self.bucket.get(key)
+        found = self._found(key)
         if found is None:
             return None
         self._known[key] = _Known(found.data, found.tag, as_of)
         return found.data
+
+    def _found(self, key: str) -> Found | None:
+        # Who holds the sweep's lock knows what it has written itself.
+        ours = held(self.bucket.url)
+        found, mark = (None, None) if ours is None else (ours.found(key), ours.mark())
+        if found is None:
+            found = self.bucket.get(key)
+            if ours is not None and found is not None:
+                ours.note(key, found, mark)
+        return found
 
     def listed_records(self) -> dict[str, Listed]:
         """Return the records of trials by their keys; while much is read, they are listed once.
@@ -159,7 +170,11 @@ class Parts:
         as_of = self.snapshot
         if as_of is not None and self._listed is not None and self._listed[0] is as_of:
             return self._listed[1]
-        found = {item.key: item for item in self.bucket.listed(f"{RECORDS}/")}
+        prefix, ours = f"{RECORDS}/", held(self.bucket.url)
+        known, mark = (None, None) if ours is None else (ours.listed(prefix), ours.mark())
+        found = {item.key: item for item in self.bucket.listed(prefix)} if known is None else known
+        if ours is not None and known is None:
+            ours.note_listed(prefix, found, mark)
         self._listed = as_of, found
         return found
 
@@ -189,6 +204,18 @@ class Parts:
             self._pending.pop(key, None)
             raise
 
+    def remove_record(self, key: str) -> None:
+        """Remove a record at once.
+
+        Raises:
+            StorageError: It cannot be removed.
+        """
+        self.bucket.delete([key])
+        self._tags.pop(key, None)
+        self._known.pop(key, None)
+        if (ours := held(self.bucket.url)) is not None:
+            ours.forget(key)
+
     def settle(self) -> None:
         """Wait until all records are in the store.
 
@@ -208,12 +235,14 @@ class Parts:
         for _ in range(_ATTEMPTS):
             if key not in self._tags:
                 # Whoever is the owner after this look has written nothing yet, or what is written over is not this.
-                found = self.bucket.get(key)
-                self._check_ours()
+                found = self._ours(key)
+                if found is None:
+                    found = self.bucket.get(key)
+                    self._check_ours()
                 self._tags[key] = found.tag if found is not None else None
             tag = self._tags[key]
             try:
-                self._tags[key] = self.bucket.put(key, data, over=tag, is_new=tag is None)
+                self._tags[key] = self._put(key, data, tag)
             except ConflictError:
                 # Looked at again, and whether it is still this process's.
                 del self._tags[key]
@@ -228,6 +257,20 @@ class Parts:
             )
         if self._pending.get(key) is data:
             self._pending.pop(key, None)
+
+    def _ours(self, key: str) -> Found | None:
+        ours = held(self.bucket.url)
+        return None if ours is None else ours.found(key)
+
+    def _put(self, key: str, data: bytes, over: Tag | None) -> Tag:
+        ours, tag = held(self.bucket.url), None
+        write = None if ours is None else ours.begin(key)
+        try:
+            tag = self.bucket.put(key, data, over=over, is_new=over is None)
+        finally:
+            if ours is not None and write is not None:
+                ours.end(write, data, tag)
+        return tag
 
     def _check_ours(self) -> None:
         """Find out whether this process may write over what another one has written.
