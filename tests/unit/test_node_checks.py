@@ -64,9 +64,9 @@ def test_the_storage_and_modules_are_named() -> None:
 
 def test_a_node_whose_pytorch_cannot_use_its_gpus_is_named() -> None:
     told = {"versions": {"torch": "2.9.0+cpu"}, "uses_gpus": False}
-    [problem] = node_checks._problems_of_gpus(told, 2)
+    [problem] = node_checks.problems_of_gpus(told, 2)
     assert problem.text == "offers 2 GPUs, but its PyTorch 2.9.0+cpu is a build for CPUs alone"
-    assert node_checks._problems_of_gpus({**told, "uses_gpus": True}, 2) == []
+    assert node_checks.problems_of_gpus({**told, "uses_gpus": True}, 2) == []
 
 
 def test_up_to_five_nodes_are_named_and_the_others_counted() -> None:

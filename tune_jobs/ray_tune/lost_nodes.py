@@ -1,4 +1,4 @@
-"""Tell the loss of a node from the failure of what ran there: only the second counts against a trial's retries.
+"""Tell the loss or refusal of a node from the failure of what ran there: only the latter counts against retries.
 
 Ray Tune counts both, and decides by that count before it calls anybody. Nothing public of Ray 2.60 says otherwise, so
 the method of Tune's trials that counts is replaced for a run.
@@ -15,7 +15,9 @@ from typing import Any
 import ray
 from ray.air.execution._internal import RayActorManager
 from ray.exceptions import OutOfMemoryError, RayActorError, RayError, RayTaskError
+from ray.tune import PlacementGroupFactory
 from ray.tune.experiment import Trial
+from ray.util.placement_group import NODE_ID_LABEL_KEY
 
 from policies.errors import TuneJobsError
 
@@ -30,8 +32,22 @@ class NodeLeavesError(TuneJobsError):
     """The node of a training process is about to be taken away; what it trained is saved."""
 
 
+class NodeRefusedError(TuneJobsError):
+    """A node that joined while the sweep ran can't take part in it; nothing was trained there.
+
+    Args:
+        message: Which node, and why.
+        hint: What to do there.
+        node_id: The node, as Ray names it.
+    """
+
+    def __init__(self, message: str, hint: str = "", node_id: str = "") -> None:
+        super().__init__(message, hint)
+        self.node_id = node_id
+
+
 def node_that_left(error: BaseException | None) -> str:
-    """Return the node whose loss, and nothing else, ended an actor; empty if there was another reason.
+    """Return the node whose loss or refusal, and nothing else, ended an actor; empty if there was another reason.
 
     Args:
         error: What Ray raised for the actor, or for an actor that it waited for.
@@ -39,6 +55,8 @@ def node_that_left(error: BaseException | None) -> str:
     cause = error.cause if isinstance(error, RayTaskError) else error
     if isinstance(cause, NodeLeavesError):
         return cause.message
+    if isinstance(cause, NodeRefusedError):
+        return f"{cause.message} {cause.hint}".strip()
     actor_id = cause.actor_id if isinstance(cause, RayActorError) else None
     if not actor_id:
         return ""
@@ -101,6 +119,7 @@ class NodeLosses:
         self._in_vain: dict[str, tuple[Hashable, int]] = {}
         self._told: dict[str, str] = {}
         self._errors: dict[str, BaseException | None] = {}
+        self._refused: set[str] = set()
 
     def __getstate__(self) -> dict[str, Any]:
         # As for `RecordKeeper`, Tune's pickle of what uses this is never read back.
@@ -118,6 +137,7 @@ class NodeLosses:
             left = self._node_that_left(trial, exc)
             original(trial, exc)
             if left:
+                self._keep_away(trial, exc)
                 trial.run_metadata.num_failures = counted
                 trial.run_metadata.invalidate_cache()
 
@@ -135,6 +155,19 @@ class NodeLosses:
     def error_of(self, trial: Trial) -> BaseException | None:
         """Return the trial's last error."""
         return self._errors.get(trial.trial_id)
+
+    def _keep_away(self, trial: Trial, error: BaseException | None) -> None:
+        """Let a trial go to none of the nodes that were refused so far; those that wait for their place stay as is."""
+        cause = error.cause if isinstance(error, RayTaskError) else error
+        if not isinstance(cause, NodeRefusedError) or not cause.node_id:
+            return
+        self._refused.add(cause.node_id)
+        asked = trial.placement_group_factory
+        elsewhere = {NODE_ID_LABEL_KEY: f"!in({','.join(sorted(self._refused))})"}
+        # What Tune has for this refuses a trial that runs; of this one's process nothing is left, and Tune asks anew.
+        trial.placement_group_factory = PlacementGroupFactory(
+            asked.bundles, strategy=asked.strategy, bundle_label_selector=[elsewhere] * len(asked.bundles)
+        )
 
     def _node_that_left(self, trial: Trial, error: BaseException | None) -> str:
         if error is None:

@@ -85,7 +85,7 @@ def check_nodes(sweep_place: str, modules: Sequence[str] = (), *, num_gpus: floa
             is_same = functools.partial(probe.is_same, machine=node["NodeID"])
             found[name] = problems_of(told, versions(), sweep_place, is_same)
             if num_gpus and node["Resources"].get("GPU"):
-                found[name] += _problems_of_gpus(told, node["Resources"]["GPU"])
+                found[name] += problems_of_gpus(told, node["Resources"]["GPU"])
             notes += _notes(name, told["versions"])
     refuse({name: problems for name, problems in found.items() if problems}, len(found))
     return tuple(notes)
@@ -147,7 +147,11 @@ def _answer_of(task: Any, timeout_s: float) -> dict[str, Any] | Problem:
 
 
 def problems_of(
-    told: Mapping[str, Any], ours: Mapping[str, str], place: str, is_same: Callable[[str], bool]
+    told: Mapping[str, Any],
+    ours: Mapping[str, str],
+    place: str,
+    is_same: Callable[[str], bool],
+    here: str | None = None,
 ) -> list[Problem]:
     """Return what keeps a node from taking part, by its answer.
 
@@ -156,11 +160,12 @@ def problems_of(
         ours: The versions that it must have.
         place: The place of the sweep.
         is_same: Whether a node that read this question sees the same folder.
+        here: What has the versions that it must have; None: this machine.
     """
     theirs = told["versions"]
     if "not_working" in told and theirs.get("tune-jobs") == ours.get("tune-jobs"):
         return [Problem(f"has no working tune-jobs: {told['not_working']}", _WORKING)]
-    here = socket.gethostname()
+    here = here or socket.gethostname()
     problems = [
         Problem(f"has {_NAMES.get(name, name)} {theirs[name]}, {here} has {version}", _VERSIONS)
         if name in theirs
@@ -184,7 +189,13 @@ def problems_of(
     return problems
 
 
-def _problems_of_gpus(told: Mapping[str, Any], num_gpus: float) -> list[Problem]:
+def problems_of_gpus(told: Mapping[str, Any], num_gpus: float) -> list[Problem]:
+    """Return what keeps a node with GPUs from training on them, by its answer.
+
+    Args:
+        told: The answer.
+        num_gpus: The GPUs that it offers.
+    """
     if told.get("uses_gpus", True):
         return []
     text = f"offers {num_gpus:g} GPU{'s' * (num_gpus != 1)}, but its PyTorch {told['versions'].get('torch', '')} is a "

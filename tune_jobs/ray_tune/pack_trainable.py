@@ -17,8 +17,9 @@ from ray import tune
 from policies.acting.evaluate import Evaluator
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules
+from tune_jobs.ray_tune.joined_nodes import refusal
 from tune_jobs.ray_tune.lean import Sealed
-from tune_jobs.ray_tune.lost_nodes import DrainNotice
+from tune_jobs.ray_tune.lost_nodes import DrainNotice, NodeRefusedError
 from tune_jobs.ray_tune.trainable import (
     REPORT_INTERVAL_S,
     TaskReader,
@@ -43,20 +44,25 @@ _READ_AT_ONCE = 16
 class PackTrainable(tune.Trainable):  # type: ignore[misc]
     """Runs a pack; `config` holds `sweep_place`, `pack_id`, `engine`, `env_kind` and `num_env_processes`."""
 
+    _refusal: NodeRefusedError | None = None
+
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the pack; it is built in the first step, so that every error is raised there."""
         self._config = config
+        self._log = TrialLog()
+        self._engine: PackEngine | None = None
+        self._evaluator: Evaluator | None = None
+        self._loop: PackLoop | None = None
+        self._refusal = refusal(config)
+        if self._refusal is not None:
+            return
         self._files = open_sweep(config["sweep_place"]).pack(config["pack_id"])
         run = owner_of_run(config)
         self._owner = self._files.take(run)
         end_with_driver(config, self._owner)
         note_signals()
-        self._log = TrialLog()
         self._file: IO[bytes] = self._log.open(self._files.log_path)
         self._files.begin_log()
-        self._engine: PackEngine | None = None
-        self._evaluator: Evaluator | None = None
-        self._loop: PackLoop | None = None
         self._node = this_node()
         self._notice = DrainNotice()
 
@@ -66,7 +72,10 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         Raises:
             Exception: An error of no single member; it is in the pack's log too.
             NodeLeavesError: The node is taken away; the members are saved.
+            NodeRefusedError: The node joined later, and can't take part; nothing was begun.
         """
+        if self._refusal is not None:
+            raise self._refusal
         try:
             if self._loop is None:
                 self._loop = self._open()

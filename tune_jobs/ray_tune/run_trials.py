@@ -21,6 +21,7 @@ from policies.errors import CannotRunError
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
+from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import going_on
@@ -117,8 +118,10 @@ class _Run:
         self._job = job
         self._watch = watch
         self._store = self.store = store
-        # The settings of every process: its sweep, its run, and the driver with which it ends.
-        self._config = {"sweep_place": store.place, "run": owner.token, "driver": this_process()}
+        # The settings of every process: its sweep, its run, the driver with which it ends, and what its node must have.
+        self._config = {
+            "sweep_place": store.place, "run": owner.token, "driver": this_process(), "versions": versions(),
+        }  # fmt: skip
         self._record = store.read_record()
         self._spec = stored_spec(self._record)
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)

@@ -27,8 +27,9 @@ from policies.envs.tallies import end_tally
 from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
 from policies.parents import end_with_parent, is_gone
+from tune_jobs.ray_tune.joined_nodes import refusal
 from tune_jobs.ray_tune.lean import Sealed
-from tune_jobs.ray_tune.lost_nodes import DrainNotice
+from tune_jobs.ray_tune.lost_nodes import DrainNotice, NodeRefusedError
 from tune_jobs.ray_tune.scheduling import score_of
 from tune_jobs.ray_tune.tune_scheduler import METRIC
 from tune_jobs.spec.engines import engine_on_record
@@ -164,7 +165,9 @@ def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> Non
 
 
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs trials; `config` holds `sweep_place` and `trial_id`, and from the driver `run` and `driver`."""
+    """Runs trials; `config` holds `sweep_place` and `trial_id`, and from the driver `run`, `driver` and `versions`."""
+
+    _refusal: NodeRefusedError | None = None
 
     def setup(self, config: dict[str, Any]) -> None:
         """Remember the trial; it is built in the first step, so that every error is raised there."""
@@ -176,9 +179,11 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         self._evaluators: dict[str, Evaluator] = {}
         self._node = this_node()
         self._notice = DrainNotice()
-        self._run = owner_of_run(config)
-        end_with_driver(config, self._run)
         self._take(config)
+        self._refusal = refusal(config)
+        if self._refusal is None:
+            self._run = owner_of_run(config)
+            end_with_driver(config, self._run)
 
     def reset_config(self, new_config: Mapping[str, Any]) -> bool:
         """Take the next trial in the same warm process."""
@@ -197,7 +202,10 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         Raises:
             Exception: Any error of the trial; it is in the trial's log too.
             NodeLeavesError: The node is taken away; the trial is saved.
+            NodeRefusedError: The node joined later, and can't take part; nothing was begun.
         """
+        if self._refusal is not None:
+            raise self._refusal
         place, trial_id = self._trial
         try:
             if self._loop is None:
@@ -277,6 +285,9 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         Raises:
             CheckpointError: The checkpoint of the pause is not there.
         """
+        if self._refusal is not None:
+            # The next step says so.
+            return
         pointer = json.loads((Path(checkpoint) / _POINTER).read_text(encoding="utf-8"))
         place, trial_id = self._trial
         latest = _latest_iteration(place, trial_id)
