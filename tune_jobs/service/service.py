@@ -28,6 +28,7 @@ from tune_jobs.service.metrics import Metrics
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.state_metrics import EnvSteps, StateCollector
 from tune_jobs.service.statuses import Statuses
+from tune_jobs.service.storage_health import StorageHealth
 from tune_jobs.service.submitting import Submitter
 from tune_jobs.service.supervisor import Supervisor, Surroundings
 from tune_jobs.service.telling import Teller
@@ -47,6 +48,7 @@ class Service:
     queue: Queue
     labels: Labels
     statuses: Statuses
+    storage_health: StorageHealth
     submitter: Submitter
     supervisor: Supervisor
     watching: Watching
@@ -120,6 +122,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                     queue=queue,
                     labels=labels,
                     statuses=statuses,
+                    storage_health=StorageHealth(storage),
                     submitter=submitter,
                     supervisor=supervisor,
                     watching=watching,

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
-from policies.errors import CheckpointError, NotFoundError, TuneJobsError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
+from tune_jobs.store.patience import impatient
 from tune_jobs.sweeps.status import SweepStatus, status_of
 
 FRESH_S = 0.4
@@ -91,7 +92,13 @@ class Statuses:
 
         Raises:
             NotFoundError: There is none, it is damaged, or its name is nothing that JSON and addresses can have.
+            CannotRunError: Its store does not answer.
         """
+        # Whoever asks for it holds the lock meanwhile, and the next one waits for that.
+        with impatient():
+            return self._see(name)
+
+    def _see(self, name: str) -> Seen:
         if not _is_text(name):
             raise CheckpointError(
                 f"The name of the folder {name!a} is no text in UTF-8, so no page can link it.",
@@ -134,11 +141,21 @@ class Statuses:
         return Seen(status, trials, stamp, looked, Done(self._clock(), self._clock() - now), of=trials)
 
     def all(self) -> list[Seen]:
-        """Return all sweeps, by name; those that can't be read give a warning."""
+        """Return all sweeps, by name; those that can't be read give a warning.
+
+        Raises:
+            CheckpointError: They can't be listed.
+            CannotRunError: Their store does not answer.
+        """
         found = []
-        for sweep in self._storage.sweeps():
+        with impatient():
+            sweeps = self._storage.sweeps()
+        for sweep in sweeps:
             try:
                 found.append(self.see(sweep.name))
+            except CannotRunError:
+                # Without those that it has, a list would say that they are gone.
+                raise
             except TuneJobsError as error:
                 leave_out(error)
         return found

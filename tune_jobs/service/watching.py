@@ -10,13 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.views import ListView, SweepView, View
 from tune_jobs.store.contract import Storage
+from tune_jobs.store.patience import impatient
 from tune_jobs.sweeps.curves import Columns
 
 _log = logging.getLogger(__name__)
@@ -57,7 +58,8 @@ class Follower:
         self.used_at = time.monotonic()
         with self._looking:
             if self._thread is None:
-                self.log.add(self._view.changes())
+                with impatient():
+                    self.log.add(self._view.changes())
                 self._thread = threading.Thread(target=self._run, name=f"watch {self._what}", daemon=True)
                 self._thread.start()
 
@@ -91,12 +93,15 @@ class Follower:
             elif began - self.used_at > LINGER_S:
                 break
             try:
-                with self._looking:
+                with self._looking, impatient():
                     self.log.add(self._view.changes())
             except NotFoundError as error:
                 if not isinstance(error, CheckpointError):
                     self.log.add([("deleted", {})])
                     break
+                _log.warning("%s can't be followed just now: %s", self._what, error)
+                wait_s = _MOST_WAIT_S
+            except CannotRunError as error:
                 _log.warning("%s can't be followed just now: %s", self._what, error)
                 wait_s = _MOST_WAIT_S
             except Exception:  # noqa: BLE001 (such as a database that is away for a while)

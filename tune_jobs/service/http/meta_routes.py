@@ -18,7 +18,7 @@ router = APIRouter(tags=["service"])
 
 
 @router.get("/healthz")
-def health() -> Health:
+async def health() -> Health:
     """Say that the process answers."""
     return Health(status="ok")
 
@@ -32,6 +32,8 @@ def ready(service: TheService, response: Response) -> Ready:
             connection.execute(text("SELECT 1"))
     except SQLAlchemyError:
         problems.append("The database can't be used.")
+    if not service.storage_health.is_there():
+        problems.append("The storage can't be reached.")
     if not service.supervisor.is_alive:
         problems.append("The queue is not run.")
     if service.supervisor.is_draining:

@@ -20,6 +20,7 @@ from tune_jobs.service.problem_documents import database_problem, full_disk_prob
 from tune_jobs.service.queue import KeyUsedError
 from tune_jobs.service.submitting import DoesNotFitError
 from tune_jobs.spec.problems import WrongSpecError
+from tune_jobs.store.objects.bucket import ConflictError, StorageError
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +46,9 @@ _STATUS: tuple[tuple[type[TuneJobsError], HTTPStatus], ...] = (
     (CannotRunError, HTTPStatus.SERVICE_UNAVAILABLE),
 )
 
+_RETRY_AFTER_S, _RETRY_AFTER_CHANGE_S = "5", "60"
+"""Seconds after which a request may do that an object store didn't answer, or refused: then somebody has to change
+something."""
 _FRAMEWORKS = {
     "Not Found": ("There is nothing at this path.", "See the routes in /api/v1/openapi.json."),
     "There was an error parsing the body": (
@@ -71,6 +75,12 @@ def add_handlers(app: FastAPI) -> None:
 
 
 async def _told(_: Request, error: TuneJobsError) -> JSONResponse:
+    if (store_error := _of_store(error)) is not None:
+        answer = problem(
+            HTTPStatus.SERVICE_UNAVAILABLE, store_error.message, hint=store_error.hint, error=CannotRunError.__name__
+        )
+        answer.headers["Retry-After"] = _RETRY_AFTER_S if store_error.passes else _RETRY_AFTER_CHANGE_S
+        return answer
     status = next((code for kind, code in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
     if status == HTTPStatus.SERVICE_UNAVAILABLE and is_full(error):
         return full_disk_problem(error.message)
@@ -78,6 +88,13 @@ async def _told(_: Request, error: TuneJobsError) -> JSONResponse:
     # Of the words of the command line, which ends with the exit code of this kind of error.
     kind = next(item.__name__ for item in type(error).__mro__ if item.__module__ == TuneJobsError.__module__)
     return problem(status, error.message, hint=error.hint, error=kind, problems=problems)
+
+
+def _of_store(error: BaseException | None) -> StorageError | None:
+    """Return the error of an object store that another one came of."""
+    while error is not None and not (isinstance(error, StorageError) and not isinstance(error, ConflictError)):
+        error = error.__cause__
+    return error
 
 
 async def _refused(_: Request, error: RefusedError) -> JSONResponse:

@@ -14,6 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from tune_jobs.service.logs import ACCESS, answering
 from tune_jobs.service.metrics import Metrics
+from tune_jobs.store.patience import impatient
 
 HEADER = "X-Request-ID"
 NO_ROUTE = "none"
@@ -56,7 +57,9 @@ class RequestMiddleware:
             await send(message)
 
         try:
-            await self._app(scope, receive, sending)
+            # A request that waited for a store that is away would keep a thread from others that need none.
+            with impatient():
+                await self._app(scope, receive, sending)
         except Exception as error:
             if status is None:
                 # What the server answers then.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import os
 import threading
 from collections.abc import Callable, Iterable
@@ -34,7 +35,8 @@ def side_by_side(do: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     if not getattr(_here, "is_in_pool", False):
         # An interpreter that ends starts no threads any more; the last uploads are made all the same.
         with contextlib.suppress(RuntimeError):
-            begun.extend(_pool().submit(do, item) for item in wanted[1:])
+            # Whoever wants an answer now wants it there, too.
+            begun.extend(_pool().submit(contextvars.copy_context().run, do, item) for item in wanted[1:])
     own = [_done(do, item) for item in (*wanted[:1], *wanted[1 + len(begun) :])]
     return [future.result() for future in (*own[:1], *begun, *own[1:])]
 

@@ -23,6 +23,7 @@ from policies.files import atomic_path
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.reasons import MISSING_BUCKET, reason_of
 from tune_jobs.store.objects.url import ObjectUrl
+from tune_jobs.store.patience import ANSWER_S, AWAY, is_impatient
 
 if TYPE_CHECKING:
     import obstore.store
@@ -48,11 +49,12 @@ class StorageError(CannotRunError):
         message: What could not be done, and why.
         hint: What to do.
         passes: Whether another try may do it: the store answered by an error of its own, or not at all.
+        reason: Why, alone, without a full stop.
     """
 
-    def __init__(self, message: str, hint: str = "", *, passes: bool = False) -> None:
+    def __init__(self, message: str, hint: str = "", *, passes: bool = False, reason: str = "") -> None:
         super().__init__(message, hint)
-        self.passes = passes
+        self.passes, self.reason = passes, reason
 
 
 class ConflictError(StorageError):
@@ -87,17 +89,19 @@ class Bucket:
 
     def __init__(self, url: ObjectUrl) -> None:
         self.url = url
-        self._opened: obstore.store.ObjectStore | None = None
+        # For those who wait, and for those who want an answer now.
+        self._opened: dict[bool, obstore.store.ObjectStore] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"url": self.url, "_opened": None}
+        return {"url": self.url, "_opened": {}}
 
     @property
     def _store(self) -> obstore.store.ObjectStore:
         # Opened when it is needed: obstore takes 0.1 s to load, and an address alone needs none.
-        if self._opened is None:
-            self._opened = _client(self.url)
-        return self._opened
+        now = is_impatient()
+        if now not in self._opened:
+            self._opened[now] = _client(self.url, now=now)
+        return self._opened[now]
 
     def get(self, key: str) -> Found | None:
         """Return an object; None: there is none.
@@ -301,13 +305,25 @@ class Bucket:
             raise error
 
     def _doing(self, what: str, key: str, do: Callable[[], _T]) -> _T:
-        deadline, pause = time.monotonic() + _PATIENCE_S, _FIRST_PAUSE_S
+        store, now = f"{self.url.scheme}://{self.url.bucket} {self.url.settings}", is_impatient()
+        away = AWAY.error(store) if now else None
+        if away is not None:
+            why, hint = (str(item) for item in away.args)
+            raise StorageError(f"{self.name_of(key)} cannot be {what}: {why}.", hint, passes=True)
+        deadline, pause = time.monotonic() + (ANSWER_S / 2 if now else _PATIENCE_S), _FIRST_PAUSE_S
         while True:
             try:
                 with self._told(what, key):
-                    return do()
+                    done = do()
+                AWAY.answered(store)
+                return done
             except StorageError as error:
-                if not error.passes or time.monotonic() + pause > deadline:
+                if not error.passes:
+                    AWAY.answered(store)
+                    raise
+                if time.monotonic() + pause > deadline:
+                    if now:
+                        AWAY.failed(store, CannotRunError(error.reason, error.hint))
                     raise
             time.sleep(pause)
             pause = min(2 * pause, _LONGEST_PAUSE_S)
@@ -323,7 +339,7 @@ class Bucket:
         except (BaseError, OSError, ValueError) as error:
             reason = reason_of(error, self.url.short)
             message = f"{self.name_of(key)} cannot be {what}: {reason.text}."
-            raise StorageError(message, reason.hint, passes=reason.passes) from None
+            raise StorageError(message, reason.hint, passes=reason.passes, reason=reason.text) from None
 
 
 def _tag(meta: Any) -> Tag:
@@ -334,18 +350,20 @@ def _listed(meta: Any) -> Listed:
     return Listed(meta["path"], meta["size"], _tag(meta), meta["last_modified"].timestamp())
 
 
-def _client(url: ObjectUrl) -> obstore.store.ObjectStore:
+def _client(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
     # What it was made from: a forked process has none of its parent's threads, and each has its credentials from there.
     told = tuple(item for item in sorted(os.environ.items()) if item[0].startswith(("AWS_", "GOOGLE_", "AZURE_")))
-    return _client_of(os.getpid(), str(url), told)
+    return _client_of(os.getpid(), str(url), told, now=now)
 
 
 @functools.lru_cache(maxsize=_MAX_CLIENTS)
-def _client_of(_process: int, address: str, _told: tuple[tuple[str, str], ...]) -> obstore.store.ObjectStore:
-    return _open(ObjectUrl.parse(address))
+def _client_of(
+    _process: int, address: str, _told: tuple[tuple[str, str], ...], *, now: bool
+) -> obstore.store.ObjectStore:
+    return _open(ObjectUrl.parse(address), now=now)
 
 
-def _open(url: ObjectUrl) -> obstore.store.ObjectStore:
+def _open(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
     from obstore.store import AzureStore, GCSStore, S3Store
 
     prefix = url.prefix or None
@@ -357,6 +375,11 @@ def _open(url: ObjectUrl) -> obstore.store.ObjectStore:
         },
         "retry_config": {"max_retries": 12, "retry_timeout": timedelta(seconds=_PATIENCE_S)},
     }
+    if now:
+        # A large answer may take its time, but none that stands still.
+        options["client_options"] |= {"read_timeout": timedelta(seconds=ANSWER_S)}
+        options["client_options"] |= {"connect_timeout": timedelta(seconds=ANSWER_S / 2)}
+        options["retry_config"] = {"max_retries": 3, "retry_timeout": timedelta(seconds=ANSWER_S / 2)}
     endpoint = url.settings.get("endpoint")
     if url.scheme == "s3":
         if endpoint:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import PurePosixPath
 
 from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Bucket, StorageError
 from tune_jobs.store.objects.object_sweep import ObjectSweep, name_taken
 from tune_jobs.store.objects.url import ObjectUrl
 
 _MAX_NAME_BYTES = 255
-_AT_ONCE = 32
 
 
 class ObjectStorage:
@@ -53,8 +52,7 @@ class ObjectStorage:
             folders, _ = Bucket(self._url).children()
             # Hidden ones are rehearsals.
             found = [self.sweep(name) for name in folders if not name.startswith(".")]
-            with ThreadPoolExecutor(_AT_ONCE) as pool:
-                exist = list(pool.map(ObjectSweep.exists, found))
+            exist = side_by_side(ObjectSweep.exists, found)
         except StorageError as error:
             raise CheckpointError(error.message, error.hint) from error
         return [sweep for sweep, is_there in zip(found, exist, strict=True) if is_there]

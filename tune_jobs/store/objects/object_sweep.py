@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import hashlib
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -170,8 +171,13 @@ class ObjectSweep(Artifacts):
                 listed = self._listed_trials()
                 side_by_side(lambda trial_id: self.trial(trial_id).fetch(listed[trial_id], results=results), listed)
             if checkpoints:
+                pending: list[Future[Any]] = []
                 with ThreadPoolExecutor(AT_ONCE) as pool:
-                    list(pool.map(lambda item: self.trial(item.trial_id).fetch_checkpoint(item.iteration), checkpoints))
+                    for item in checkpoints:
+                        fetch = self.trial(item.trial_id).fetch_checkpoint
+                        pending.append(pool.submit(contextvars.copy_context().run, fetch, item.iteration))
+                for future in pending:
+                    future.result()
             yield
         finally:
             if is_outermost:
