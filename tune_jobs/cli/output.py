@@ -132,7 +132,7 @@ def show_sweeps(statuses: Sequence[SweepStatus], *, as_json: bool) -> None:
         return
     table = make_table("sweep", "state", "trials", "created")
     for status in statuses:
-        table.add_row(status.sweep.name, status.state, status.told_counts, local_time(status.sweep.created_at))
+        table.add_row(status.sweep.name, status.told_state, status.told_counts, local_time(status.sweep.created_at))
     console.print(table)
 
 

@@ -6,6 +6,7 @@ Tune decides which trial runs where and when; what a trial is and how far it got
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
 from collections.abc import Callable, Sequence
@@ -32,6 +33,7 @@ from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import PopulationScheduler
 from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
 from tune_jobs.ray_tune.reporter import reporter
+from tune_jobs.ray_tune.run_waits import RunWaits
 from tune_jobs.ray_tune.scheduling import EveryoneGoesOn
 from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
 from tune_jobs.ray_tune.trainable import TrialTrainable
@@ -42,6 +44,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
 from tune_jobs.store.opening import name_for_commands, open_sweep
+from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 from tune_jobs.store.storage_watch import StorageWatch
 
@@ -107,6 +110,8 @@ def run_trials(job: RunJob, listener: Listener) -> None:
             raise
         finally:
             with current().shielded():
+                with contextlib.suppress(OwnershipLostError):
+                    run.waits.end()
                 run.keeper.close()
                 owner.release()
 
@@ -125,6 +130,7 @@ class _Run:
         self._record = store.read_record()
         self._spec = stored_spec(self._record)
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
+        self.waits = RunWaits(store, self.keeper)
         self._scheduler: TrialScheduler = TuneScheduler(EveryoneGoesOn())
         self._chooser: PointChooser | None = None
 
@@ -173,6 +179,7 @@ class _Run:
         losses = NodeLosses(lambda trial: driver.reached(pack_id_of(trial)), self._watch.check_after)
         events = PackEvents(driver, self.keeper, self._spec.iteration_timeout_s, self._watch, losses)
         bundle = {"CPU": plan.cpus_per_pack} | ({"GPU": plan.gpus_per_pack} if plan.gpus_per_pack else {})
+        self.waits.resources = bundle
         tuner = tune.Tuner(
             tune.with_resources(PackTrainable, tune.PlacementGroupFactory([bundle])),
             param_space={
@@ -198,6 +205,8 @@ class _Run:
         param_space: dict[str, Any] = dict(self._config)
         losses = NodeLosses(self._reached, self._watch.check_after)
         events = TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
+        resources = _resources(spec, job)
+        self.waits.resources = resources.required_resources
         at_once = None if waits_for_others(spec.scheduler) else job.max_concurrent
         searcher: Searcher | SearchAlgorithm
         if self._chooser is not None:
@@ -207,7 +216,7 @@ class _Run:
             param_space["trial_id"] = None
             searcher = BasicVariantGenerator([{"trial_id": name} for name in trial_ids], max_concurrent=at_once or 0)
         tuner = tune.Tuner(
-            tune.with_resources(TrialTrainable, _resources(spec, job)),
+            tune.with_resources(TrialTrainable, resources),
             param_space=param_space,
             tune_config=tune.TuneConfig(
                 search_alg=searcher,
@@ -233,7 +242,7 @@ class _Run:
         return tune.RunConfig(
             name=name,
             storage_path=str(self._store.tune_folder),
-            stop=_StopWhenAsked(self._store, self.keeper, is_finished, self._watch),
+            stop=_StopWhenAsked(self._store, self.keeper, is_finished, self._watch, self.waits),
             verbose=0,
             progress_reporter=reporter(),
             failure_config=tune.FailureConfig(max_failures=max_failures),
@@ -255,8 +264,11 @@ def _resources(spec: SweepSpec, job: RunJob) -> tune.PlacementGroupFactory:
 class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
     """Ends the run when nothing is left to do, or when it is asked to stop and trials have saved or took too long."""
 
-    def __init__(self, store: Sweep, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch) -> None:
+    def __init__(
+        self, store: Sweep, keeper: RecordKeeper, is_finished: Callable[[], bool], watch: RayWatch, waits: RunWaits
+    ) -> None:
         self._watch = watch
+        self._waits = waits
         self._store = store
         self._keeper = keeper
         self._is_finished = is_finished
@@ -272,9 +284,11 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         Raises:
             RayDiedError: A part of Ray is gone.
             CannotRunError: The storage is.
+            OwnershipLostError: Another process runs the sweep by now.
         """
         self._watch.check()
         self._storage.check()
+        self._waits.look()
         if self._is_finished():
             return True
         if self._asked_at is None:

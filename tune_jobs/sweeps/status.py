@@ -64,6 +64,11 @@ class SweepStatus:
         return "interrupted" if self.sweep.state == "running" and not self.alive else self.sweep.state
 
     @property
+    def told_state(self) -> str:
+        """The sweep's state for a list, in which nothing else says that it waits."""
+        return self.state if self.waits_for is None else "waiting for nodes"
+
+    @property
     def told_counts(self) -> str:
         """The number of trials by status, as text."""
         return ", ".join(f"{number:,} {name}" for name, number in self.counts.items() if number) or "none"
@@ -165,7 +170,9 @@ class Sweeps(BriefList[SweepStatus]):
     """The sweeps of a storage folder, by name."""
 
     def _repr_html_(self) -> str:
-        rows = [(each.sweep.name, each.state, each.told_counts, _best_text(each.best).split("  ")[0]) for each in self]
+        rows = [
+            (each.sweep.name, each.told_state, each.told_counts, _best_text(each.best).split("  ")[0]) for each in self
+        ]
         return rows_html(("sweep", "state", "trials", "best so far"), rows)
 
 
