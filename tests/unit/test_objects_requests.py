@@ -2,8 +2,12 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import cast
 
 import pytest
+from fake_pack import Pack, statuses
 from s3_faults import Faults, Opened
 from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
 
@@ -80,6 +84,25 @@ def test_files_of_one_checkpoint_are_uploaded_side_by_side(faults: Faults, opene
     trial.write_checkpoint(make_checkpoint(1), fill)
     trial.settle()
     assert not both_came.broken
+
+
+def test_members_of_a_pack_are_opened_side_by_side(faults: Faults, opened: Opened) -> None:
+    all_came = threading.Barrier(NUM_TRIALS, timeout=30)
+    faults.rule("slow", kinds="GET", keys="/head.json$", times=NUM_TRIALS, then=all_came.wait)
+    pack = Pack(cast("Path", opened().place), stop={"num_iterations": 1}).add("t0000", "t0001", "t0002").run()
+    assert not all_came.broken
+    assert pack.engine.builds == [("t0000", None), ("t0001", None), ("t0002", None)]
+    assert set(statuses(pack).values()) == {"completed"}
+    assert [len(opened().trial(name).read_iterations()) for name in ("t0000", "t0001", "t0002")] == [1, 1, 1]
+
+
+def test_who_checks_side_by_side_waits_for_one_answer(faults: Faults, opened: Opened) -> None:
+    run = opened().take()
+    all_came = threading.Barrier(NUM_TRIALS, timeout=30)
+    faults.rule("slow", kinds="GET", keys="/run.json$", times=NUM_TRIALS, then=all_came.wait)
+    with ThreadPoolExecutor(NUM_TRIALS) as pool:
+        list(pool.map(lambda _: run.check(), range(NUM_TRIALS)))
+    assert not all_came.broken
 
 
 def test_a_report_is_uploaded_side_by_side_and_not_fetched_where_it_was_made(faults: Faults, opened: Opened) -> None:

@@ -234,8 +234,7 @@ class PackLoop:
     def _one_iteration(self) -> bool:
         """Train all members once and evaluate those that are due; return whether there were any members."""
         while new := [member for member in self._members.values() if member.loop is None]:
-            for member in new:
-                self._open(member)
+            self._open(new)
         if not self._members:
             return False
         due: list[_TrialInPack] = []
@@ -310,14 +309,21 @@ class PackLoop:
         member.close()
         del self._members[member.task.trial_id]
 
-    def _open(self, member: _TrialInPack) -> None:
-        member.engine = _MemberEngine(self._engine, member.task.trial_id, self._lock)
-        member.loop = TrialSteps(member.task, member.engine, self._evaluator, self._clock, self._under)
-        try:
-            with self._watch(member.task.iteration_timeout_s):
-                member.loop.open()
-        except Exception as error:  # noqa: BLE001 (it must not end the others)
-            self._failed(member, error)
+    def _open(self, new: Sequence[_TrialInPack]) -> None:
+        for member in new:
+            member.engine = _MemberEngine(self._engine, member.task.trial_id, self._lock)
+            member.loop = TrialSteps(member.task, member.engine, self._evaluator, self._clock, self._under)
+        with self._watch(max(member.task.iteration_timeout_s for member in new)):
+            # Side by side, as the store may be far away; they are built one after the other, in their order.
+            taken = list(self._writers.map(_outcome, [member.trial.take_over for member in new]))
+        for member, outcome in zip(new, taken, strict=True):
+            try:
+                if isinstance(outcome, Exception):
+                    raise outcome  # noqa: TRY301 (told as what `build` raises)
+                with self._watch(member.task.iteration_timeout_s):
+                    member.trial.build()
+            except Exception as error:  # noqa: BLE001 (it must not end the others)
+                self._failed(member, error)
 
     def _failed(self, member: _TrialInPack, error: Exception, *, leaves: bool = False) -> None:
         """Report a failure; the member is opened again if it may be retried and need not leave."""

@@ -79,6 +79,8 @@ class TrialSteps:
         self._reason: str | None = None
         # Whether the engine has a copy of another trial's weights with which it has not trained yet.
         self._is_copy = False
+        # The folder with the weights that the trial goes on from; None: it is built from its seed.
+        self._built_from: Path | None = None
         self._started = 0.0
         self._started_at: float | None = None
 
@@ -108,6 +110,15 @@ class TrialSteps:
                 hyperparameters.
             OwnershipLostError: This process may not open the trial any more.
         """
+        self.take_over()
+        self.build()
+
+    def take_over(self) -> None:
+        """Do the first half of `open`: take the trial, and read what there is of it. Only the store is used here.
+
+        Raises:
+            OwnershipLostError: This process may not open the trial any more.
+        """
         self._store.take(self._under)
         self._store.remove_leftovers()
         self._checkpoints, self._notes = take_up_checkpoints(self._store)
@@ -127,6 +138,16 @@ class TrialSteps:
         elif latest is not None:
             folder = self._store.checkpoint_folder(latest.iteration)
         self._take_up_results(start)
+        self._built_from = folder
+
+    def build(self) -> None:
+        """Do the second half of `open`: build the trial from what was read.
+
+        Raises:
+            CheckpointError: The checkpoint is whole but cannot be restored.
+            OwnershipLostError: Another process has taken the trial.
+        """
+        folder = self._built_from
         for note in self._notes:
             self._store.write_log(f"{self.task.trial_id}: {note}")
         with self._store.owned():

@@ -92,7 +92,7 @@ class ObjectOwner:
     def __init__(self, bucket: Bucket, key: str, token: str) -> None:
         self._bucket, self._key = bucket, key
         self.token = token
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._looked_at, self._was_current = -float("inf"), True
         self._looking: threading.Thread | None = None
 
@@ -165,9 +165,9 @@ class ObjectOwner:
         Raises:
             OwnershipLostError: Another process has.
         """
-        with self._lock:
-            if self._was_current:
-                self._look()
+        # Not under the lock: who checks side by side waits for one answer, not for one after the other.
+        if self._was_current:
+            self._look()
         if not self._was_current:
             raise lost(self._bucket.name_of(self._key), self._present())
 
@@ -193,8 +193,9 @@ class ObjectOwner:
     def _look(self) -> None:
         asked_at = time.monotonic()
         is_current = self._present() == self.token
-        self._was_current = self._was_current and is_current
-        self._looked_at = max(asked_at, self._looked_at)
+        with self._lock:
+            self._was_current = self._was_current and is_current
+            self._looked_at = max(asked_at, self._looked_at)
 
     def _look_again(self) -> None:
         # A store that does not answer is asked by who needs to know, once the answer before is not believed any more.
