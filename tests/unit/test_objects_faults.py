@@ -272,6 +272,31 @@ def test_a_sweep_in_a_bucket_that_is_missing_is_no_sweep_that_is_missing(faults:
         assert "Make the bucket" in raised.value.hint
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        "<Message>The region 'us-east-1' is wrong; expecting 'eu-west-1'</Message>",
+        "<Message>Wrong.</Message><Region>eu-west-1</Region>",
+    ],
+)
+def test_the_region_that_the_store_names_is_in_the_hint(faults: Faults, bucket: Bucket, said: str) -> None:
+    faults.rule("status", status=400, body=f"<Error><Code>AuthorizationHeaderMalformed</Code>{said}</Error>")
+    with pytest.raises(StorageError) as raised:
+        bucket.listed()
+    assert "add ?region=eu-west-1 to" in raised.value.hint
+
+
+def test_a_web_server_that_is_no_object_store_is_told_at_once(faults: Faults, bucket: Bucket) -> None:
+    for use in (lambda: bucket.put("a", b"1"), lambda: bucket.look("a")):
+        faults.clear()
+        faults.rule("status", status=200, body="<html><body>Welcome</body></html>", times=100)
+        with pytest.raises(StorageError, match="no object store") as raised:
+            use()
+        assert not raised.value.passes
+        assert "Correct the endpoint" in raised.value.hint
+        assert len(faults.requests) == 1
+
+
 def test_patience_has_an_end(faults: Faults, bucket: Bucket) -> None:
     faults.rule("torn", kinds="LIST", times=10_000)
     bucket.put("a", b"x")

@@ -17,6 +17,7 @@ MISSING_BUCKET = ("NoSuchBucket", "ContainerNotFound", "The specified bucket doe
 _PASSING_CODES = ("RequestTimeout", "OperationAborted", "ConditionalRequestConflict", "SlowDown")
 _EXPIRED = ("ExpiredToken", "TokenRefreshRequired", "InvalidToken", "ExpiredTokenException", "RequestExpired")
 _REGION = ("PermanentRedirect", "AuthorizationHeaderMalformed", "IllegalLocationConstraintException")
+_REGION_TOLD = re.compile(r"(?:<Region>|expecting ')([a-z0-9-]{2,40})(?:</Region>|')")
 _CONNECTIONS = {
     "ConnectionRefused|Connection refused": "the connection was refused",
     "TimedOut|timed out": "there was no answer in time",
@@ -63,6 +64,10 @@ def reason_of(error: Exception, place: str) -> Reason:
         parts = [status[0].rstrip() if status else "", code, _first_line(said[1]) if said else ""]
         passes = number >= 500 or number in (408, 429) or code in _PASSING_CODES
         why, hint = ", ".join(part for part in parts if part), _hint(number, code, text, place) or reach
+    elif "Header missing from response" in text:
+        # A web server's page, say: an object has a tag and a length.
+        why, passes = "what answers there is no object store", False
+        hint = "Correct the endpoint in the storage's address: its host and its port."
     elif "redirect without LOCATION" in text:
         why, passes, hint = "the store sends to another place (status code: 301)", False, _hint(301, "", text, place)
     elif "invalid path" in text:
@@ -92,12 +97,14 @@ def _hint(status: int, code: str, text: str, place: str) -> str:
     if code in _EXPIRED:
         return (
             "The session token of this process's credentials has expired or is not valid: get new ones "
-            "(AWS_SESSION_TOKEN, say), or let the machine's role give them, and resume the sweep."
+            "(AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, say), or let the machine's role give them, and resume the sweep."
         )
     if code == "RequestTimeTooSkewed":
         return "Set this machine's clock: it differs from the store's by more than that allows."
     if status == 301 or code in _REGION:
-        return "The bucket is in another region: add ?region=REGION to the storage's address."
+        told = _REGION_TOLD.search(text)
+        region = told[1] if told is not None else "REGION"
+        return f"The bucket is in another region: add ?region={region} to the storage's address."
     if status in (401, 403) or (status == 400 and not code):
         return _credentials(place)
     return ""
