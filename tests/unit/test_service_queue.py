@@ -1,11 +1,13 @@
 """The queue: which job is next, what is remembered, and that each change happens once; in both databases."""
 
+import functools
 import itertools
 import json
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from databases import database_url, postgresql  # noqa: F401 (fixtures)
@@ -17,6 +19,7 @@ from tune_jobs.service.database import opening
 from tune_jobs.service.database.opening import open_database, sqlite_url
 from tune_jobs.service.database.tables import metadata
 from tune_jobs.service.jobs import Job
+from tune_jobs.service.labels import Label, Labels
 from tune_jobs.service.queue import KeyUsedError, Queue
 
 
@@ -224,6 +227,14 @@ def test_of_equal_requests_at_once_one_makes_a_job(queue: Queue) -> None:
     assert len(jobs) == 1
     assert sum(result[1] for result in found) == 1  # type: ignore[index]
     assert len(queue.jobs()) == 1
+
+
+def test_a_new_sweep_is_labelled_by_several_at_once(engine: Engine) -> None:
+    labels = Labels(engine)
+    for turn in range(10):
+        changes: list[dict[str, Any]] = [{"owner": "ann"}, {"note": "mine"}, {"tags": ["a"]}, {}] * 2
+        at_once([functools.partial(labels.change, f"s{turn}", **change) for change in changes])
+        assert labels.of(f"s{turn}") == Label("ann", "mine", ("a",))
 
 
 def test_a_job_is_claimed_once(queue: Queue) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Engine, delete, insert, select, update
+from sqlalchemy.exc import IntegrityError
 
 from tune_jobs.service.database.tables import sweeps
 
@@ -51,12 +52,17 @@ class Labels:
         """Change what is given, and return the label."""
         given: dict[str, Any] = {"owner": owner, "note": note, "tags": None if tags is None else list(tags)}
         values = {key: value for key, value in given.items() if value is not None}
+        change = update(sweeps).where(sweeps.c.name == name).values(values or {"name": name})
         with self._engine.begin() as connection:
-            found = connection.execute(select(sweeps.c.name).where(sweeps.c.name == name)).first()
-            if found is None:
-                connection.execute(insert(sweeps).values({"name": name, "owner": "", "note": "", "tags": []} | values))
-            elif values:
-                connection.execute(update(sweeps).where(sweeps.c.name == name).values(values))
+            if connection.execute(change).rowcount == 0:
+                try:
+                    # Of PostgreSQL's transactions an error would end the whole one.
+                    with connection.begin_nested():
+                        new = {"name": name, "owner": "", "note": "", "tags": []} | values
+                        connection.execute(insert(sweeps).values(new))
+                except IntegrityError:
+                    # Another one has made it meanwhile, and said something else of it.
+                    connection.execute(change)
         return self.of(name)
 
     def forget(self, name: str) -> None:
