@@ -97,7 +97,8 @@ def _hint(status: int, code: str, text: str, place: str) -> str:
     if code in _EXPIRED:
         return (
             "The session token of this process's credentials has expired or is not valid: get new ones "
-            "(AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, say), or let the machine's role give them, and resume the sweep."
+            "(AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN, say), or let the machine's role give "
+            "them, and resume the sweep."
         )
     if code == "RequestTimeTooSkewed":
         return "Set this machine's clock: it differs from the store's by more than that allows."
