@@ -55,17 +55,17 @@ $(VENV)/installed-bench: $(VENV)/installed
 # reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
 # the environment says.
 RAY := tests/ray
-# It needs no Ray of the tests' own, and takes the longest of its part.
+# It needs no Ray of the tests' own: it stands where there is time left.
 SERVED := $(RAY)/test_service.py
 OTHERS := $(filter-out $(RAY)/ tests/unit/,$(sort $(dir $(wildcard tests/*/test_*.py))))
 PYTEST := $(BIN)/python -m pytest --durations=15 --durations-min=5
 test unit: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
-	$(PYTEST) $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
+	$(PYTEST) $(RAY)/test_[a-ot-z]*.py $(SERVED) > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
 	$(PYTEST) $(filter-out $(SERVED),$(sort $(wildcard $(RAY)/test_[p-s]*.py))) > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
 	$(PYTEST) tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
-	$(PYTEST) $(OTHERS) $(SERVED); others=$$?; \
+	$(PYTEST) $(OTHERS); others=$$?; \
 	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \

@@ -137,6 +137,9 @@ def two_resume(folder: Path, kind: str, undisturbed: Sweep) -> list[Outcome]:
     before = Before(sweep)
     outcome.check = before.problems
     both = [sweep.begin(), sweep.begin()]
+    # It goes on slowly until one of them was sent away: one that comes when the other is done has nothing to do.
+    if not wait_for(lambda: both[1].poll() is not None, both[0], _GONE_S):
+        wait_for(lambda: both[0].poll() is not None, both[1], _GONE_S)
     sweep.slow.unlink()
     codes = sorted(process.wait(600) for process in both)
     if codes != [0, 5]:
