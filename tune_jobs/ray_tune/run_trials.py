@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,16 +104,26 @@ def run_trials(job: RunJob, listener: Listener) -> None:
                 watch.check_after(error)
             except RayDiedError as death:
                 raise ray_died(name_for_commands(store), death) from error
-            if type(error) is CannotRunError:
-                # The storage, say, can't be written any more.
-                raise going_on(error, name_for_commands(store)) from error
-            raise
+            with _saying_how_to_go_on(store):
+                raise
         finally:
-            with current().shielded():
+            # What ended the run may keep the last records from being written too, and is told in this way then.
+            with current().shielded(), _saying_how_to_go_on(store):
                 with contextlib.suppress(OwnershipLostError):
                     run.waits.end()
                 run.keeper.close()
                 owner.release()
+
+
+@contextlib.contextmanager
+def _saying_how_to_go_on(store: Sweep) -> Iterator[None]:
+    try:
+        yield
+    except CannotRunError as error:
+        if type(error) is not CannotRunError:
+            raise
+        # The storage, say, can't be written any more.
+        raise going_on(error, name_for_commands(store)) from error
 
 
 class _Run:

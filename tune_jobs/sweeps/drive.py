@@ -269,8 +269,18 @@ def _run_trials(
             finally:
                 monitor.phase = "ending Ray" if address is None else "leaving the Ray cluster"
                 # Done before Ray is shut down: if a part of Ray died, that takes long, and may end this process.
-                with current().shielded(), run.held():
+                with current().shielded(), run.held(), _giving_way_to(sys.exception()):
                     close_run(store, started)
+
+
+@contextlib.contextmanager
+def _giving_way_to(earlier: BaseException | None) -> Iterator[None]:
+    """Say nothing of what can't be written in the block if the same storage has ended the run before, which is told."""
+    try:
+        yield
+    except CannotRunError:
+        if earlier is None:
+            raise
 
 
 def most_at_once(store: Sweep, now: int, *, num_trials: int) -> int:
