@@ -9,9 +9,12 @@ import subprocess
 import sys
 import venv
 from collections.abc import Sequence
+from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 pytestmark = pytest.mark.package
 ROOT = Path(__file__).parents[2]
@@ -19,20 +22,56 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clean environment's bin folder, with the wheel and what it depends on, at the tested versions."""
+    """A clean environment's bin folder, with the wheel and what it says that it depends on, at the tested versions."""
     folder = tmp_path_factory.mktemp("wheel")
     call([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)], folder)
     (wheel,) = folder.glob("*.whl")
     venv.create(folder / "venv")
     binaries = folder / "venv" / "bin"
-    constraints = ROOT / "constraints.txt"
-    (torch,) = [line for line in constraints.read_text().splitlines() if line.startswith("torch==")]
-    # Not compiled by pip, file by file: Python compiles what is imported, a fifth of it.
     pip = [sys.executable, "-m", "pip", "--python", str(binaries / "python")]
-    pip += ["install", "--quiet", "--no-compile", "--constraint", str(constraints)]
-    call([*pip, torch], folder)
-    call([*pip, str(wheel)], folder)
+    call([*pip, "install", "--quiet", "--no-compile", "--no-deps", str(wheel)], folder)
+    (packages,) = (folder / "venv" / "lib").glob("python*/site-packages")
+    (ours,) = packages.glob("tune_jobs-*.dist-info")
+    # Not by pip, which would fetch and unpack gigabytes for two minutes: the files are those of the tests' environment.
+    for needed in needed_by(Distribution.at(ours)):
+        link_files(needed, packages)
+    call([*pip, "check"], folder)
     return binaries
+
+
+def needed_by(installed: Distribution) -> list[Distribution]:
+    """What is needed by a distribution without its extras, directly or not, as it is in the tests' environment."""
+    found: dict[str, Distribution] = {}
+    asked: set[tuple[str, str]] = set()
+
+    def visit(needs: Distribution, extra: str) -> None:
+        for text in needs.requires or ():
+            requirement = Requirement(text)
+            if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
+                continue
+            for wanted in ("", *requirement.extras):
+                key = (canonicalize_name(requirement.name), wanted)
+                if key not in asked:
+                    asked.add(key)
+                    visit(found.setdefault(key[0], distribution(requirement.name)), wanted)
+
+    visit(installed, "")
+    return list(found.values())
+
+
+def link_files(installed: Distribution, packages: Path) -> None:
+    """Let another environment have a distribution's files, without commands and what Python compiled."""
+    for file in installed.files or ():
+        if ".." in file.parts or file.suffix == ".pyc":
+            continue
+        target = packages / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(str(file.locate()), target)
+        except OSError:
+            # On another disk.
+            shutil.copyfile(str(file.locate()), target)
+            shutil.copymode(str(file.locate()), target)
 
 
 def call(command: Sequence[str], cwd: Path) -> str:
