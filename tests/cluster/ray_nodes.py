@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.kills.processes import end_with_parent
+
 BIN = Path(sys.executable).parent
 START_TIMEOUT_S = 180
 STOP_TIMEOUT_S = 60
@@ -28,6 +30,11 @@ def free_port() -> int:
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
+
+
+def _take_leave_with_parent() -> None:
+    # `ray start` ends what it has started, at this signal.
+    end_with_parent(signal.SIGTERM)
 
 
 def kill_group(process: subprocess.Popen[Any]) -> None:
@@ -158,6 +165,7 @@ class Cluster:
                 process = subprocess.Popen(
                     command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
                     env={**self.environment, **environment}, start_new_session=True,
+                    preexec_fn=_take_leave_with_parent,  # noqa: PLW1509 (it makes one system call)
                 )  # fmt: skip
             node = self.nodes[name] = Node(name, process, log)
             try:

@@ -11,6 +11,7 @@ import functools
 import random
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +38,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.fresh:
         shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
+    # So that what is undone on the way out is undone: mounts, cables, nodes.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     outcomes = Outcomes(folder / "outcomes.jsonl")
     for name, scenario in SCENARIOS.items():
         if not options.only or name in options.only.split(","):
@@ -114,8 +117,8 @@ def single_faults(folder: Path, outcomes: Outcomes, _: int, kinds: tuple[str, ..
 
 def cluster_faults(folder: Path, outcomes: Outcomes, _: int, kinds: tuple[str, ...], seed: int) -> None:
     """Those of a cluster's nodes."""
-    if "packed" in kinds:
-        for name, act in nodes.all_of(functools.partial(kills.reference, folder, "packed"), seed).items():
+    for kind in (kind for kind in kinds if kind in ("packed", "rllib")):
+        for name, act in nodes.all_of(folder, kind, seed).items():
             _once(outcomes, folder, name, act)
 
 

@@ -20,6 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+from tests.kills.processes import end_with_parent
+
 _LOOK_S = 0.01
 
 
@@ -125,6 +127,7 @@ def _be(command: Sequence[str], folder: Path, environment: Mapping[str, str], ou
     """Be the command from now on, in a fork; never returns."""
     code = 1
     try:
+        end_with_parent()
         os.setsid()
         os.chdir(folder)
         for path, flags, numbers in ((os.devnull, os.O_RDONLY, (0,)), (output, os.O_WRONLY | os.O_APPEND, (1, 2))):

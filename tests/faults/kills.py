@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from tests.faults.outcomes import Outcome
 from tests.faults.sweeps import KINDS, Before, Disturbed, Sweep, spec, wait_for, wrong
@@ -18,12 +19,12 @@ _GONE_S = 60.0
 _LONGEST_DELAY_S = 3.0
 
 
-def reference(folder: Path, kind: str) -> Sweep:
-    """The undisturbed sweep of a kind; it is run once."""
-    place = folder / f"undisturbed-{kind}"
+def reference(folder: Path, kind: str, mark: str = "", **changes: Any) -> Sweep:
+    """The undisturbed sweep of a kind, with settings changed, which `mark` names; it is run once."""
+    place = folder / f"undisturbed-{kind}{mark}"
     place.mkdir(parents=True, exist_ok=True)
     # The files that the environment asks for, which are never there, are its own.
-    sweep = Sweep(place, spec(kind, place))
+    sweep = Sweep(place, spec(kind, place, **changes))
     if not (sweep.place / "sweep.json").is_file() or any(r["status"] != "completed" for r in sweep.records()):
         found = sweep.end()
         if found:

@@ -19,6 +19,8 @@ class Outcome:
     problems: list[str] = field(default_factory=list)
     recomputed: int | None = None
     """The most iterations of a trial that had to be trained again."""
+    told: str = ""
+    """The end of what the run printed, if the fault ended it."""
     seconds: float = 0.0
     check: Callable[[], list[str]] | None = None
     """Called when the sweep is at its end."""

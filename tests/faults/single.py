@@ -23,17 +23,24 @@ from tests.kills.processes import Family
 
 _MEETS_S, _STOPPED_S, _OUTAGE_S, _ENDS_S = 120.0, 60.0, 30.0, 300.0
 _TIMEOUT_S = 20.0
+_TOLD_CHARACTERS = 2_000
 _STORAGE_BYTES = 64 * 1024**2
 _CLONE_NEWNS = 0x00020000
 ENV_FAULTS = ("exit", "hang", "memory")
 STORAGE_FAULTS = ("full", "read-only", "gone")
+_SLOW_OPERATION_S, _SLOW_S = 10.0, 120.0
 
 
 def all_of(kind: str, undisturbed: Callable[[], Sweep]) -> dict[str, Callable[[Path], Outcome]]:
     """Each of these faults by its name, as a function of an empty folder."""
     found = {f"env: {how}, {kind}": _call(env_fault, kind, how, undisturbed) for how in ENV_FAULTS}
     found[f"process stopped for a minute, {kind}"] = lambda folder: stopped(folder, kind, undisturbed())
-    return found | {f"storage {how}, {kind}": _call(storage_fault, kind, how, undisturbed) for how in STORAGE_FAULTS}
+    found |= {f"storage {how}, {kind}": _call(storage_fault, kind, how, undisturbed) for how in STORAGE_FAULTS}
+    if shutil.which("cc"):
+        found[f"storage slow, {kind}"] = lambda folder: storage_slow(folder, kind, undisturbed())
+    else:
+        print(f"storage slow, {kind}: not run, as there is no C compiler (cc)")
+    return found
 
 
 def _call(
@@ -121,6 +128,38 @@ def storage_fault(folder: Path, kind: str, how: str, undisturbed: Sweep) -> Outc
             # It is a file system that is gone with this process.
             shutil.copytree(storage, folder / "sweeps-left", symlinks=True)
     return outcome
+
+
+def storage_slow(folder: Path, kind: str, undisturbed: Sweep) -> Outcome:
+    """Each operation on the storage takes 10 s, for two minutes: the sweep waits, and nothing of it fails.
+
+    Args:
+        folder: An empty folder.
+        kind: Of sweep.
+        undisturbed: From `kills.reference`.
+    """
+    library, flag = folder / "slow_storage.so", folder / "storage-is-slow"
+    _run("cc", "-shared", "-fPIC", "-O1", "-o", str(library), str(Path(__file__).with_name("slow_storage.c")), "-ldl")
+    storage = folder / "sweeps"
+    storage.mkdir()
+    variables = {
+        "LD_PRELOAD": library, "SLOW_STORAGE": storage.resolve(), "SLOW_STORAGE_FLAG": flag,
+        "SLOW_STORAGE_S": f"{_SLOW_OPERATION_S:g}",
+    }  # fmt: skip
+    # A library is loaded by programs that begin, not by forks.
+    sweep = Sweep(folder, spec(kind, folder), prefix=("env", *(f"{name}={value}" for name, value in variables.items())))
+
+    def act(process: Process) -> list[str]:
+        flag.touch()
+        trained = {int(record["pid"]) for record in sweep.records() if record["status"] == "running" and record["pid"]}
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_SLOW_S)
+        flag.unlink()
+        met = {int(path.suffix[1:]) for path in folder.glob(f"{flag.name}.*")}
+        needed = {process.pid, *trained}
+        return [] if needed <= met else [f"of the processes {needed}, only {needed & met} had to wait"]
+
+    return during(sweep, f"storage slow, {kind}", act, Disturbed(kind), undisturbed)
 
 
 @contextlib.contextmanager
@@ -211,12 +250,15 @@ def during(
     outcome.moment = "the run ended well"
     if code != 0:
         outcome.moment = f"exit code {code}, resumed"
-        told = sweep.output.read_text(encoding="utf-8", errors="replace")
-        if "resume" not in told.partition("tune-jobs launch")[2]:
+        left = Before(sweep)
+        outcome.recomputed = left.recomputed
+        # Without the first line, which is the command.
+        outcome.told = sweep.output.read_text(encoding="utf-8", errors="replace").partition("\n")[2][-_TOLD_CHARACTERS:]
+        if "tune-jobs resume" not in outcome.told:
             outcome.problems.append(f"exit code {code}, and nothing says how to go on: {sweep.said()}")
         # As the command says, where trials have failed for good.
-        again = ("--retry-failed",) if "--retry-failed" in told else ()
-        outcome.problems += sweep.end(sweep.begin(more=again))
+        again = ("--retry-failed",) if "--retry-failed" in outcome.told else ()
+        outcome.problems += [*sweep.end(sweep.begin(more=again)), *left.problems()]
     outcome.problems += [*before.problems(), *wrong(sweep, undisturbed, may)]
     outcome.seconds = time.monotonic() - started
     return outcome

@@ -18,22 +18,22 @@ import yaml
 
 from tests.faults.forked import Forked, Process
 from tests.kills.checks import problems
-from tests.kills.processes import Family
+from tests.kills.processes import Family, end_with_parent
 from tune_jobs.store.logs import continued_from
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = str(Path(sys.executable).with_name("tune-jobs"))
 KINDS = ("packed", "rllib", "pbt", "tpe")
-EVERY_ITERATIONS, NUM_ENV_STEPS = 3, 6_400
+EVERY_ITERATIONS, NUM_ENV_STEPS, PACE_S = 3, 6_400, 0.004
 LIMIT_S = 900.0
 _STARTUP = 4
 """Points that TPE draws before it chooses by results."""
 
 
-def spec(kind: str, folder: Path, **changes: Any) -> dict[str, Any]:
-    """A sweep file's settings, of a kind of sweep; it is slow while `slow` is in the folder."""
+def spec(kind: str, folder: Path, *, pace_s: float = PACE_S, **changes: Any) -> dict[str, Any]:
+    """A sweep file's settings, of a kind of sweep; while `slow` is in the folder, each env step takes `pace_s`."""
     env_id = f"tests.faults.paced:Faults{'Alike' if kind == 'packed' else 'Paced'}-v0"
-    env_args = {"slow": str(folder / "slow"), "fault": str(folder / "fault")}
+    env_args = {"slow": str(folder / "slow"), "pace_s": pace_s, "fault": str(folder / "fault")}
     found: dict[str, Any] = {
         "env": {"id": env_id, "args": env_args},
         "algorithm": "ppo",
@@ -65,6 +65,7 @@ class Sweep:
         environment: Variables for the commands.
         flags: For `launch` and `resume`.
         num_cpus: Of the driver's own Ray.
+        prefix: A command that runs the rest of its arguments, for `launch` and `resume`.
     """
 
     def __init__(
@@ -74,34 +75,35 @@ class Sweep:
         environment: dict[str, str] | None = None,
         *flags: str,
         num_cpus: int = 2,
+        prefix: tuple[str, ...] = (),
     ) -> None:
-        self.num_cpus = num_cpus
+        self.num_cpus, self._prefix = num_cpus, prefix
         self.folder, self.place, self.flags = folder, folder / "sweeps" / "cut", flags
         self.slow, self.fault = folder / "slow", folder / "fault"
         (folder / "spec.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
         self._environment = {**(environment or os.environ), "PYTHONPATH": str(ROOT)}
         self.output = folder / "output.txt"
 
-    def begin(self, prefix: tuple[str, ...] = (), more: tuple[str, ...] = ()) -> Process:
-        """Launch it, or resume it if it is there; in a fork of this process, unless a command runs it.
+    def begin(self, more: tuple[str, ...] = ()) -> Process:
+        """Launch it, or resume it if it is there; in a fork of this process, unless it has a prefix or flags.
 
         Args:
-            prefix: A command that runs the rest of its arguments.
             more: Flags of this command alone.
         """
         module = ("--allow-module", "tests.faults.paced")
         verb = ["resume", str(self.place)] if (self.place / "sweep.json").is_file() else ["launch", "spec.yaml"]
-        command = [*prefix, PROGRAM, *verb, "--no-finish", *self.flags, *more]
+        command = [*self._prefix, PROGRAM, *verb, "--no-finish", *self.flags, *more]
         if verb[0] == "launch":
             command += ["--name", "cut", *module]
         with self.output.open("ab") as output:
             output.write(f"$ {' '.join(command)}\n".encode())
             output.flush()
-            if not prefix and not self.flags:
+            if not self._prefix and not self.flags:
                 return Forked(command, self.folder, self._environment, self.output, self.num_cpus)
             return subprocess.Popen(
                 command, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
                 env=self._environment, start_new_session=True,
+                preexec_fn=end_with_parent,  # noqa: PLW1509 (it makes one system call)
             )  # fmt: skip
 
     def end(self, process: Process | None = None) -> list[str]:

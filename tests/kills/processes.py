@@ -1,14 +1,26 @@
-"""Everything that a command has started, and what of it is left."""
+"""Everything that a command has started, what of it is left, and that it ends with who started it."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
 from typing import Self
+
+_PR_SET_PDEATHSIG = 1
+# Loaded before there are threads: a child that was just forked may only call it.
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+
+
+def end_with_parent(number: int = signal.SIGKILL) -> None:
+    """Let the kernel send this process a signal once the thread that started it has ended; call it in a child."""
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, number)
 
 
 def _table() -> dict[int, tuple[int, str]]:
