@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
@@ -50,6 +51,13 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str], li
         time.sleep(0.05)
 
 
+def command_of(pid: int) -> str:
+    """A process's command, by the name that Ray gives it if it does; empty if it has ended."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ").strip()
+    return ""
+
+
 def wait_until_gone(pid: int, limit_s: float = 600) -> None:
     """Until a trial's process has ended; one that nobody waits for is a zombie."""
     deadline = time.monotonic() + limit_s
@@ -65,6 +73,7 @@ class Sweep:
         self.cwd, self.folder = cwd, cwd / "sweeps" / "cut"
         self.slow = cwd / "slow"
         self.listens_at: set[str] = set()
+        self.programs: list[str] = []
         (cwd / "spec.yaml").write_text(SPEC.format(slow=self.slow, num_env_steps=NUM_ENV_STEPS))
 
     def interrupt(self, number: signal.Signals, *command: str) -> tuple[int, str]:
@@ -89,6 +98,7 @@ class Sweep:
             wait_until(second_has_checkpoints, process)
             with Family(process.pid) as family:
                 self.listens_at |= set(listening(family.alive()))
+                self.programs = [command_of(pid) for pid in family.alive()]
             process.send_signal(number)
             out, err = process.communicate(timeout=600)
         finally:
@@ -161,6 +171,9 @@ def test_a_kill_loses_no_more_than_the_last_iterations(sweep: Sweep) -> None:
     # Nobody on another machine reaches a sweep's processes, those of Ray among them.
     assert len(sweep.listens_at) >= 5
     assert {address.rpartition(":")[0] for address in sweep.listens_at} == {"127.0.0.1"}
+    # Ray starts no agent for the dashboard that is not there.
+    assert [program for program in sweep.programs if "idle_agent.py" in program]
+    assert not [program for program in sweep.programs if "DashboardAgent" in program or "agent.py" in program.split()]
     wait_until_gone(read(sweep.folder)[1]["pid"])
     command = [PROGRAM, "status", str(sweep.folder), "--json"]
     status = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -208,13 +208,13 @@ def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path: Pat
 def test_own_modules_that_only_this_processs_path_has_are_found_by_the_ray_it_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from tune_jobs.ray_tune import cluster
+    from tune_jobs.ray_tune import local_ray
 
     (tmp_path / "hidden_own.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", "/before")
     env_modules.allow_modules(["hidden_own"])
     env_modules.import_module_allowed("hidden_own")
-    with cluster._finding_own_modules():
+    with local_ray._finding_own_modules():
         assert os.environ["PYTHONPATH"].split(os.pathsep) == [str(tmp_path), "/before"]
     assert os.environ["PYTHONPATH"] == "/before"

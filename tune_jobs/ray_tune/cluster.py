@@ -14,12 +14,10 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import ray
 from ray.exceptions import AuthenticationError
 
-from policies.envs.modules import module_folders
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
@@ -33,14 +31,12 @@ from tune_jobs.ray_tune.connected_ray import (
     is_client,
     of_a_sweep,
 )
-from tune_jobs.ray_tune.environment import prepare_environment, provide_token
+from tune_jobs.ray_tune.environment import prepare_environment
+from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, start, without_environments
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
 
-# Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
-_OBJECT_STORE_BYTES = 256 * 1024**2
 _MAX_JOIN_ATTEMPTS = 4
-_QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
 
 
 @dataclass(frozen=True)
@@ -83,11 +79,12 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
         try:
             with ending_if_it_fails(), _keeping_sigterm(), _deaf_to_hangups():
                 if address is None:
-                    _start(machine)
+                    start(machine)
+                    stack.enter_context(without_environments())
                 else:
                     # One that a sweep's process started here for its others: a cluster's nodes are elsewhere.
                     is_ours = is_users and address.startswith("127.0.0.1:")
-                    with _at_loopback() if is_ours else contextlib.nullcontext():
+                    with at_loopback() if is_ours else contextlib.nullcontext():
                         _join(address)
             source = "this machine" if address is None else f"the cluster at {address}"
             yield Connection(address, is_client(), cluster_machine(source))
@@ -135,82 +132,6 @@ def _deaf_to_hangups() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start(machine: Machine | None) -> None:
-    # A local sweep sends nothing anywhere; users who want Ray's usage statistics can set the variable.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    provide_token()
-    resources: dict[str, Any] = {}
-    if machine is not None:
-        resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
-    try:
-        with _finding_own_modules(), _without_unused_processes(), _at_loopback():
-            # "local": a cluster of this sweep's own, even if another one runs already.
-            ray.init(
-                address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **_QUIET
-            )
-    except Exception as error:
-        raise CannotRunError(
-            f"Ray cannot be started on this machine: {_first_line(error)}",
-            "Look for the cause in Ray's logs in /tmp/ray/session_latest/logs.",
-        ) from error
-
-
-@contextlib.contextmanager
-def _at_loopback() -> Iterator[None]:
-    """Let a Ray that is started in the block listen at 127.0.0.1 alone, where no other machine reaches it.
-
-    Ray 2.60 puts this machine's own address in the place of 127.0.0.1, also where it was given, and then listens at
-    all addresses; but not on macOS and Windows, nor where this says that it is on one of them. A process that joins
-    such a Ray has to do so too.
-    """
-    constants: Any = ray._private.ray_constants  # noqa: SLF001
-    original, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
-    try:
-        yield
-    finally:
-        constants.ENABLE_RAY_CLUSTER = original
-
-
-_UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
-
-
-@contextlib.contextmanager
-def _without_unused_processes() -> Iterator[None]:
-    """Start Ray in the block without three processes that nobody asks here: autoscaler, log monitor and dashboard.
-
-    `include_dashboard=False` starts the last one all the same. Together they take 1.5 s of CPU time before the first
-    trial, 200 MB of memory, and a second at the end. Nothing public of Ray 2.60 leaves them out.
-    """
-    node: Any = ray._private.node.Node  # noqa: SLF001
-    originals = {name: getattr(node, name) for name in _UNUSED if hasattr(node, name)}
-    for name in originals:
-        setattr(node, name, lambda *_, **__: None)
-    try:
-        yield
-    finally:
-        for name, original in originals.items():
-            setattr(node, name, original)
-
-
-@contextlib.contextmanager
-def _finding_own_modules() -> Iterator[None]:
-    """Let the processes that Ray starts find the user's own modules where this process found them.
-
-    Ray itself passes on this process's working directory and the main script's folder, but not the rest of its path.
-    """
-    before = os.environ.get("PYTHONPATH")
-    folders = [*module_folders(), *([before] if before else [])]
-    if folders:
-        os.environ["PYTHONPATH"] = os.pathsep.join(folders)
-    try:
-        yield
-    finally:
-        if before is not None:
-            os.environ["PYTHONPATH"] = before
-        else:
-            os.environ.pop("PYTHONPATH", None)
-
-
 def _join(address: str) -> None:
     check_is_ray(address)
     # Ray's native code prints a warning for each of its attempts.
@@ -223,7 +144,7 @@ def _join(address: str) -> None:
             if "InvalidAuthToken" in said or isinstance(error, AuthenticationError):
                 raise wrong_token(address) from error
             raise CannotRunError(
-                f"The Ray cluster at {address} cannot be joined: {_first_line(error)}",
+                f"The Ray cluster at {address} cannot be joined: {first_line(error)}",
                 "Its Ray and Python must be of this machine's versions, and its token (RAY_AUTH_TOKEN) the same. "
                 "host:port is for machines that are nodes of the cluster; others join by ray://HOST:10001.",
             ) from error
@@ -240,14 +161,10 @@ def _join(address: str) -> None:
 def _init_patiently(address: str) -> None:
     for attempt in range(1, _MAX_JOIN_ATTEMPTS + 1):
         try:
-            ray.init(address=address, **_QUIET)
+            ray.init(address=address, **QUIET)
             return
         except ConnectionError as error:
             # Ray 2.60's client proxy forks a server for each client, and one in twenty dies at once in gRPC's fork
             # handlers (ray issue 63202), unless the head was started with GRPC_ENABLE_FORK_SUPPORT=0.
             if "Starting Ray client server failed" not in str(error) or attempt == _MAX_JOIN_ATTEMPTS:
                 raise
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,176 @@
+"""Start Ray on this machine for a sweep, at 127.0.0.1 alone and without what a sweep has no use for.
+
+Nothing public of Ray 2.60 does most of this. Each place where Ray itself is changed says what it costs otherwise; where
+a later Ray has no such place any more, it starts as it would by itself, or a test of this module says so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from policies.envs.modules import module_folders
+from policies.errors import CannotRunError
+from tune_jobs.plan.machine import Machine
+from tune_jobs.ray_tune.environment import provide_token
+
+# Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
+_OBJECT_STORE_BYTES = 256 * 1024**2
+QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+"""What `ray.init` is told, so that it prints nothing."""
+
+
+def start(machine: Machine | None) -> None:
+    """Start a Ray of this machine and join it.
+
+    Args:
+        machine: The CPUs and GPUs to start it with; None: all that Ray finds.
+
+    Raises:
+        CannotRunError: Ray does not start.
+    """
+    # A local sweep sends nothing anywhere; users who want Ray's usage statistics can set the variable.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    provide_token()
+    resources: dict[str, Any] = {}
+    if machine is not None:
+        resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
+    try:
+        with _finding_own_modules(), _without_unused_processes(), without_dashboards_agent(), at_loopback():
+            # "local": a cluster of this sweep's own, even if another one runs already.
+            ray.init(
+                address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **QUIET
+            )
+    except Exception as error:
+        raise CannotRunError(
+            f"Ray cannot be started on this machine: {first_line(error)}",
+            "Look for the cause in Ray's logs in /tmp/ray/session_latest/logs.",
+        ) from error
+
+
+@contextlib.contextmanager
+def at_loopback() -> Iterator[None]:
+    """Let a Ray that is started in the block listen at 127.0.0.1 alone, where no other machine reaches it.
+
+    Ray 2.60 puts this machine's own address in the place of 127.0.0.1, also where it was given, and then listens at
+    all addresses; but not on macOS and Windows, nor where this says that it is on one of them. A process that joins
+    such a Ray has to do so too.
+    """
+    constants: Any = ray._private.ray_constants  # noqa: SLF001
+    original, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER = original
+
+
+_UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
+
+
+@contextlib.contextmanager
+def _without_unused_processes() -> Iterator[None]:
+    """Start Ray in the block without three processes that nobody asks here: autoscaler, log monitor and dashboard.
+
+    `include_dashboard=False` starts the last one all the same. Together they take 1.5 s of CPU time before the first
+    trial, 200 MB of memory, and a second at the end. Nothing public of Ray 2.60 leaves them out.
+    """
+    node: Any = ray._private.node.Node  # noqa: SLF001
+    originals = {name: getattr(node, name) for name in _UNUSED if hasattr(node, name)}
+    for name in originals:
+        setattr(node, name, lambda *_, **__: None)
+    try:
+        yield
+    finally:
+        for name, original in originals.items():
+            setattr(node, name, original)
+
+
+_AGENT = "--dashboard_agent_command="
+
+
+@contextlib.contextmanager
+def without_dashboards_agent() -> Iterator[None]:
+    """Let `idle_agent` take the place of the dashboard's agent in a Ray that is started in the block.
+
+    The raylet waits for it before it starts the first process, for most of a second of CPU time. Nothing public of Ray
+    2.60 leaves it out.
+    """
+    services: Any = ray._private.services  # noqa: SLF001
+    original = services.start_ray_process
+
+    def start(command: list[str], *args: Any, **kwargs: Any) -> Any:
+        return original([_of_an_idle_agent(part) for part in command], *args, **kwargs)
+
+    services.start_ray_process = start
+    try:
+        yield
+    finally:
+        services.start_ray_process = original
+
+
+def _of_an_idle_agent(part: str) -> str:
+    """A part of a raylet's command; the command of the dashboard's agent, in one part, with another program."""
+    if not part.startswith(_AGENT):
+        return part
+    _, found, options = part.partition(f"{os.sep}agent.py ")
+    if not found or sys.platform == "win32":
+        return part
+    program = [sys.executable, "-I", "-S", str(Path(__file__).with_name("idle_agent.py"))]
+    return f"{_AGENT}{subprocess.list2cmdline(program)} {options}"
+
+
+@contextlib.contextmanager
+def _finding_own_modules() -> Iterator[None]:
+    """Let the processes that Ray starts find the user's own modules where this process found them.
+
+    Ray itself passes on this process's working directory and the main script's folder, but not the rest of its path.
+    """
+    before = os.environ.get("PYTHONPATH")
+    folders = [*module_folders(), *([before] if before else [])]
+    if folders:
+        os.environ["PYTHONPATH"] = os.pathsep.join(folders)
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ["PYTHONPATH"] = before
+        else:
+            os.environ.pop("PYTHONPATH", None)
+
+
+@contextlib.contextmanager
+def without_environments() -> Iterator[None]:
+    """Let Tune's actors of the block have the environment of a Ray that was started here.
+
+    Ray 2.60's Tune gives each actor a runtime environment, for one variable of PyTorch Lightning and what it passes on
+    to other machines; so Ray starts new processes, and those that it has started for each CPU, or that wait with
+    everything imported (`warm`), are of no use.
+    """
+    from ray.tune.execution import class_cache
+
+    cache: Any = class_cache._ActorClassCache  # noqa: SLF001
+    original = cache.get
+
+    def get(self: Any, trainable: type[Any]) -> Any:
+        known = self._cache
+        if trainable not in known:
+            known[trainable] = ray.remote(trainable)
+        return known[trainable]
+
+    cache.get = get
+    try:
+        yield
+    finally:
+        cache.get = original
+
+
+def first_line(error: Exception) -> str:
+    """What an error of Ray's says first; its name if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
