@@ -14,6 +14,7 @@ VARIABLE = "TUNE_JOBS_SLOW"
 _LEARN = "`make learn` trains every preset over five seeds"
 
 SLOW = {
+    "tests/cluster/test_autoscaler.py": "tests/unit/test_waiting_for_nodes.py, and tests/unit/test_autoscaler.py",
     "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[rllib-crash]":
         "the same, packed",
     "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[packed-drain]":

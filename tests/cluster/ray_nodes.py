@@ -123,16 +123,27 @@ class Cluster:
         }
         self.nodes: dict[str, Node] = {}
 
-    def start_head(self, dashboard_port: int | None = None, *, num_cpus: int = 1, prefix: Sequence[str] = ()) -> Node:
-        """Start the head; with a port, the dashboard answers there, and takes jobs. `prefix` is as for a worker."""
+    def start_head(
+        self,
+        dashboard_port: int | None = None,
+        *,
+        num_cpus: int = 1,
+        prefix: Sequence[str] = (),
+        options: Sequence[str] = (),
+        environment: dict[str, str] | None = None,
+    ) -> Node:
+        """Start the head; with a port, the dashboard answers there, and takes jobs.
+
+        `prefix` and `environment` are as for a worker, `options` further ones of `ray start`.
+        """
         self.jobs_address = f"http://127.0.0.1:{dashboard_port}"
-        options = [
+        words = [
             "--head", f"--port={self.port}", f"--ray-client-server-port={self.client_port}",
             f"--dashboard-port={dashboard_port or free_port()}",
             f"--include-dashboard={'true' if dashboard_port else 'false'}",
-            *self._at(self.host),
+            *self._at(self.host), *options,
         ]  # fmt: skip
-        return self._start("head", options, num_cpus, prefix, {})
+        return self._start("head", words, num_cpus, prefix, environment or {})
 
     def start_worker(
         self,

@@ -4,9 +4,11 @@ import os
 import pickle
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError
 from tune_jobs.ray_tune import node_checks
@@ -90,6 +92,51 @@ def test_a_node_is_asked_for_what_it_has(tmp_path: Path) -> None:
     assert set(told["versions"]) == {"python", "numpy"}
     assert told["modules"] == {"no_such_module": "ModuleNotFoundError: No module named 'no_such_module'"}
     assert node_checks._question()((), (), probe.place, "node")["unseen"]
+
+
+def test_what_is_written_too_late_hides_no_error_and_is_left_to_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remove, times = Path.rmdir, [2]
+
+    def removed_late(folder: Path) -> None:
+        if times[0]:
+            times[0] -= 1
+            # A process of a node that was lost.
+            (folder / "node.scratch").touch()
+        remove(folder)
+
+    monkeypatch.setattr(Path, "rmdir", removed_late)
+    with probing(tmp_path) as probe:
+        pass
+    assert not Path(probe.place).exists()
+    times[0] = 9
+    with pytest.raises(KeyError, match="why"), probing(tmp_path):
+        raise KeyError("why")
+    assert [each.name for each in Path(probe.place).iterdir()] == ["node.scratch"]
+
+
+@pytest.mark.parametrize("how", ["gone", "drained", "there"])
+def test_a_node_that_leaves_while_it_is_asked_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    lost = {"NodeID": "5" * 56, "NodeManagerAddress": "10.0.0.7", "NodeManagerHostname": "seven", "Resources": {}}
+    tables = [[lost], [] if how == "gone" else [lost]]
+    monkeypatch.setattr(node_checks, "alive_nodes", lambda: tables.pop(0))
+    task: Any = SimpleNamespace(options=lambda **_: task, remote=lambda *_: task)
+    draining = ["5" * 56] if how == "drained" else []
+    state = SimpleNamespace(state=SimpleNamespace(get_draining_nodes=lambda: draining))
+    fake = SimpleNamespace(
+        remote=lambda **_: lambda _: task, get=lambda *_, **__: 1 / 0, _private=SimpleNamespace(state=state)
+    )
+    monkeypatch.setattr(node_checks, "ray", fake)
+    store = make_sweep_folder(tmp_path / "mine")
+    with store.lock():
+        if how == "there":
+            with pytest.raises(CannotRunError, match=r"Node 10\.0\.0\.7 .* cannot run a worker: division by zero"):
+                node_checks.check_nodes(store.place)
+        else:
+            assert node_checks.check_nodes(store.place) == ()
 
 
 def test_a_node_with_locks_of_its_own_alone_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

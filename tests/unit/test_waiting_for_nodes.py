@@ -15,7 +15,8 @@ from tune_jobs.plan.concurrency import max_concurrent
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import taking_signals
-from tune_jobs.ray_tune import connected_ray
+from tune_jobs.ray_tune import autoscaler, connected_ray
+from tune_jobs.ray_tune.autoscaler import NodeType
 from tune_jobs.ray_tune.cluster import Connection
 from tune_jobs.service.labels import Label
 from tune_jobs.service.statuses import Statuses
@@ -69,6 +70,7 @@ def of(monkeypatch: pytest.MonkeyPatch, *num_cpus: float) -> Cluster:
     cluster = Cluster(*num_cpus)
     monkeypatch.setattr(connected_ray, "present_machine", cluster.present)
     monkeypatch.setattr(connected_ray, "asking_for", cluster.asking)
+    monkeypatch.setattr(autoscaler, "node_types", tuple)
     monkeypatch.setattr(waiting, "_POLL_INTERVAL_S", 0.01)
     return cluster
 
@@ -163,6 +165,52 @@ def test_the_limit_ends_the_wait_and_the_sweep_is_kept(monkeypatch: pytest.Monke
     assert store.read_record().waiting is None
 
 
+SMALL = NodeType("small", 1, 0, 5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "types", "known"),
+    [
+        (
+            {},
+            (SMALL._replace(most=1), NodeType("idle", 0, 0, 9)),
+            "small (1 CPU, 1 at most), idle (no CPUs, 9 at most)",
+        ),
+        ({"num_cpus": 8}, (SMALL, NodeType("large", 4, 1, 1_000)), "large (4 CPUs and 1 GPU, 1,000 at most)"),
+        ({"num_gpus": 1}, (SMALL,), "small (1 CPU, 5 at most)"),
+    ],
+    ids=["too few nodes", "too small nodes", "no GPUs"],
+)
+def test_what_no_node_of_the_autoscaler_can_ever_hold_is_refused_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+    store: SweepStore,
+    changes: dict[str, Any],
+    types: tuple[NodeType, ...],
+    known: str,
+) -> None:
+    if changes:
+        spec = load_spec({**SPEC.model_dump(exclude_unset=True), "resources": changes})
+        store.write_record(store.read_record().model_copy(update={"spec": spec.model_dump(mode="json")}))
+    cluster = of(monkeypatch, 1)
+    monkeypatch.setattr(autoscaler, "node_types", lambda: types)
+    with pytest.raises(CannotRunError) as caught, removed_if_not_begun(CreatedSweep("mine", store.place)):
+        machine_that_fits(store, cluster.connection, 3, progress="none")
+    assert re.search(r"needs \d .*With all nodes that its autoscaler may add it would not fit", caught.value.message)
+    assert known in caught.value.message
+    assert "forever" not in caught.value.message
+    assert "resources.num_cpus" in caught.value.hint
+    # Nothing was asked for, and nothing is left.
+    assert cluster.asked == []
+    assert not store.folder.exists()
+
+
+def test_what_fits_on_nodes_of_the_autoscaler_is_waited_for(monkeypatch: pytest.MonkeyPatch, store: SweepStore) -> None:
+    cluster = of(monkeypatch, 1, 3)
+    # Each env runner may be on a node of its own.
+    monkeypatch.setattr(autoscaler, "node_types", lambda: (SMALL._replace(most=2),))
+    assert machine_that_fits(store, cluster.connection, 60, progress="none").num_cpus == 3
+
+
 def test_another_error_leaves_nothing_of_a_new_sweep(store: SweepStore) -> None:
     with pytest.raises(CannotRunError), removed_if_not_begun(CreatedSweep("mine", store.place)):
         raise CannotRunError("The nodes cannot take part.")
@@ -243,6 +291,7 @@ def test_nodes_that_join_are_counted_and_those_that_left_are_not(
     monkeypatch.undo()
     monkeypatch.setattr("ray.nodes", lambda: tables.pop(0) if len(tables) > 1 else tables[0])
     monkeypatch.setattr(connected_ray, "asking_for", cluster.asking)
+    monkeypatch.setattr(autoscaler, "node_types", tuple)
     monkeypatch.setattr(waiting, "_POLL_INTERVAL_S", 0.01)
     with connected_ray.of_a_sweep():
         connection = Connection("auto", is_client=False, machine=connected_ray.cluster_machine("the cluster"))

@@ -194,7 +194,8 @@ def run_options(command: _Command) -> _Command:
             type=click.FloatRange(0, 10**9),
             default=0.0,
             metavar="SECONDS",
-            help="With --address: how long to wait for nodes that can hold one trial.  [default: 0]",
+            help="With --address, or a service on a cluster: how long to wait for nodes that can hold one trial.  "
+            "[default: 0, or as the service's operator said]",
         ),
         allow_module_option,
         storage_option,

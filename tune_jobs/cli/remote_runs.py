@@ -111,22 +111,24 @@ def _say_left(left: _Left, *, as_json: bool) -> int:
 
 def _begun(client: Client, verb: str, arguments: Sequence[Any], options: dict[str, Any]) -> Job:
     name = arguments[0]
+    # 0 is what is there where nothing was given: then it is as the service's operator has said.
+    wait: dict[str, Any] = {"wait_for_nodes": options.get("wait_for_nodes") or None}
     match verb:
         case "launch":
             try:
-                return client.submit(name, overrides=options["overrides"], name=options["name"]).job
+                return client.submit(name, overrides=options["overrides"], name=options["name"], **wait).job
             except SpecError as error:
                 raise told_here(error, name, options["overrides"]) from error
         case "extend":
-            return client.extend(name, arguments[1])
+            return client.extend(name, arguments[1], **wait)
         case "inject":
-            return client.inject(name, arguments[1])
+            return client.inject(name, arguments[1], **wait)
         case "replicate":
-            return client.replicate(name, top=options["top"], seeds=options["seeds"])
+            return client.replicate(name, top=options["top"], seeds=options["seeds"], **wait)
         case _:
             # As here: without a failed trial there is nothing to retry, and whatever else is missing is run.
             has_failed = options["retry_failed"] and client.status(name).counts.get("failed")
-            return client.retry(name) if has_failed else client.resume(name)
+            return client.retry(name, **wait) if has_failed else client.resume(name, **wait)
 
 
 def _followed(client: Client, job: Job, say: Callable[[str], None]) -> Job:

@@ -30,6 +30,10 @@ folder_option = click.option(
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any free port.")
 @click.option("--address", metavar="ADDRESS", help="Ray cluster that sweeps run on; without it, this machine.")
+@click.option(
+    "--wait-for-nodes", type=click.FloatRange(0, 10**9), default=0.0, show_default=True, metavar="SECONDS",
+    help="With --address: how long sweeps wait for nodes that can hold one trial, unless their request says it.",
+)  # fmt: skip
 @database_option
 @folder_option
 @click.option("--env", "envs", multiple=True, metavar="PATTERN", help="Env ids that sweeps may name; may be repeated.")
@@ -70,6 +74,7 @@ def serve(
     host: str,
     port: int,
     address: str | None,
+    wait_for_nodes: float,
     database: str | None,
     folder: Path | None,
     envs: tuple[str, ...],
@@ -109,7 +114,7 @@ def serve(
         command=tuple(shlex.split(run_command or "")),
         public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
         tls_certificate=tls_certificate, tls_key=tls_key, log_format=log_format, keep_audit_days=keep_audit_days,
-        own_folder=absolute_folder(folder),
+        own_folder=absolute_folder(folder), wait_for_nodes=wait_for_nodes,
     )  # fmt: skip
     logs.configure(log_format, secrets=config.secrets)
 

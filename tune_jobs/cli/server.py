@@ -33,7 +33,6 @@ _ONLY_HERE = {
     "storage": ("--storage", "it names a folder of this machine, and the service has its own"),
     "detach": ("--detach", "a service runs sweeps without this terminal anyway"),
     "address": ("--address", "the service runs sweeps where its operator has said"),
-    "wait_for_nodes": ("--wait-for-nodes", "the service runs sweeps where its operator has said"),
     "finish": ("--finish or --no-finish", "the service always makes what follows the trials"),
     "allow_module": ("--allow-module", "its operator says which modules sweeps may name (`serve --allow-module`)"),
     "html": ("--html", "its page is made on the machine of the sweeps' folder"),

@@ -69,6 +69,7 @@ class Client(Looking):
         note: str = "",
         tags: Sequence[str] = (),
         key: str | None = None,
+        wait_for_nodes: float | None = None,
     ) -> Submitted:
         """Have the service write a sweep and run it when its turn comes.
 
@@ -81,12 +82,17 @@ class Client(Looking):
             tags: Words to find it by.
             key: An idempotency key: with the same one the same request makes one sweep, however often it is sent.
                 None: a new one, which is the same at each attempt of this call.
+            wait_for_nodes: The most seconds to wait until the nodes of the service's cluster can hold one trial, 0: not
+                at all; None: as the service's operator has said.
 
         Raises:
-            SpecError: The sweep is wrong or not allowed there, its name is taken, or the key was used for another.
+            SpecError: The sweep is wrong or not allowed there, its name is taken, the key was used for another, or the
+                service has no cluster whose nodes could be waited for.
             CannotRunError: It cannot run there.
         """
         body = request_of(source, overrides, name) | {"priority": priority, "note": note, "tags": list(tags)}
+        if wait_for_nodes is not None:
+            body["wait_for_nodes"] = wait_for_nodes
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
         found = self._ask("POST", "/sweeps", body=body, repeat=True, headers=headers, timeout_s=_PLAN_S)
         return self._read(Submitted, found)
@@ -101,41 +107,46 @@ class Client(Looking):
         """
         return self._read(list[Job], self._ask("POST", f"{sweep_path(name)}/stop"))
 
-    def resume(self, name: str) -> Job:
-        """Have what is missing of a sweep run."""
-        return self._read(Job, self._ask("POST", f"{sweep_path(name)}/resume"))
+    def resume(self, name: str, *, wait_for_nodes: float | None = None) -> Job:
+        """Have what is missing of a sweep run; `wait_for_nodes` is the same as for `submit`."""
+        return self._change(name, "resume", wait_for_nodes)
 
-    def retry(self, name: str) -> Job:
-        """Have failed trials run again, and whatever else is missing.
+    def retry(self, name: str, *, wait_for_nodes: float | None = None) -> Job:
+        """Have failed trials run again, and whatever else is missing; `wait_for_nodes` is the same as for `submit`.
 
         Raises:
             ConflictError: It has no failed trial.
         """
-        return self._read(Job, self._ask("POST", f"{sweep_path(name)}/retry"))
+        return self._change(name, "retry", wait_for_nodes)
 
-    def extend(self, name: str, num_samples: int) -> Job:
-        """Have more samples of a sweep's space run.
+    def extend(self, name: str, num_samples: int, *, wait_for_nodes: float | None = None) -> Job:
+        """Have more samples of a sweep's space run; `wait_for_nodes` is the same as for `submit`.
 
         Raises:
             SpecError: The space has nothing random to draw, or there would be too many trials.
         """
-        return self._read(Job, self._ask("POST", f"{sweep_path(name)}/extend", body={"num_samples": num_samples}))
+        return self._change(name, "extend", wait_for_nodes, {"num_samples": num_samples})
 
-    def inject(self, name: str, point: Mapping[str, Any]) -> Job:
+    def inject(self, name: str, point: Mapping[str, Any], *, wait_for_nodes: float | None = None) -> Job:
         """Have a point of one's own trained, with all seeds of a point.
 
         Args:
             name: The sweep.
             point: A value for each searched hyperparameter; it may lie outside of the space.
+            wait_for_nodes: The same as for `submit`.
 
         Raises:
             SpecError: A value is missing or wrong, or there would be too many trials.
         """
-        return self._read(Job, self._ask("POST", f"{sweep_path(name)}/trials", body={"point": dict(point)}))
+        return self._change(name, "trials", wait_for_nodes, {"point": dict(point)})
 
-    def replicate(self, name: str, *, top: int = 5, seeds: int = 5) -> Job:
-        """Have the leading settings trained again with fresh seeds, at most so many each."""
-        return self._read(Job, self._ask("POST", f"{sweep_path(name)}/replicate", body={"top": top, "seeds": seeds}))
+    def replicate(self, name: str, *, top: int = 5, seeds: int = 5, wait_for_nodes: float | None = None) -> Job:
+        """Have the leading settings trained again with fresh seeds, at most so many each; the wait as for `submit`."""
+        return self._change(name, "replicate", wait_for_nodes, {"top": top, "seeds": seeds})
+
+    def _change(self, name: str, verb: str, wait_for_nodes: float | None, body: Any = None) -> Job:
+        query = {"wait_for_nodes": wait_for_nodes}
+        return self._read(Job, self._ask("POST", f"{sweep_path(name)}/{verb}", body=body, query=query))
 
     def change(
         self,

@@ -5,6 +5,7 @@ All nodes are asked at once, and every one that cannot take part is named in one
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import socket
 import time
@@ -50,7 +51,8 @@ def check_nodes(sweep_place: str, modules: Sequence[str] = (), *, num_gpus: floa
     """Check, by a worker on every node, what a sweep needs there.
 
     That is the versions that this process has (of Python and torch, those that matter), the user's own modules, and
-    the sweep's folder: the node has to read, write, list, lock and delete there.
+    the sweep's folder: the node has to read, write, list, lock and delete there. A node that leaves meanwhile, as an
+    autoscaler takes idle ones away, is left out.
 
     Args:
         sweep_place: The place of the sweep; its lock has to be held.
@@ -80,7 +82,8 @@ def check_nodes(sweep_place: str, modules: Sequence[str] = (), *, num_gpus: floa
         for name, (task, node) in tasks.items():
             told = _answer_of(task, max(0.0, deadline - time.monotonic()))
             if isinstance(told, Problem):
-                found[name] = [told]
+                if not _leaves(node["NodeID"]):
+                    found[name] = [told]
                 continue
             is_same = functools.partial(probe.is_same, machine=node["NodeID"])
             found[name] = problems_of(told, versions(), sweep_place, is_same)
@@ -144,6 +147,17 @@ def _answer_of(task: Any, timeout_s: float) -> dict[str, Any] | Problem:
     except Exception as error:  # noqa: BLE001 (a worker that does not start, or dies)
         return Problem(f"cannot run a worker: {_last_line(error)}", _SILENT)
     return told
+
+
+def _leaves(node_id: str) -> bool:
+    """Whether a node has left the cluster, or is being drained: nothing will be trained there."""
+    if node_id not in {node["NodeID"] for node in alive_nodes()}:
+        return True
+    state: Any = ray._private.state  # noqa: SLF001 (told nowhere else)
+    # A client of `ray://` can't ask; what is drained is gone a little later.
+    with contextlib.suppress(Exception):
+        return node_id in state.state.get_draining_nodes()
+    return False
 
 
 def problems_of(

@@ -15,6 +15,7 @@ from tune_jobs.service.job_files import own_database, own_folder
 from tune_jobs.service.logs import LogFormat
 from tune_jobs.service.telling import COMMAND, check_target, secrets_of
 from tune_jobs.store.urls import folder_of, is_url
+from tune_jobs.sweeps.waiting import check_wait
 
 LOOPBACK = "loopback"
 """As the address of a proxy: one on this machine."""
@@ -77,6 +78,8 @@ class ServiceConfig:
         keep_audit_days: How long the audit log keeps an entry, in days.
         own_folder: The folder for what the service itself writes, which its drivers work in, too; None: one in the
             storage folder.
+        wait_for_nodes: The most seconds that a sweep waits until the cluster's nodes can hold one trial, where its
+            request does not say it.
     """
 
     storage: str | Path
@@ -101,8 +104,10 @@ class ServiceConfig:
     log_format: LogFormat = "text"
     keep_audit_days: float = 365.0
     own_folder: Path | None = None
+    wait_for_nodes: float = 0.0
 
     def __post_init__(self) -> None:
+        check_wait(self.address, self.wait_for_nodes)
         for url in self.webhooks:
             check_target(url)
         for pattern in self.envs:

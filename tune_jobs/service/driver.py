@@ -145,7 +145,9 @@ def _done(request: Mapping[str, Any]) -> Any:
     from tune_jobs.sweeps import verbs
 
     place, arguments = request["sweep"], request["arguments"]
-    common: dict[str, Any] = {"address": request["address"], "progress": "none"}
+    common: dict[str, Any] = {
+        "address": request["address"], "progress": "none", "wait_for_nodes": request["wait_for_nodes"],
+    }  # fmt: skip
     match request["verb"]:
         case "extend":
             from tune_jobs.spec.file import stored_spec

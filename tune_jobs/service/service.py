@@ -74,8 +74,9 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
             # A cluster shares its CPUs among the trials of all sweeps by itself.
             num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
             where = Surroundings(
-                config.working_folder, config.folder, config.address, num_cpus, config.modules, config.log_format
-            )
+                config.working_folder, config.folder, config.address, num_cpus, config.modules, config.log_format,
+                config.wait_for_nodes,
+            )  # fmt: skip
             metrics = Metrics()
             watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
             teller = Teller(

@@ -45,6 +45,8 @@ class Submission:
     priority: int = 0
     note: str = ""
     tags: Sequence[str] = field(default_factory=tuple)
+    wait_for_nodes: float | None = None
+    """On a cluster: the most seconds to wait until its nodes can hold one trial; None: as the operator has said."""
 
     @property
     def digest(self) -> str:
@@ -55,6 +57,8 @@ class Submission:
         }  # fmt: skip
         if self.default_name is not None:
             data["default_name"] = self.default_name
+        if self.wait_for_nodes is not None:
+            data["wait_for_nodes"] = self.wait_for_nodes
         return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
@@ -107,6 +111,7 @@ class Submitter:
             DoesNotFitError: It needs more than this machine has.
             CannotRunError: It cannot be written.
         """
+        arguments = waiting_arguments(self._config, submission.wait_for_nodes)
         keyed = None if key is None else (key, submission.digest)
         if (known := self._known(owner, keyed)) is not None:
             return known, False
@@ -122,7 +127,7 @@ class Submitter:
             # The job comes first: a sweep whose job was never written would be begun twice where the request is
             # repeated.
             job, is_new = self._queue.begin(
-                name, "drive", {}, owner=owner, priority=submission.priority, key=keyed, state="creating"
+                name, "drive", arguments, owner=owner, priority=submission.priority, key=keyed, state="creating"
             )
         if not is_new:
             return job, False
@@ -221,6 +226,23 @@ class Submitter:
         while self._storage.is_taken(stem if number == 1 else f"{stem}-{number}"):
             number += 1
         return stem if number == 1 else f"{stem}-{number}"
+
+
+def waiting_arguments(config: ServiceConfig, wait_for_nodes: float | None) -> dict[str, float]:
+    """Return what a job's arguments say of how long it waits for nodes: nothing, where it is as the operator has said.
+
+    Raises:
+        SpecError: It is given, and sweeps run on the service's own machine, where no node joins.
+    """
+    if wait_for_nodes is None:
+        return {}
+    if wait_for_nodes and config.address is None:
+        raise SpecError(
+            f"wait_for_nodes {wait_for_nodes:g} (--wait-for-nodes) waits for nodes of a Ray cluster, and this service "
+            "runs sweeps on its own machine.",
+            "Leave it out, or ask a service that runs them on a cluster (`tune-jobs serve --address`).",
+        )
+    return {"wait_for_nodes": wait_for_nodes}
 
 
 def _wanted(submission: Submission, spec: SweepSpec) -> str | None:

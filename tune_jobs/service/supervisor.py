@@ -47,6 +47,8 @@ class Surroundings:
     """Modules that specs may name; the operator's choice."""
     log_format: LogFormat = "text"
     """Of what processes without a job say, on this one's standard error."""
+    wait_for_nodes: float = 0.0
+    """How many seconds a job waits for nodes of the cluster that can hold one trial, if it does not say it itself."""
 
 
 class Supervisor:
@@ -324,6 +326,7 @@ class Supervisor:
                 "verb": job.verb,
                 "arguments": job.arguments,
                 "address": self._where.address,
+                "wait_for_nodes": job.arguments.get("wait_for_nodes", self._where.wait_for_nodes),
             }
             try:
                 driver.give(request, lock, files.log)

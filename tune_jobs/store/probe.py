@@ -27,6 +27,7 @@ OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 _QUESTION = "question"
 _HELD = "held"
 _MAX_QUESTION_BYTES = 1_000
+_MOST_REMOVALS = 3
 
 
 class FailedOperationError(CannotRunError):
@@ -101,9 +102,18 @@ def probing(sweep_folder: Path) -> Iterator[FolderProbe]:
         with _locked(folder / _HELD):
             yield FolderProbe(folder, token)
     finally:
-        for path in folder.iterdir():
-            path.unlink(missing_ok=True)
-        folder.rmdir()
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """Remove the question and its answers; what can't be is left to the next run, and hides no error of this one."""
+    for _ in range(_MOST_REMOVALS):
+        with contextlib.suppress(OSError):
+            for path in folder.iterdir():
+                path.unlink(missing_ok=True)
+            # A process of a node that was lost meanwhile, and that nobody waits for, may write just now.
+            folder.rmdir()
+            return
 
 
 def answer(place: str, machine: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from analysis.waits import WaitRecord
@@ -52,13 +53,14 @@ def machine_that_fits(store: Sweep, connection: Connection, wait_s: float, *, pr
         progress: The same as for `launch`.
 
     Raises:
-        CannotRunError: The cluster is too small still.
+        CannotRunError: The cluster is too small still, or its autoscaler may add no node that would change that.
         WaitEndedError: A signal came, or the sweep was asked to stop.
     """
     note_wait(store, None)
     spec, machine = stored_spec(store.read_record()), connection.machine
     if wait_s <= 0 or _lacking(spec, machine) is None:
         return machine
+    _refuse_what_never_comes(spec, machine)
     try:
         machine = _waited(store, spec, connection, wait_s, progress)
     except KeyboardInterrupt as error:
@@ -100,6 +102,40 @@ def _waited(store: Sweep, spec: SweepSpec, connection: Connection, wait_s: float
     return machine
 
 
+def _refuse_what_never_comes(spec: SweepSpec, machine: Machine) -> None:
+    """Refuse a trial that would not fit on the cluster with all nodes that its autoscaler may add, if that is known.
+
+    Raises:
+        CannotRunError: It would not; the message has both numbers.
+    """
+    from tune_jobs.ray_tune.autoscaler import node_types
+
+    types, lacking = node_types(), _lacking(spec, machine)
+    if not types or lacking is None:
+        return
+    # No trial has its parts on more nodes than it has parts.
+    more = [
+        (each.num_cpus, each.num_gpus) for each in types for _ in range(min(each.most, len(bundles_of_trial(spec))))
+    ]
+    largest = replace(
+        machine,
+        num_cpus=machine.num_cpus + sum(cpus for cpus, _ in more),
+        num_gpus=machine.num_gpus + sum(gpus for _, gpus in more),
+        nodes=(*machine.nodes, *more),
+    )
+    if _lacking(spec, largest) is None:
+        return
+    known = ", ".join(
+        f"{each.name} ({_resources(each.num_cpus, each.num_gpus) or 'no CPUs'}, {each.most:,} at most)"
+        for each in types
+    )
+    raise CannotRunError(
+        f"{_told(lacking)} With all nodes that its autoscaler may add it would not fit either: {known}.",
+        "Give the autoscaler a type of nodes that one trial fits on, or lower what it needs: resources.num_cpus, "
+        "resources.num_env_runners or resources.num_gpus.",
+    )
+
+
 def _in_vain(store: Sweep, address: str | None, wait_s: float, told: str) -> CannotRunError:
     job = store.read_record().job
     where = f"{job.address} --detach" if job is not None else str(address)
@@ -124,11 +160,14 @@ def _told(lacking: CannotRunError) -> str:
 
 
 def _missing(spec: SweepSpec, machine: Machine) -> str:
-    cpus, gpus = spec.cpus_per_trial - machine.num_cpus, spec.resources.num_gpus - machine.num_gpus
-    parts = [f"{cpus:g} CPU{'s' * (cpus != 1)}"] if cpus > 0 else []
-    if gpus > 0:
-        parts.append(f"{gpus:g} GPU{'s' * (gpus != 1)}")
-    return f"Missing: {' and '.join(parts) or 'a larger node'}"
+    missing = _resources(spec.cpus_per_trial - machine.num_cpus, spec.resources.num_gpus - machine.num_gpus)
+    return f"Missing: {missing or 'a larger node'}"
+
+
+def _resources(cpus: float, gpus: float) -> str:
+    return " and ".join(
+        f"{count:g} {name}{'s' * (count != 1)}" for name, count in (("CPU", cpus), ("GPU", gpus)) if count > 0
+    )
 
 
 def bundles_of_trial(spec: SweepSpec) -> list[dict[str, float]]:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 
 from tune_jobs.service.access.callers import Caller
 from tune_jobs.service.growth import Addition, check_growth, num_samples_after
 from tune_jobs.service.http.caller import AChanger, TheService
-from tune_jobs.service.http.models import Extend, Inject, Replicate
+from tune_jobs.service.http.models import WAIT_FOR_NODES, Extend, Inject, Replicate
 from tune_jobs.service.http.problems import NotNowError
 from tune_jobs.service.jobs import Job, Verb
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
+from tune_jobs.service.submitting import waiting_arguments
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
 from tune_jobs.sweeps.adding import new_point
@@ -24,6 +25,8 @@ router = APIRouter(
     tags=["actions"],
     responses=problems({409: "It contradicts what the sweep does just now, or was asked for already."}),
 )
+
+Wait = Annotated[float | None, Query(**WAIT_FOR_NODES)]
 
 
 @router.post("/stop", status_code=202)
@@ -42,34 +45,33 @@ def stop(name: str, service: TheService, _: AChanger) -> list[Job]:
 
 
 @router.post("/resume", status_code=202)
-def resume(name: str, service: TheService, caller: AChanger) -> Job:
+def resume(name: str, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Run what is missing of a sweep."""
-    return _enqueue(service, caller, name, "drive", {})
+    return _enqueue(service, caller, name, "drive", {}, wait_for_nodes)
 
 
 @router.post("/retry", status_code=202)
-def retry(name: str, service: TheService, caller: AChanger) -> Job:
+def retry(name: str, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Run failed trials again, from their latest checkpoints, and whatever else is missing."""
     seen = service.statuses.see(name)
     if not seen.status.counts.get("failed"):
         raise NotNowError(f"Sweep {name} has no failed trial.")
-    return _enqueue(service, caller, name, "retry", {})
+    return _enqueue(service, caller, name, "retry", {}, wait_for_nodes)
 
 
 @router.post("/extend", status_code=202)
-def extend(name: str, more: Extend, service: TheService, caller: AChanger) -> Job:
+def extend(name: str, more: Extend, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Add points to a sweep, and run them."""
     spec = stored_spec(service.statuses.see(name).status.sweep)
     check_extendable(spec)
     jobs = _check_growth(service, name, Addition(num_samples=more.num_samples))
     # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
-    return _enqueue(
-        service, caller, name, "extend", {"to_num_samples": num_samples_after(spec, jobs) + more.num_samples}
-    )
+    arguments = {"to_num_samples": num_samples_after(spec, jobs) + more.num_samples}
+    return _enqueue(service, caller, name, "extend", arguments, wait_for_nodes)
 
 
 @router.post("/trials", status_code=202)
-def inject(name: str, chosen: Inject, service: TheService, caller: AChanger) -> Job:
+def inject(name: str, chosen: Inject, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Add a point that somebody chose, and train it with all seeds of a point."""
     seen = service.statuses.see(name)
     record, trials = seen.status.sweep, seen.trials.records
@@ -77,15 +79,15 @@ def inject(name: str, chosen: Inject, service: TheService, caller: AChanger) -> 
     # As the sweep writes it, so that a request that says the same in other words is known to be the same.
     point = new_point(record, spec, trials, chosen.point)
     _check_growth(service, name, Addition(points=[point]))
-    return _enqueue(service, caller, name, "inject", {"point": point})
+    return _enqueue(service, caller, name, "inject", {"point": point}, wait_for_nodes)
 
 
 @router.post("/replicate", status_code=202)
-def replicate(name: str, race: Replicate, service: TheService, caller: AChanger) -> Job:
+def replicate(name: str, race: Replicate, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Train the leading settings again with fresh seeds."""
     check_replicable(stored_spec(service.statuses.see(name).status.sweep))
     _check_growth(service, name, Addition(top=race.top, seeds=race.seeds))
-    return _enqueue(service, caller, name, "replicate", race.model_dump())
+    return _enqueue(service, caller, name, "replicate", race.model_dump(), wait_for_nodes)
 
 
 def _check_growth(service: Service, name: str, more: Addition) -> list[Job]:
@@ -97,13 +99,23 @@ def _check_growth(service: Service, name: str, more: Addition) -> list[Job]:
     return jobs
 
 
-def _enqueue(service: Service, caller: Caller, name: str, verb: Verb, arguments: Mapping[str, Any]) -> Job:
+def _enqueue(  # noqa: PLR0917 (all of them are one request)
+    service: Service,
+    caller: Caller,
+    name: str,
+    verb: Verb,
+    arguments: Mapping[str, Any],
+    wait_for_nodes: float | None,
+) -> Job:
     service.statuses.see(name)
+    wait = waiting_arguments(service.config, wait_for_nodes)
     for job in service.queue.jobs("waiting", "running", sweep=name):
-        if job.verb == verb and job.arguments == dict(arguments) and not job.stop_requested:
+        # How long it waits for nodes makes it no other job.
+        asked = {key: value for key, value in job.arguments.items() if key != "wait_for_nodes"}
+        if job.verb == verb and asked == dict(arguments) and not job.stop_requested:
             raise NotNowError(f"Sweep {name} has that job already: number {job.id}, which is {job.state}.")
     last = service.queue.jobs(sweep=name)
     num_cpus = last[-1].num_cpus if last else service.supervisor.num_cpus
-    job, _ = service.queue.begin(name, verb, arguments, owner=caller.name, num_cpus=num_cpus)
+    job, _ = service.queue.begin(name, verb, {**arguments, **wait}, owner=caller.name, num_cpus=num_cpus)
     service.supervisor.wake()
     return job

@@ -17,6 +17,13 @@ TEXT = r"^[^\x00]*$"
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Priority = Annotated[int, Field(ge=-MAX_PRIORITY, le=MAX_PRIORITY, description="Higher ones go first.")]
 Tags = Annotated[list[Annotated[str, Field(min_length=1, max_length=50, pattern=TEXT)]], Field(max_length=20)]
+WAIT_FOR_NODES: dict[str, Any] = {
+    "ge": 0,
+    "le": 10**9,
+    "allow_inf_nan": False,
+    "description": "On a cluster: the most seconds to wait until its nodes can hold one trial; its autoscaler is asked "
+    "for them. Left out: as the service's operator has said.",
+}
 Note = Annotated[str, Field(max_length=2_000, pattern=TEXT, description="A text for people.")]
 
 
@@ -37,6 +44,7 @@ class NewSweep(_Request):
     priority: Priority = 0
     note: Note = ""
     tags: Tags = Field(default_factory=list)
+    wait_for_nodes: float | None = Field(None, **WAIT_FOR_NODES)
 
     def submission(self) -> Submission:
         """Return it as the submitter has it."""

@@ -59,6 +59,16 @@ export function openNew(main, route) {
     ),
     field("tags", "Tags", { type: "text", maxlength: 1000 }, "Separated by commas."),
     field("note", "Note", { rows: 2, maxlength: 2000 }),
+    ...(me.address === null
+      ? []
+      : [
+          field(
+            "wait_for_nodes",
+            "Wait for nodes, seconds",
+            { type: "number", min: 0, max: 1e9, step: 1 },
+            "At most, until the cluster can hold one trial. Empty: as the service's operator has said.",
+          ),
+        ]),
     problem,
     el("div", { class: "buttons" }, submit),
   );
@@ -159,7 +169,7 @@ export function openNew(main, route) {
     event.preventDefault();
     submit.disabled = true;
     problem.replaceChildren();
-    const { name, priority, tags, note } = form.elements;
+    const { name, priority, tags, note, wait_for_nodes: wait } = form.elements;
     try {
       const body = {
         text: editor.text,
@@ -169,6 +179,7 @@ export function openNew(main, route) {
         priority: Number(priority.value),
         tags: tagsOf(tags.value),
         note: note.value,
+        wait_for_nodes: wait?.value ? Number(wait.value) : null,
       };
       const made = await ask("sweeps", { method: "POST", body, headers: { "Idempotency-Key": key } });
       sessionStorage.removeItem(DRAFT);
