@@ -7,15 +7,14 @@ import os
 import subprocess
 from collections.abc import Iterator
 
-_SUBNET = "10.213.77"
-
 
 class Network:
     """A bridge, at which this machine has the address `host`; see `network`."""
 
-    host = f"{_SUBNET}.1"
-
     def __init__(self) -> None:
+        # Two runs at once have two networks.
+        self._subnet = f"10.213.{os.getpid() % 256}"
+        self.host = f"{self._subnet}.1"
         # Names of links have 15 characters at most.
         self._mark = f"tj{os.getpid() % 100_000}"
         self.bridge = f"{self._mark}b"
@@ -36,7 +35,7 @@ class Network:
 
     def host_of(self, number: int) -> str:
         """The address of a machine."""
-        return f"{_SUBNET}.{number + 1}"
+        return f"{self._subnet}.{number + 1}"
 
     def prefix(self, number: int) -> tuple[str, ...]:
         """The command that runs the rest of its arguments on a machine."""

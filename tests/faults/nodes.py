@@ -73,6 +73,12 @@ def _sweep(folder: Path, kind: str, cluster: Cluster, **changes: Any) -> Sweep:
     return Sweep(folder, settings, cluster.environment, "--address", cluster.address)
 
 
+def _training_on(node: Node, sweep: Sweep) -> list[int]:
+    """The processes on a node that train trials with a checkpoint."""
+    there = [record for record in sweep.records() if str(record["node"]).endswith(f"/{node.node_id[:8]}")]
+    return [int(record["pid"]) for record in there if record["pid"] and sweep.newest(record["trial_id"])]
+
+
 def head_killed(folder: Path, kind: str, undisturbed: Sweep) -> Outcome:
     """The head is gone and comes back with nothing; the sweep ends, says so, and is resumed there."""
     with _cluster(folder) as cluster:
@@ -96,14 +102,15 @@ def network_cut(folder: Path, kind: str, undisturbed: Sweep) -> Outcome:
     """A node that nobody reaches for a minute: its trials go on elsewhere, and what comes back is not written."""
     with network() as net, _cluster(folder, net.host) as cluster:
         number = net.add()
-        cluster.start_worker("worker", prefix=net.prefix(number), host=net.host_of(number))
+        worker = cluster.start_worker("worker", prefix=net.prefix(number), host=net.host_of(number))
         sweep = _sweep(folder, kind, cluster)
 
-        def act(_: Process) -> list[str]:
-            nodes = {record["node"].partition("/")[0] for record in sweep.records() if record["node"]}
+        def act(process: Process) -> list[str]:
+            if not wait_for(lambda: bool(_training_on(worker, sweep)), process):
+                return ["nothing trained on the node that was to be cut"]
             with net.cut(number):
                 time.sleep(_CUT_S)
-            return [] if net.host_of(number) in nodes else [f"nothing trained on the node that was cut: {nodes}"]
+            return []
 
         may = Disturbed(kind, notes=_LOST)
         outcome = during(sweep, f"network of a node cut for a minute, {kind}", act, may, undisturbed)
@@ -118,14 +125,10 @@ def clock_off(folder: Path, kind: str, undisturbed: Sweep, *, which: str, second
         off = cluster.start_worker("worker", environment=_clock(seconds))
         sweep = _sweep(folder, kind, cluster)
 
-        def trains_there() -> list[int]:
-            there = [record for record in sweep.records() if str(record["node"]).endswith(f"/{off.node_id[:8]}")]
-            return [int(record["pid"]) for record in there if sweep.newest(record["trial_id"])]
-
         def act(process: Process) -> list[str]:
-            if not wait_for(lambda: bool(trains_there()), process):
+            if not wait_for(lambda: bool(_training_on(off, sweep)), process):
                 return [f"nothing trained on the node {off.node_id[:8]}"]
-            maps = [Path(f"/proc/{pid}/maps").read_text(encoding="utf-8") for pid in trains_there()]
+            maps = [Path(f"/proc/{pid}/maps").read_text(encoding="utf-8") for pid in _training_on(off, sweep)]
             return [] if all("libfaketime" in text for text in maps) else ["a process there had the right time"]
 
         name = f"clock of a node an hour {which}, {kind}"
