@@ -19,7 +19,7 @@ class Paced(CartPoleEnv):
         slow: A file; while it is there, every step takes `pace_s`.
         pace_s: Seconds.
         fault: A file; while it is there, the first process that steps removes it and meets what it names: `hang`,
-            `exit` (`os._exit`) or `memory` (it allocates, and then hangs).
+            `exit` (`os._exit`) or `memory SHARE` (it allocates until so much of the machine's memory is used).
     """
 
     def __init__(self, slow: str, pace_s: float = 0.004, fault: str = "") -> None:
@@ -66,14 +66,21 @@ def _meet(how: str) -> None:
     if how == "exit":
         os._exit(3)
     kept: list[Any] = []
-    while how == "memory" and len(kept) < MOST_MEMORY_BYTES // _PIECE_BYTES:
-        kept.append(np.ones(_PIECE_BYTES, np.uint8))
+    until = time.monotonic() + 10_000
+    while time.monotonic() < until:
+        # What others free meanwhile is taken, too.
+        if how.startswith("memory") and used_memory() < float(how.split()[1]):
+            kept.append(np.ones(_PIECE_BYTES, np.uint8))
         time.sleep(_PIECE_S)
-    time.sleep(10_000)
 
 
-MOST_MEMORY_BYTES = 6 * 1024**3
-"""So much is allocated at most, so that a machine where nobody stops it goes on."""
+def used_memory() -> float:
+    """The share of this machine's memory that is used."""
+    lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    sizes = {line.partition(":")[0]: int(line.split()[1]) for line in lines}
+    return 1.0 - sizes["MemAvailable"] / sizes["MemTotal"]
+
+
 _PIECE_BYTES, _PIECE_S = 2**26, 0.02
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from tests.faults.forked import Process
 from tests.faults.outcomes import Outcome
+from tests.faults.paced import used_memory
 from tests.faults.sweeps import Before, Disturbed, Sweep, spec, wait_for, wrong
 from tests.kills.processes import Family
 
@@ -25,6 +26,8 @@ _MEETS_S, _STOPPED_S, _OUTAGE_S, _ENDS_S = 120.0, 60.0, 30.0, 300.0
 _TIMEOUT_S = 20.0
 _TOLD_CHARACTERS = 2_000
 _STORAGE_BYTES = 64 * 1024**2
+_OVER = 0.03
+"""The share of the memory by which an environment goes over what Ray allows."""
 _CLONE_NEWNS = 0x00020000
 ENV_FAULTS = ("exit", "hang", "memory")
 STORAGE_FAULTS = ("full", "read-only", "gone")
@@ -61,13 +64,15 @@ def env_fault(folder: Path, kind: str, how: str, undisturbed: Sweep) -> Outcome:
     changes: dict[str, Any] = {"max_retries": 3}
     if how != "exit":
         changes["iteration_timeout_s"] = _TIMEOUT_S if how == "hang" else 600.0
-    environment = dict(os.environ)
+    environment, fault = dict(os.environ), how
     if how == "memory":
-        environment |= {"RAY_memory_usage_threshold": f"{_used_memory() + 0.17:.3f}"}
+        threshold = min(used_memory() + 0.17, 1.0 - 2 * _OVER)
+        environment |= {"RAY_memory_usage_threshold": f"{threshold:.3f}"}
+        fault = f"memory {threshold + _OVER:.3f}"
     sweep = Sweep(folder, spec(kind, folder, **changes), environment)
 
     def act(process: Process) -> list[str]:
-        (folder / "fault.new").write_text(how, encoding="utf-8")
+        (folder / "fault.new").write_text(fault, encoding="utf-8")
         (folder / "fault.new").rename(sweep.fault)
         met = wait_for(lambda: not sweep.fault.exists(), process, _MEETS_S)
         return [] if met else [f"no environment met it: {sweep.said()}"]
@@ -76,13 +81,6 @@ def env_fault(folder: Path, kind: str, how: str, undisturbed: Sweep) -> Outcome:
     if not any(record["num_failures"] for record in sweep.records()):
         outcome.problems.append("no trial has a failure on record")
     return outcome
-
-
-def _used_memory() -> float:
-    """The share of this machine's memory that is used."""
-    lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    sizes = {line.partition(":")[0]: int(line.split()[1]) for line in lines}
-    return 1.0 - sizes["MemAvailable"] / sizes["MemTotal"]
 
 
 def stopped(folder: Path, kind: str, undisturbed: Sweep) -> Outcome:
