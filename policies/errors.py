@@ -5,9 +5,10 @@ Hierarchy: every error below is a `TuneJobsError`; the subclass decides the exit
 
 from __future__ import annotations
 
+import copy
 import re
 import traceback
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 # Halves of surrogate pairs, which cannot be written to files, and control characters except newlines and tabs.
 _UNFIT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -31,6 +32,19 @@ class TuneJobsError(Exception):
         super().__init__(message, hint)
         self.message = message
         self.hint = hint
+
+    def again(self, message: str | None = None, hint: str | None = None) -> Self:
+        """Return the same error, with all that it says of itself, to be raised once more.
+
+        Args:
+            message: What it says instead; None: the same.
+            hint: What it advises instead; None: the same.
+        """
+        other = copy.copy(self)
+        other.message = self.message if message is None else fit(message)
+        other.hint = self.hint if hint is None else fit(hint)
+        other.args = (other.message, other.hint)
+        return other
 
     def __str__(self) -> str:
         """Return the message and the hint, the hint on a line of its own."""
@@ -103,7 +117,7 @@ def tellable(error: Exception) -> Exception:
     except UnicodeEncodeError:
         if isinstance(error, TuneJobsError):
             # Its own message is valid text; that of its cause is not.
-            return type(error)(error.message, error.hint)
+            return error.again()
         return TuneJobsError(f"{type(error).__name__}: {said_by(error)}")
     return error
 

@@ -26,8 +26,11 @@ trial._log, trial._evaluators, trial._engine, trial._run = TrialLog(), {}, None,
 trial._open(folder, "t0000")
 """,
     "pack": """
-from tune_jobs.ray_tune.pack_trainable import PackTrainable
+from concurrent.futures import ThreadPoolExecutor
+from tune_jobs.ray_tune.pack_trainable import PackTrainable, TaskReader
 pack = PackTrainable.__new__(PackTrainable)
+pack._ahead = ThreadPoolExecutor(1)
+pack._reading = pack._ahead.submit(TaskReader, folder)
 pack._config = {"sweep_place": folder, "engine": "packed", "env_kind": "scalar", "num_env_processes": 0}
 pack._owner, pack._file = None, open(Path(folder) / "trials/t0000/log.txt", "ab")
 pack._open()

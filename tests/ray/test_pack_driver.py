@@ -1,7 +1,9 @@
 """Who trains in which pack, decided without any process: what packs report is made up here."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,7 +13,9 @@ from analysis.records import CheckpointRecord
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.ray_tune.early_stopping import build_scheduler
 from tune_jobs.ray_tune.pack_scheduler import PackDriver
+from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Assignment
 from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import RecordKeeper
@@ -80,6 +84,42 @@ def failure(number: int, *, retried: bool) -> MemberReport:
 
 
 # -- handing out
+
+
+def test_a_pack_that_reports_is_told_what_it_trains_on(tmp_path: Path) -> None:
+    driven, told = Driven(tmp_path, 6), list[tuple[str, ...]]()
+
+    def tell(**reports: Report) -> None:
+        made = [driven.report(*item) for item in reports.items()]
+        driven.driver.take("p00", made, node="here", pid=1, tell=lambda what: told.append(what.trial_ids))
+
+    # It has read that, and need not look there again.
+    tell(t0000=(100, 1.0))
+    assert told == [("t0000", "t0001")]
+    tell(t0000=(200, 1.0))
+    tell(t0000=(1000, "completed"))
+    assert told[1:] == [("t0001", "t0004")]
+    # The next process of the pack reads it in the storage, until it reports.
+    driven.driver.died("p00", "killed")
+    driven.driver.died("p00", "killed")
+    assert driven.assigned() == [1]
+    assert told[2:] == []
+    tell(t0001=(100, 1.0))
+    tell(t0001=(1000, "completed"))
+    assert told[2:] == [("t0001",), ("t0004",)]
+
+
+def test_what_a_process_is_told_goes_before_what_it_could_read() -> None:
+    pack: Any = PackTrainable.__new__(PackTrainable)
+    pack._first, pack._told, added = None, None, list[str]()
+    pack._owner = SimpleNamespace(held=contextlib.nullcontext)
+    pack._files = SimpleNamespace(read=lambda: Assignment(("t0000",)))
+    pack._reader = SimpleNamespace(read=lambda trial_id: trial_id)
+    loop: Any = SimpleNamespace(trial_ids=(), add=lambda task, _: added.append(task))
+    pack._arrange(loop)
+    pack.assign(Assignment(("t0001",)))
+    pack._arrange(loop)
+    assert added == ["t0000", "t0001"]
 
 
 @pytest.mark.parametrize(

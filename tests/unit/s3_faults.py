@@ -18,7 +18,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 import pytest
 from s3_server import s3_endpoint
 
-from tune_jobs.store.objects import asked, bucket, outbox, owners, trial_state
+from tune_jobs.store.objects import asked, clients, object_trial, outbox, owners, trial_state
 from tune_jobs.store.objects.object_sweep import ObjectSweep
 from tune_jobs.store.objects.url import ObjectUrl
 
@@ -216,13 +216,15 @@ class _Handler(BaseHTTPRequestHandler):
 def faults(monkeypatch: pytest.MonkeyPatch) -> Iterator[Faults]:
     """A proxy of the test's own; all that waits has little patience."""
     # Milliseconds would do, but for machines that do much else.
-    monkeypatch.setattr(bucket, "_PATIENCE_S", 2.0)
+    monkeypatch.setattr(clients, "PATIENCE_S", 2.0)
     monkeypatch.setattr(outbox, "_FIRST_PAUSE_S", 0.02)
     monkeypatch.setattr(outbox, "_LONGEST_PAUSE_S", 0.05)
     monkeypatch.setattr(owners, "_LOOK_EVERY_S", 0.0)
     monkeypatch.setattr(trial_state, "_LOOK_EVERY_S", 0.0)
     monkeypatch.setattr(asked, "_EVERY_S", 0.0)
     monkeypatch.setattr(trial_state, "_RESULTS_AFTER_S", 0.02)
+    monkeypatch.setattr(trial_state, "_CHECKPOINTS_AFTER_S", 0.0)
+    monkeypatch.setattr(object_trial, "_RUNNING_AFTER_S", 0.0)
     made = Faults()
     yield made
     made.clear()

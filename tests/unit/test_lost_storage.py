@@ -8,8 +8,10 @@ import pytest
 from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError, NotFoundError
+from tune_jobs.store.objects import outbox
 from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.objects.object_sweep import ObjectSweep
+from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.storage_watch import StorageWatch
@@ -74,6 +76,60 @@ def test_an_object_store_that_does_not_answer_is_gone_too(url: ObjectUrl) -> Non
     with pytest.raises(StorageError) as refusal, told_if_it_is_gone(store, lambda: None):
         raise refused
     assert refusal.value is refused
+
+
+def test_no_folder_is_made_where_a_storage_is_gone(store: SweepStore) -> None:
+    run, pack = store.take(), store.pack("p00")
+    run.release()
+    taken_away(store)
+    with pytest.raises(OwnershipLostError), run.held():
+        pass
+    with pytest.raises(CannotRunError, match="is gone"):
+        pack.take(run)
+    assert not store.folder.parent.exists()
+    # Nor a file in what lies there instead.
+    store.folder.mkdir(parents=True)
+    with pytest.raises(OwnershipLostError), run.held():
+        pass
+    assert list(store.folder.iterdir()) == []
+
+
+def test_a_store_that_was_away_too_long_for_an_upload_is_gone(url: ObjectUrl, monkeypatch: pytest.MonkeyPatch) -> None:
+    away = StorageError("s3://x cannot be written: no answer.", "Check it.", passes=True, reason="no answer")
+
+    def upload() -> NoReturn:
+        raise away
+
+    monkeypatch.setattr(outbox, "PATIENCE_S", -1.0)
+    uploads = outbox.Outbox()
+    uploads.add("a", upload)
+    with pytest.raises(StorageError) as raised:
+        uploads.settle(["a"])
+    assert (raised.value.passes, raised.value.reason) == (True, "no answer")
+    with pytest.raises(CannotRunError) as caught, told_if_it_is_gone(ObjectSweep(url), lambda: None):
+        # The next write is told, too.
+        uploads.add("a", upload)
+    assert "is gone: s3://x cannot be written" in caught.value.message
+
+
+def test_a_store_that_is_away_while_it_is_waited_for_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def upload() -> NoReturn:
+        raise StorageError("s3://x cannot be written: no answer.", "Check it.", passes=True)
+
+    uploads = outbox.Outbox()
+    uploads.add("a", upload)
+    with pytest.raises(StorageError, match=r"1 uploads have not ended within 0 s. s3://x cannot be written") as raised:
+        uploads.settle(["a"], timeout_s=0.3)
+    assert raised.value.passes
+
+
+def test_an_error_that_names_the_store_says_still_that_it_passes(url: ObjectUrl) -> None:
+    parts = Parts(url)
+    with pytest.raises(StorageError) as raised, parts.named():
+        raise StorageError(f"{parts.own()}/x cannot be read.", "Check it.", passes=True, reason="no answer")
+    assert raised.value.message == f"{url.short}/x cannot be read."
+    assert raised.value.args == (raised.value.message, "Check it.")
+    assert (raised.value.passes, raised.value.reason) == (True, "no answer")
 
 
 class Clock:

@@ -1,5 +1,6 @@
 """What asks a store often, holds its lock or keeps files of it nearby, while the store or the machine fails."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from s3_faults import Faults
 from store_parts import fill, make_checkpoint, make_sweep
 
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.store.objects import lease, scratch
+from tune_jobs.store.objects import asked, lease, scratch
 from tune_jobs.store.objects.bucket import Bucket, StorageError
 from tune_jobs.store.objects.lease import is_leased, leased
 from tune_jobs.store.objects.object_sweep import ObjectSweep
@@ -54,6 +55,28 @@ def test_who_asks_for_a_stop_before_each_step_does_not_wait_for_the_store(faults
     soon(lambda: "a step" in ObjectSweep(url).trial("t0000").log_tail())
     sweep.clear_stop_request()
     assert not sweep.stop_requested()
+
+
+def test_who_asks_often_for_a_stop_does_not_wait_for_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(asked, "_EVERY_S", 0.01)
+    monkeypatch.setattr(asked, "_BELIEVED", 1e9)
+    monkeypatch.setattr(asked, "_WAIT_S", 30.0)
+    answers, went_on = itertools.chain([False], itertools.repeat(True)), threading.Event()
+    went_on.set()
+
+    def ask() -> bool:
+        went_on.wait(30)
+        return next(answers)
+
+    question = asked.Asked(ask)
+    assert not question.answer()
+    went_on.clear()
+    time.sleep(0.02)
+    began = time.monotonic()
+    assert not question.answer()
+    assert time.monotonic() - began < 15
+    went_on.set()
+    soon(question.answer)
 
 
 def test_whether_a_stop_was_asked_for_is_an_error_if_the_store_never_said(faults: Faults, url: ObjectUrl) -> None:

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from s3_faults import Faults
 
-from policies.errors import CannotRunError
-from tune_jobs.store.objects import bucket as of_bucket
+from policies.errors import CannotRunError, TuneJobsError
+from tune_jobs.store.objects import clients
 from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError
+from tune_jobs.store.objects.object_storage import ObjectStorage
 from tune_jobs.store.objects.object_sweep import ObjectSweep
 from tune_jobs.store.objects.url import ObjectUrl
 
@@ -77,7 +78,7 @@ def test_a_conditional_write_whose_answer_is_lost_is_known_again(
     act: str,
 ) -> None:
     if act == "slow":
-        monkeypatch.setattr(of_bucket, "REQUEST_TIMEOUT_S", 0.15)
+        monkeypatch.setattr(clients, "REQUEST_TIMEOUT_S", 0.15)
         settings = {"delay_s": 0.3}
     else:
         settings = {}
@@ -295,6 +296,17 @@ def test_a_web_server_that_is_no_object_store_is_told_at_once(faults: Faults, bu
         assert not raised.value.passes
         assert "Correct the endpoint" in raised.value.hint
         assert len(faults.requests) == 1
+
+
+def test_a_web_server_is_told_apart_from_a_store_without_sweeps(faults: Faults, bucket: Bucket) -> None:
+    storage = ObjectStorage(bucket.url)
+    assert storage.sweeps() == []
+    assert not storage.is_taken("mine")
+    faults.rule("status", status=200, body="<html><body>Welcome</body></html>", times=100)
+    for use in (storage.sweeps, lambda: storage.is_taken("mine"), lambda: storage.new_sweep("mine")):
+        with pytest.raises(TuneJobsError, match="no object store") as raised:
+            use()
+        assert "Correct the endpoint" in raised.value.hint
 
 
 def test_patience_has_an_end(faults: Faults, bucket: Bucket) -> None:

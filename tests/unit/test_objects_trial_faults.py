@@ -146,8 +146,8 @@ def test_a_process_that_ends_without_the_store_says_what_is_lost(faults: Faults,
     said = run(
         f"""
         import socket
-        from tune_jobs.store.objects import outbox, bucket
-        outbox._AT_EXIT_S, bucket._PATIENCE_S = 0.3, 0.1
+        from tune_jobs.store.objects import bucket, clients, outbox
+        outbox._AT_EXIT_S, clients.PATIENCE_S = 0.3, 0.1
         url = ObjectUrl.parse({str(url)!r})
         trial = ObjectSweep(url).trial("t0000")
         trial.take()

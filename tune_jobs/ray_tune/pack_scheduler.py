@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController
     from ray.tune.experiment import Trial
 
+Tell = Callable[[Assignment], object]
+"""Tells the process of a pack which trials it has to train, before it trains on."""
 _DEATHS_IN_COMPANY = 2
 """How many times a member may be in a pack that dies before it continues alone."""
 
@@ -46,6 +48,10 @@ class _Pack:
         self.ending: set[str] = set()
         """Members that the scheduler has ended; the pack removes them before it trains on."""
         self.is_up = False
+        self.tell: Tell | None = None
+        """Tells its process; None: there is none, or it has not reported yet, and reads in the storage."""
+        self.told: Assignment | None = None
+        """What it was told last; None: nothing yet."""
 
     @property
     def staying(self) -> tuple[str, ...]:
@@ -98,7 +104,9 @@ class PackDriver:
             if index < num_packs:
                 # If there are fewer trials than room, they are spread evenly.
                 self._fill(pack, min(self._slots, math.ceil(len(self._waiting) / (num_packs - index))))
-            self._write(pack)
+            self._write(pack, soon=True)
+        # Before any of their processes is started.
+        store.settle()
 
     def __getstate__(self) -> dict[str, Any]:
         # As for `RecordKeeper`, Tune's pickle of this object is never read back.
@@ -146,9 +154,23 @@ class PackDriver:
             self._fill(pack, self._slots)
         self._write(pack)
 
-    def take(self, pack_id: str, reports: Sequence[MemberReport], *, node: str, pid: int) -> bool:
-        """Take a pack's reports and decide what it does next; return whether it has nothing left to do."""
+    def take(
+        self, pack_id: str, reports: Sequence[MemberReport], *, node: str, pid: int, tell: Tell | None = None
+    ) -> bool:
+        """Take a pack's reports and decide what it does next; return whether it has nothing left to do.
+
+        Args:
+            pack_id: The pack.
+            reports: What it reports.
+            node: Where its process is.
+            pid: Its process.
+            tell: Tells its process what it has to train from now on; None: it reads that in the storage.
+        """
         pack = self._packs[pack_id]
+        if pack.tell is None:
+            # What it has read in the storage it is told, too, so that it looks there no more.
+            pack.told = None
+        pack.tell = tell
         for report in reports:
             if report.progress is not None:
                 self._progressed(pack, report.trial_id, report.progress, node, pid)
@@ -163,7 +185,7 @@ class PackDriver:
     def died(self, pack_id: str, error: str) -> None:
         """Handle the death of a pack's process, or an error of no single member; the pack is started again."""
         pack = self._packs[pack_id]
-        pack.is_up = False
+        pack.is_up, pack.tell = False, None
         in_company = len(pack.members) > 1
         for trial_id in list(pack.ending):
             self._stopped(pack, trial_id)
@@ -202,7 +224,7 @@ class PackDriver:
 
     def _restarts(self, pack_id: str, note: Callable[[str], None]) -> None:
         pack = self._packs[pack_id]
-        pack.is_up = False
+        pack.is_up, pack.tell = False, None
         for trial_id in list(pack.ending):
             # The next process is not told of them, so none would report their end.
             self._stopped(pack, trial_id)
@@ -214,7 +236,7 @@ class PackDriver:
     def closed(self, pack_id: str) -> None:
         """Handle a pack that Tune has ended: it has nothing to do, or the sweep stops and it did not save in time."""
         pack = self._packs[pack_id]
-        pack.is_up = False
+        pack.is_up, pack.tell = False, None
         for trial_id in list(pack.members):
             self._keeper.ended(trial_id)
             self._leave(pack, trial_id)
@@ -291,10 +313,16 @@ class PackDriver:
         if pack.is_up:
             self._keeper.started(trial_id)
 
-    def _write(self, pack: _Pack) -> None:
+    def _write(self, pack: _Pack, *, soon: bool = False) -> None:
         failures = {name: self._num_failures[name] for name in pack.staying if self._num_failures[name]}
+        assignment = Assignment(pack.staying, failures)
         with self._keeper.owned():
-            pack.files.write(Assignment(pack.staying, failures))
+            # A process that is told does not read it; the next one of the pack is begun after another write.
+            pack.files.write(assignment, soon=soon or pack.tell is not None)
+        if pack.tell is not None and assignment != pack.told:
+            # In the storage it may see it late, and train members on that have ended.
+            pack.tell(assignment)
+            pack.told = assignment
 
 
 class PackScheduler(FIFOScheduler):  # type: ignore[misc]
@@ -312,7 +340,15 @@ class PackScheduler(FIFOScheduler):  # type: ignore[misc]
     ) -> str:
         """Pass the reports to the driver, and return its decision; packs that would have nothing to do ask no more."""
         reports: Sequence[MemberReport] = result["reports"].report
-        is_done = self._driver.take(str(trial.config["pack_id"]), reports, node=result["node"], pid=result["pid"])
+        process = result["process"].report
+        is_done = self._driver.take(
+            str(trial.config["pack_id"]),
+            reports,
+            node=result["node"],
+            pid=result["pid"],
+            # Ray runs a process's calls in the order in which they were made: this one before the next step.
+            tell=process.assign.remote,
+        )
         for other in tune_controller.get_trials():
             # An autoscaler adds nodes for those that wait for one.
             if other.status == other.PENDING and self._driver.is_of_no_use(str(other.config["pack_id"])):

@@ -1,7 +1,8 @@
 """The Ray Tune Trainable of a pack: one process that trains many trials at once, for as long as there are any.
 
-Tune gives it a sweep folder and a pack id. It reads which trials to train from its assignment before every step; the
-trials themselves are in the sweep folder, so a pack that is started again continues from what its members left there.
+Tune gives it a sweep's place and a pack id. It reads in its assignment which trials to train; after its first report
+the driver tells it, before the next step, as a storage may be far away. The trials themselves are in the storage, so a
+pack that is started again continues from what its members left there.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import functools
 import traceback
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import IO, TYPE_CHECKING, Any
 
+import ray
 from ray import tune
 
 from policies.acting.evaluate import Evaluator
@@ -29,9 +31,10 @@ from tune_jobs.ray_tune.trainable import (
     this_node,
     watchdog,
 )
+from tune_jobs.store.contract import Assignment
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.training.pack_loop import PackLoop
-from tune_jobs.training.protocol import PackEngine
+from tune_jobs.training.protocol import PackEngine, TrialTask
 from tune_jobs.training.registry import make_pack_engine
 
 if TYPE_CHECKING:
@@ -53,6 +56,11 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         self._engine: PackEngine | None = None
         self._evaluator: Evaluator | None = None
         self._loop: PackLoop | None = None
+        self._told: Assignment | None = None
+        self._first: Future[tuple[Assignment, dict[str, TrialTask]]] | None = None
+        # Meanwhile other things are done that wait for the storage, or need none.
+        self._ahead = ThreadPoolExecutor(1, "ahead")
+        self._reading = self._ahead.submit(TaskReader, config["sweep_place"])
         self._refusal = refusal(config)
         if self._refusal is not None:
             return
@@ -65,6 +73,11 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         self._files.begin_log()
         self._node = this_node()
         self._notice = DrainNotice()
+        self._this = ray.get_runtime_context().current_actor
+
+    def assign(self, assignment: Assignment) -> None:
+        """Take from the driver which trials the pack has to train; it is in the storage, too, or will be."""
+        self._told = assignment
 
     def step(self) -> dict[str, Any]:
         """Remove members that shall end, add new ones, and train until there is something to decide.
@@ -88,7 +101,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
             traceback.print_exc()
             raise
         # The driver decides when there is nothing left to do.
-        return {"done": False, "reports": Sealed(reports), "node": self._node}
+        return {"done": False, "reports": Sealed(reports), "process": Sealed(self._this), "node": self._node}
 
     def _leave(self, loop: PackLoop) -> None:
         """Save the members and end the pack here, as the node is taken away."""
@@ -109,8 +122,9 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         return evaluate_many(evaluator, policies)
 
     def _open(self) -> PackLoop:
-        self._reader = reader = TaskReader(self._config["sweep_place"])
+        self._reader = reader = self._reading.result()
         spec = reader.spec
+        self._first = self._ahead.submit(self._read)
         allow_modules(reader.sweep.allowed_modules)
         self._is_scheduled = spec.scheduler.type != "none"
         self._engine = self.make_engine()
@@ -132,18 +146,27 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         Raises:
             OwnershipLostError: Another process runs this pack by now, and reads the same assignment.
         """
+        first, self._first = self._first, None
         with self._owner.held():
-            assignment = self._files.read()
+            assignment, known = (self._told or self._files.read(), {}) if first is None else first.result()
         for trial_id in loop.trial_ids:
             if trial_id not in assignment.trial_ids:
                 loop.end(trial_id)
         new = [trial_id for trial_id in assignment.trial_ids if trial_id not in loop.trial_ids]
         if new:
-            # Side by side, as a store may be far away.
-            with ThreadPoolExecutor(min(len(new), _READ_AT_ONCE)) as pool:
-                tasks = list(pool.map(self._reader.read, new))
-            for task in tasks:
-                loop.add(task, assignment.num_failures.get(task.trial_id, 0))
+            tasks = known or self._tasks(new)
+            for trial_id in new:
+                loop.add(tasks[trial_id], assignment.num_failures.get(trial_id, 0))
+
+    def _read(self) -> tuple[Assignment, dict[str, TrialTask]]:
+        """Read the first assignment, and what its trials are."""
+        assignment = self._files.read()
+        return assignment, self._tasks(assignment.trial_ids)
+
+    def _tasks(self, trial_ids: Sequence[str]) -> dict[str, TrialTask]:
+        # Side by side, as a store may be far away.
+        with ThreadPoolExecutor(max(1, min(len(trial_ids), _READ_AT_ONCE))) as pool:
+            return dict(zip(trial_ids, pool.map(self._reader.read, trial_ids), strict=True))
 
     def cleanup(self) -> None:
         """Free everything, as the process may end."""
@@ -151,4 +174,5 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
             self._engine.close()
         if self._evaluator is not None:
             self._evaluator.close()
+        self._ahead.shutdown(wait=False)
         self._log.close()

@@ -125,7 +125,7 @@ class PackEvents(tune.Callback):  # type: ignore[misc]
         **info: Any,
     ) -> None:
         """Drop the report, which the scheduler has taken, so that Tune does not keep it."""
-        del result["reports"]
+        del result["reports"], result["process"]
 
     def on_step_end(self, iteration: int, trials: list[Trial], **info: Any) -> None:
         """Do the work that packs need not wait for, now that they continue."""

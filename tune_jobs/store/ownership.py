@@ -82,7 +82,7 @@ class Owner:
             CannotRunError: The file cannot be written or locked.
         """
         owner = cls(path, "")
-        with owner._locked() as descriptor:
+        with owner._locked(makes=True) as descriptor:
             if under is not None:
                 under.check()
             number, _, _ = _read(descriptor).partition(" ")
@@ -127,16 +127,20 @@ class Owner:
             raise self._lost()
 
     @contextlib.contextmanager
-    def _locked(self) -> Iterator[int]:
+    def _locked(self, *, makes: bool = False) -> Iterator[int]:
         with self._lock:
             try:
                 if self._descriptor is None:
-                    self.path.parent.mkdir(parents=True, exist_ok=True)
-                    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+                    if makes:
+                        self.path.parent.mkdir(parents=True, exist_ok=True)
+                    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | (os.O_CREAT if makes else 0)
                     self._descriptor = os.open(self.path, flags, 0o666)
                 refuse_others(os.fstat(self._descriptor), self.path)
                 self._wait(self._descriptor)
             except OSError as error:
+                if not makes and isinstance(error, FileNotFoundError):
+                    # It is not made anew: its folder may be gone, with the whole storage.
+                    raise self._lost() from error
                 raise CannotRunError(
                     f"{self.path} cannot be written and locked: {error.strerror}.",
                     "Check its permissions, and that the file system of the storage has locks.",

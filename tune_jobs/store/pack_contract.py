@@ -36,8 +36,12 @@ class Pack(Protocol):
         """
         ...
 
-    def write(self, assignment: Assignment) -> None:
+    def write(self, assignment: Assignment, *, soon: bool = False) -> None:
         """Replace the assignment, atomically.
+
+        Args:
+            assignment: The assignment. The records of its trials are kept before.
+            soon: Whether it may be kept a little later; `Sweep.settle` waits for it.
 
         Raises:
             CannotRunError: It cannot be written.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from policies.errors import MALFORMED, CheckpointError, NotFoundError
+from policies.errors import MALFORMED, CannotRunError, CheckpointError, NotFoundError
 from policies.files import read_regular, write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.logs import begin_log, log_tail
@@ -55,10 +55,15 @@ class PackFiles:
 
         Raises:
             OwnershipLostError: Another process has taken `under`.
+            CannotRunError: The sweep's folder is gone, which is not made anew.
         """
+        if not self._sweep_folder.is_dir():
+            raise CannotRunError(
+                f"{self._sweep_folder} is gone.", "Mount or connect the storage again, and resume the sweep."
+            )
         return Owner.take(self.owner_path, under)
 
-    def write(self, assignment: Assignment) -> None:
+    def write(self, assignment: Assignment, *, soon: bool = False) -> None:  # noqa: ARG002 (it is at once)
         """Replace the assignment."""
         data = {"trial_ids": list(assignment.trial_ids), "num_failures": dict(assignment.num_failures)}
         write_atomic(self.assignment_path, json.dumps(data) + "\n")

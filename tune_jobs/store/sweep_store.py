@@ -9,10 +9,9 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 from analysis.records import FINISHED, BestRecord, CheckpointRecord, FilmsRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
@@ -180,9 +179,10 @@ class SweepStore:
         """
         return TrialStore(self.folder, trial_id)
 
-    def reading(self, **_what: Any) -> AbstractContextManager[None]:
+    @contextlib.contextmanager
+    def reading(self, *, results: bool = True, checkpoints: Sequence[CheckpointRecord] = ()) -> Iterator[None]:  # noqa: ARG002
         """Do nothing: a file is read when it is needed."""
-        return contextlib.nullcontext()
+        yield
 
     def pack(self, pack_id: str) -> PackFiles:
         """Return the files of one pack.

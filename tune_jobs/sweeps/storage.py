@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from pathlib import Path
@@ -207,13 +208,18 @@ def create_store(name: str | None, stem: str, storage: str | Path) -> Sweep:
         SpecError: In the same cases as `choose_store`.
         CannotRunError: The storage cannot be written.
     """
-    while True:
-        store = choose_store(name, stem, storage)
+    if name is not None:
+        store = open_storage(storage).sweep(check_sweep_name(name))
         try:
             store.create()
         except SpecError:
-            # It was taken since it was chosen.
-            if name is not None:
-                raise
-        else:
+            # It says what is there.
+            choose_store(name, stem, storage)
+            raise
+        return store
+    while True:
+        store = choose_store(name, stem, storage)
+        # Where it was taken since it was chosen, another one is.
+        with contextlib.suppress(SpecError):
+            store.create()
             return store

@@ -10,8 +10,10 @@ from tune_jobs.store.objects.bucket import StorageError
 
 _EVERY_S = 1.0
 """Seconds for which an answer is believed."""
+_BELIEVED = 3
+"""How many times as long the answer before is believed while a new one is on its way, so that nobody waits for it."""
 _WAIT_S = 0.25
-"""Seconds that a new answer is waited for; if it does not come, the one before holds."""
+"""Seconds that a new answer is waited for after that; if it does not come, the one before holds."""
 
 
 class Asked:
@@ -37,7 +39,8 @@ class Asked:
             StorageError: It was never answered, or for a reason that does not pass.
         """
         with self._lock:
-            if self._known is not None and time.monotonic() - self._at < _EVERY_S:
+            age = time.monotonic() - self._at
+            if self._known is not None and age < _EVERY_S:
                 return self._known
             asking = self._asking
             is_new = asking is None or not asking.is_alive()
@@ -47,12 +50,12 @@ class Asked:
                 asking.start()
         if self._known is None:
             asking.join()
-        elif is_new:
+        elif is_new and age >= _BELIEVED * _EVERY_S:
             asking.join(_WAIT_S)
         with self._lock:
             error = self._error
             if error is not None and (self._known is None or not error.passes):
-                raise StorageError(error.message, error.hint, passes=error.passes) from None
+                raise error.again() from None
             return bool(self._known)
 
     def forget(self) -> None:

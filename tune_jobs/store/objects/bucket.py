@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
-import os
+import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from policies.errors import CannotRunError
 from policies.files import atomic_path
+from tune_jobs.store.objects import clients
 from tune_jobs.store.objects.at_once import side_by_side
-from tune_jobs.store.objects.reasons import MISSING_BUCKET, reason_of
+from tune_jobs.store.objects.reasons import MISSING_BUCKET, NO_STORE, reason_of
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.patience import ANSWER_S, AWAY, is_impatient
 
@@ -30,13 +29,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-REQUEST_TIMEOUT_S = 30.0
-"""Seconds that one request may take."""
-_PATIENCE_S = 30.0
-"""Seconds in which requests that failed for reasons that pass are repeated."""
 _MAX_DELETED = 500
-_MAX_CLIENTS = 32
-"""Addresses whose connections a process keeps: they are the same for all that it has open there."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 4.0
 Tag = tuple[str | None, str | None]
 """What tells one content of an object from another: its entity tag and its version."""
@@ -100,7 +93,7 @@ class Bucket:
         # Opened when it is needed: obstore takes 0.1 s to load, and an address alone needs none.
         now = is_impatient()
         if now not in self._opened:
-            self._opened[now] = _client(self.url, now=now)
+            self._opened[now] = clients.client_of(self.url, now=now)
         return self._opened[now]
 
     def get(self, key: str) -> Found | None:
@@ -120,6 +113,16 @@ class Bucket:
             return Found(bytes(answer.bytes()), _tag(answer.meta))
 
         return self._doing("read", key, read)
+
+    def is_store(self) -> bool:
+        """Find out whether an object store answers: a web server's page, say, reads as a list of nothing.
+
+        Raises:
+            StorageError: What answers is none, or cannot be read.
+        """
+        if self.get(secrets.token_hex(8)) is not None:
+            raise StorageError(f"{self.url.short} cannot be read: {NO_STORE[0]}.", NO_STORE[1], reason=NO_STORE[0])
+        return True
 
     def look(self, key: str) -> Listed | None:
         """Return what is known of an object without its content; None: there is none.
@@ -310,7 +313,7 @@ class Bucket:
         if away is not None:
             why, hint = (str(item) for item in away.args)
             raise StorageError(f"{self.name_of(key)} cannot be {what}: {why}.", hint, passes=True)
-        deadline, pause = time.monotonic() + (ANSWER_S / 2 if now else _PATIENCE_S), _FIRST_PAUSE_S
+        deadline, pause = time.monotonic() + (ANSWER_S / 2 if now else clients.PATIENCE_S), _FIRST_PAUSE_S
         while True:
             try:
                 with self._told(what, key):
@@ -348,52 +351,3 @@ def _tag(meta: Any) -> Tag:
 
 def _listed(meta: Any) -> Listed:
     return Listed(meta["path"], meta["size"], _tag(meta), meta["last_modified"].timestamp())
-
-
-def _client(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
-    # What it was made from: a forked process has none of its parent's threads, and each has its credentials from there.
-    told = tuple(item for item in sorted(os.environ.items()) if item[0].startswith(("AWS_", "GOOGLE_", "AZURE_")))
-    return _client_of(os.getpid(), str(url), told, now=now)
-
-
-@functools.lru_cache(maxsize=_MAX_CLIENTS)
-def _client_of(
-    _process: int, address: str, _told: tuple[tuple[str, str], ...], *, now: bool
-) -> obstore.store.ObjectStore:
-    return _open(ObjectUrl.parse(address), now=now)
-
-
-def _open(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
-    from obstore.store import AzureStore, GCSStore, S3Store
-
-    prefix = url.prefix or None
-    options: dict[str, Any] = {
-        "client_options": {
-            "timeout": timedelta(seconds=REQUEST_TIMEOUT_S),
-            "connect_timeout": timedelta(seconds=5),
-            "allow_http": url.settings.get("endpoint", "").startswith("http://"),
-        },
-        "retry_config": {"max_retries": 12, "retry_timeout": timedelta(seconds=_PATIENCE_S)},
-    }
-    if now:
-        # A large answer may take its time, but none that stands still.
-        options["client_options"] |= {"read_timeout": timedelta(seconds=ANSWER_S)}
-        options["client_options"] |= {"connect_timeout": timedelta(seconds=ANSWER_S / 2)}
-        options["retry_config"] = {"max_retries": 3, "retry_timeout": timedelta(seconds=ANSWER_S / 2)}
-    endpoint = url.settings.get("endpoint")
-    if url.scheme == "s3":
-        if endpoint:
-            # A store of one's own has its buckets in the path, and seldom a region.
-            options |= {"endpoint": endpoint, "virtual_hosted_style_request": False, "region": "us-east-1"}
-        if region := url.settings.get("region"):
-            options["region"] = region
-        return S3Store(url.bucket, prefix=prefix, **options)
-    if url.scheme == "gs":
-        if endpoint:
-            options["base_url"] = endpoint
-        return GCSStore(url.bucket, prefix=prefix, **options)
-    if account := url.settings.get("account"):
-        options["account_name"] = account
-    if endpoint:
-        options["endpoint"] = endpoint
-    return AzureStore(url.bucket, prefix=prefix, **options)

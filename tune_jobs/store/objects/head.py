@@ -7,15 +7,19 @@ earlier owner can change nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Collection, Container, Iterable, Mapping
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from analysis.records import FORMAT_VERSION
 from policies.errors import CheckpointError
 from policies.wrong_values import details_of, dotted, explain
+from tune_jobs.store import names
 from tune_jobs.store.objects.bucket import Bucket, Found, Tag
 
+NAMED = ("results", names.CHECKPOINTS_FOLDER)
+"""The folders of a trial whose objects its head names."""
 _KEY = r"^[0-9a-f]{16}$"
 
 
@@ -53,6 +57,34 @@ class Head(BaseModel):
     """By iteration."""
     damaged: Mapping[str, str] = Field(default_factory=dict)
     """What was set aside: its name, and the name that its files are under."""
+
+    def named(self) -> set[str]:
+        """Return the names of all objects that it names."""
+        damaged = {key for text in self.damaged.values() for key in text.split()}
+        return damaged | {chunk.key for chunk in self.results} | {item.key for item in self.checkpoints.values()}
+
+
+def free(name: str, taken: Container[str]) -> str:
+    """Return a name, with a number if it is taken."""
+    numbered = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(free for free in numbered if free not in taken)
+
+
+def unnamed(prefix: str, present: Iterable[str], named: Collection[str]) -> list[str]:
+    """Return those of a trial's results and checkpoints that are not among those named.
+
+    Args:
+        prefix: What the keys of the trial's objects begin with.
+        present: Keys of the trial's objects, of any kind.
+        named: What is named.
+    """
+    gone = []
+    for key in present:
+        folder, _, rest = key.removeprefix(f"{prefix}/").partition("/")
+        part = rest.partition("/")[0].removesuffix(".jsonl").rpartition("-")[2]
+        if folder in NAMED and part not in named:
+            gone.append(key)
+    return gone
 
 
 def read_head(bucket: Bucket, key: str) -> tuple[Head, Tag | None]:

@@ -28,7 +28,7 @@ _FREE = b"{}"
 
 
 @contextlib.contextmanager
-def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Beating]:
+def leased(bucket: Bucket, key: str, message: str, hint: str, *, is_first: bool = False) -> Iterator[Beating]:
     """Hold the lock in the block, or raise; it takes up to half a minute to find out that a holder elsewhere is gone.
 
     The block gets what says whether the lock is still this process's.
@@ -38,12 +38,15 @@ def leased(bucket: Bucket, key: str, message: str, hint: str) -> Iterator[Beatin
         key: The lock's object.
         message: The error's message if another process holds it.
         hint: The error's hint if another process holds it.
+        is_first: Whether nobody seems to have held it ever; the block is told whether that is so.
 
     Raises:
         CannotRunError: Another process holds it, or the store cannot be written.
     """
     own = secrets.token_hex(8)
-    beating = Beating(bucket, key, own, *_take(bucket, key, own, message, hint))
+    taken = _take_first(bucket, key, own) if is_first else None
+    beating = Beating(bucket, key, own, *(taken or _take(bucket, key, own, message, hint)))
+    beating.is_first = taken is not None
     try:
         yield beating
     finally:
@@ -75,6 +78,14 @@ def is_leased(bucket: Bucket, key: str, watch_s: float = 2.5 * _BEAT_S) -> bool:
         if now is None or now.data != found.data:
             return now is not None and bool(_holder(now))
     return False
+
+
+def _take_first(bucket: Bucket, key: str, own: str) -> tuple[Tag, float] | None:
+    begun_at = _now()
+    try:
+        return bucket.put(key, _sign(own, 0), is_new=True), begun_at
+    except ConflictError:
+        return None
 
 
 def _take(bucket: Bucket, key: str, own: str, message: str, hint: str) -> tuple[Tag, float]:
@@ -146,6 +157,8 @@ class Beating:
     def __init__(self, bucket: Bucket, key: str, own: str, tag: Tag, signed_at: float) -> None:
         self._bucket, self._key, self._tag, self._own = bucket, key, tag, own
         self._signed_at = signed_at
+        self.is_first = False
+        """Whether nobody has held the lock before."""
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="lease", daemon=True)
         self._thread.start()
@@ -185,5 +198,9 @@ class Beating:
         self._over.set()
         self._thread.join()
         with contextlib.suppress(StorageError):
-            if self.is_ours():
+            try:
                 self._bucket.put(self._key, _FREE, over=self._tag)
+            except ConflictError:
+                # A sign that had seemed to fail, perhaps.
+                if self.is_ours():
+                    self._bucket.put(self._key, _FREE, over=self._tag)

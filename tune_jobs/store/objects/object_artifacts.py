@@ -12,9 +12,11 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from pydantic import BaseModel
+
 from analysis.records import BestRecord, FilmsRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
-from policies.files import atomic_path
+from policies.files import atomic_path, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
 from tune_jobs.store.objects.at_once import side_by_side
@@ -39,7 +41,8 @@ class Artifacts:
         local = self._parts.shared() / folder
         local.mkdir(parents=True, exist_ok=True)
         if fetched:
-            present = {item.key.removeprefix(f"{folder}/"): item for item in self._bucket.listed(f"{folder}/")}
+            listed = self._parts.listed(f"{folder}/").items()
+            present = {key.removeprefix(f"{folder}/"): item for key, item in listed}
             stale = [name for name, item in present.items() if _differs(local / name, item)]
             side_by_side(lambda name: self._fetch(folder, name, present[name]), stale)
             for path in [path for path in local.rglob("*") if path.is_file()]:
@@ -56,8 +59,9 @@ class Artifacts:
     def _upload(self, folder: str, made: Path, paths: Sequence[Path]) -> None:
         """Upload files that were made, and have them where they are looked for, so that none has to be fetched."""
         keys = {f"{folder}/{path.relative_to(made).as_posix()}": path for path in paths}
-        tags = self._bucket.put_all(keys)
-        side_by_side(lambda key: self._keep(key, keys[key], tags[key]), keys)
+        tags = self._parts.put_files(keys)
+        for key, path in keys.items():
+            self._keep(key, path, tags[key])
 
     def _keep(self, key: str, made: Path, tag: Tag) -> None:
         # Where it cannot be kept, it is fetched when it is looked for, which says why.
@@ -66,6 +70,14 @@ class Artifacts:
             with atomic_path(local) as temporary:
                 shutil.copyfile(made, temporary)
             _mark(local, tag)
+
+    def _write_record(self, name: str, record: BaseModel) -> None:
+        """Write a record of the winner, and have it where its files are looked for, too."""
+        key, text = f"{names.BEST_FOLDER}/{name}", dump_sealed(record)
+        self._parts.write_record(key, text)
+        made = self._parts.own() / "made" / name
+        write_atomic(made, text)
+        self._keep(key, made, self._parts.tag_of(key))
 
     def has_best(self) -> bool:
         """Whether a winner has been written."""
@@ -90,7 +102,7 @@ class Artifacts:
             made = self._parts.own() / "made" / names.BEST_FOLDER
             save_policy(policy, made)
             self._upload(names.BEST_FOLDER, made, sorted(made.iterdir()))
-        self._parts.write_record(f"{names.BEST_FOLDER}/{names.BEST_RECORD}", dump_sealed(record))
+        self._write_record(names.BEST_RECORD, record)
 
     @property
     def best_folder(self) -> Path:
@@ -128,12 +140,11 @@ class Artifacts:
         made = self._parts.own() / "made" / f"films-{secrets.token_hex(4)}"
         made.mkdir(parents=True)
         shown = self.read_best().checkpoint
-        key = f"{names.BEST_FOLDER}/{names.FILMS_RECORD}"
-        self._parts.remove_record(key)
+        self._parts.remove_record(f"{names.BEST_FOLDER}/{names.FILMS_RECORD}")
         paths = {film: made / name for film, name in names.FILMS.items()}
         yield paths
         self._upload(names.BEST_FOLDER, made, [path for path in paths.values() if path.is_file()])
-        self._parts.write_record(key, dump_sealed(FilmsRecord(checkpoint=shown)))
+        self._write_record(names.FILMS_RECORD, FilmsRecord(checkpoint=shown))
 
     def current_report(self) -> Path | None:
         """Return the report's page if it was written after the sweep's record, the winner and the films; else None."""

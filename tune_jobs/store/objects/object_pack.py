@@ -22,6 +22,8 @@ from tune_jobs.store.trial_contract import Ownership
 
 _READ_EVERY_S = 0.25
 """Seconds between two looks at an assignment: a pack asks before every step, which must not wait for the store."""
+_READ_FOR_S = 5.0
+"""Seconds for which it is looked at after it was asked for: a pack may be told by its driver from then on."""
 
 
 class ObjectPack:
@@ -38,9 +40,13 @@ class ObjectPack:
     def __init__(self, parts: Parts, pack_id: str) -> None:
         self.pack_id = check_pack_id(pack_id)
         self._parts = parts
-        self._known: Assignment | CheckpointError | StorageError | None = None
+        self._known: Assignment | CheckpointError | StorageError = Assignment()
+        self._is_read = False
         self._uploads: LogUploads | None = None
         self._written: dict[str, Any] | None = None
+        self._looking: threading.Thread | None = None
+        self.asked_at = 0.0
+        """When the assignment was read last, by the monotonic clock."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ObjectPack, (self._parts, self.pack_id)
@@ -53,25 +59,34 @@ class ObjectPack:
         """Become the process that runs this pack; see `Pack.take`."""
         return ObjectOwner.take(self._parts.bucket, f"{self._prefix}.owner.json", under, is_run=False)
 
-    def write(self, assignment: Assignment) -> None:
+    def write(self, assignment: Assignment, *, soon: bool = False) -> None:
         """Replace the assignment."""
         data = {"trial_ids": list(assignment.trial_ids), "num_failures": dict(assignment.num_failures)}
         if data == self._written:
             # A driver writes it after every report; if it is not the pack's any more, it hears so elsewhere.
             return
-        # The members' records are read when they are begun.
-        self._parts.settle()
-        self._parts.write_record(f"{self._prefix}.json", json.dumps(data) + "\n")
+        if not soon:
+            # The members' records are read when they are begun.
+            self._parts.settle()
+        self._parts.write_record(f"{self._prefix}.json", json.dumps(data) + "\n", soon=soon)
         self._written = data
 
     def read(self) -> Assignment:
         """Read the assignment, as it was a moment ago; see `Pack.read`."""
-        if self._known is None:
-            self._known = self._now()
-            threading.Thread(target=_keep_reading, args=(weakref.ref(self),), name="assignment", daemon=True).start()
-        if not isinstance(self._known, Assignment):
-            raise self._known
-        return self._known
+        self.asked_at = time.monotonic()
+        if self._looking is None or not self._looking.is_alive():
+            if self._is_read:
+                self.look()
+            else:
+                self._known, self._is_read = self._now(), True
+            self._looking = threading.Thread(
+                target=_keep_reading, args=(weakref.ref(self),), name="assignment", daemon=True
+            )
+            self._looking.start()
+        known = self._known
+        if isinstance(known, Exception):
+            raise known
+        return known
 
     def look(self) -> None:
         """Read it anew, for `read`."""
@@ -120,11 +135,11 @@ class ObjectPack:
 
 
 def _keep_reading(pack: weakref.ref[ObjectPack]) -> None:
-    """Look at a pack's assignment as long as somebody has the pack."""
+    """Look at a pack's assignment as long as somebody asks for it."""
     while True:
         time.sleep(_READ_EVERY_S)
         present = pack()
-        if present is None:
+        if present is None or time.monotonic() - present.asked_at > _READ_FOR_S:
             return
         present.look()
         del present

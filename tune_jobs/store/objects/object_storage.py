@@ -49,7 +49,10 @@ class ObjectStorage:
     def sweeps(self) -> list[ObjectSweep]:
         """Return the sweeps that exist, by name."""
         try:
-            folders, _ = Bucket(self._url).children()
+            bucket = Bucket(self._url)
+            folders, _ = bucket.children()
+            if not folders:
+                bucket.is_store()
             # Hidden ones are rehearsals.
             found = [self.sweep(name) for name in folders if not name.startswith(".")]
             exist = side_by_side(ObjectSweep.exists, found)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 import hashlib
+import itertools
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -19,7 +21,7 @@ from tune_jobs.store import names
 from tune_jobs.store.objects.asked import Asked
 from tune_jobs.store.objects.at_once import AT_ONCE, side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError
-from tune_jobs.store.objects.held import holding
+from tune_jobs.store.objects.held import held, holding
 from tune_jobs.store.objects.lease import LEASE_S, is_leased, leased
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.object_artifacts import Artifacts
@@ -28,6 +30,7 @@ from tune_jobs.store.objects.object_trial import ObjectTrial
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import RUN, ObjectOwner
 from tune_jobs.store.objects.parts import RECORDS, Parts
+from tune_jobs.store.objects.probe import FOLDER as PROBE_FOLDER
 from tune_jobs.store.objects.probe import ObjectProbe, probing
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.places import is_trial_id
@@ -48,6 +51,8 @@ class ObjectSweep(Artifacts):
         super().__init__(Parts(url))
         self._stop = Asked(lambda: self._bucket.get(_STOP) is not None)
         self._driver_uploads: LogUploads | None = None
+        self._is_made = False
+        """Whether this process has made the sweep."""
         self._has_results = False
         """Whether results belong to what was fetched for those who read much."""
         # One for all calls, so that what a trial has fetched is fetched once.
@@ -71,21 +76,32 @@ class ObjectSweep(Artifacts):
 
     def exists(self) -> bool:
         """Whether the sweep exists."""
-        return bool(self.record_stamp())
+        ours = held(self.url)
+        return (ours is not None and ours.found(names.SWEEP_RECORD) is not None) or bool(self.record_stamp())
 
     def create(self) -> None:
         """Take the name; of several processes that want it at once, one gets it."""
         try:
-            if self.is_taken():
-                raise name_taken(self.url)
-            self._bucket.put(_CLAIM, secrets.token_bytes(8), is_new=True)
+            asked: list[Callable[[], bool]] = [self._claim, functools.partial(self._has, apart_from=_CLAIM)]
+            _, has_others = side_by_side(_answer, asked)
         except ConflictError as error:
             raise name_taken(self.url) from error
+        if has_others:
+            self._bucket.delete([_CLAIM])
+            raise name_taken(self.url)
+        self._is_made = True
+
+    def _claim(self) -> bool:
+        self._bucket.put(_CLAIM, secrets.token_bytes(8), is_new=True)
+        return True
+
+    def _has(self, apart_from: str = "") -> bool:
+        folders, objects = self._bucket.children()
+        return bool(folders or [item for item in objects if item.key != apart_from])
 
     def is_taken(self) -> bool:
         """Whether there is anything of a sweep here."""
-        folders, objects = self._bucket.children()
-        return bool(folders or objects)
+        return side_by_side(_answer, [self._has, self._bucket.is_store])[0]
 
     def discard(self) -> None:
         """Undo `create`, including everything that was written since."""
@@ -198,8 +214,12 @@ class ObjectSweep(Artifacts):
         """Be the sweep's driver in the block; the lock is free half a minute after the process has ended."""
         watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
         told = f"Sweep {self.name} is being run by another process."
-        with leased(self._bucket, _LOCK, told, watch) as beating, holding(self.url, beating.is_sure):
-            if is_leased(self._bucket, _DRIVER_LOCK, watch_s=LEASE_S):
+        with (
+            leased(self._bucket, _LOCK, told, watch, is_first=self._is_made) as beating,
+            holding(self.url, beating.is_sure, is_new=beating.is_first),
+        ):
+            # It is taken for one that holds the other: nobody has.
+            if not beating.is_first and is_leased(self._bucket, _DRIVER_LOCK, watch_s=LEASE_S):
                 raise CannotRunError(*self._still_driven)
             self._parts.is_locked = beating.is_ours
             try:
@@ -241,8 +261,14 @@ class ObjectSweep(Artifacts):
     def remove_leftovers(self) -> None:
         """Remove objects that killed processes left behind; the caller has to hold the lock."""
         ended = [trial.trial_id for trial in self.read_trials() if trial.status in FINISHED]
-        side_by_side(lambda trial_id: self.trial(trial_id).remove_leftovers(), ended)
-        self._bucket.delete([item.key for item in self._bucket.listed("probe/")])
+        # One listing of all costs fewer requests than two of each.
+        prefixes = [f"{PROBE_FOLDER}/", *([f"{names.TRIALS_FOLDER}/"] if ended else [])]
+        answers, *found = side_by_side(self._bucket.listed, prefixes)
+        by_trial: dict[str, list[str]] = {}
+        for item in itertools.chain.from_iterable(found):
+            by_trial.setdefault(item.key.split("/", 2)[1], []).append(item.key)
+        gone = side_by_side(lambda name: self.trial(name).leftovers(by_trial.get(name, [])), ended)
+        self._bucket.delete([*(item.key for item in answers), *itertools.chain.from_iterable(gone)])
 
     def probing(self) -> AbstractContextManager[ObjectProbe]:
         """Find out in the block whether other machines reach the same sweep."""
@@ -280,6 +306,10 @@ class ObjectSweep(Artifacts):
     def clear_tune_folder(self) -> None:
         """Delete Ray Tune's state of an earlier run."""
         shutil.rmtree(self.tune_folder, ignore_errors=True)
+
+
+def _answer(ask: Callable[[], bool]) -> bool:
+    return ask()
 
 
 def name_taken(url: ObjectUrl) -> SpecError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import secrets
@@ -14,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
-from policies.errors import CheckpointError, NotFoundError, TuneJobsError
+from policies.errors import MALFORMED, CheckpointError, NotFoundError, TuneJobsError
 from policies.files import open_to_append
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
 from tune_jobs.store.manifests import described_files, files_of, read_manifest, verify_checkpoint
+from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Listed
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.outbox import outbox
@@ -30,6 +32,9 @@ from tune_jobs.store.results_tail import NewPoints, ResultsMark
 from tune_jobs.store.trial_contract import Ownership
 
 _LOG = logging.getLogger(__name__)
+
+_RUNNING_AFTER_S = 2.0
+"""Seconds in which a newer record of a trial that runs may come, which is uploaded instead."""
 
 
 class ObjectTrial:
@@ -74,9 +79,8 @@ class ObjectTrial:
 
     def settle(self) -> None:
         """Wait until everything that was written here is in the store; see `Trial.settle`."""
-        if self._log_uploads is not None:
-            self._log_uploads.now()
-        self._state.settle()
+        wanted = [self._state.settle, *([] if self._log_uploads is None else [self._log_uploads.now])]
+        side_by_side(lambda wait: wait(), wanted)
 
     # -- its record
 
@@ -93,13 +97,16 @@ class ObjectTrial:
 
     def write_record(self, record: TrialRecord, *, soon: bool = False) -> None:
         """Replace the record; see `Trial.write_record`."""
-        self._parts.write_record(self._record_key, record, soon=soon)
+        after_s = _RUNNING_AFTER_S if record.status == "running" else 0.0
+        self._parts.write_record(self._record_key, record, soon=soon, after_s=after_s)
 
     def fetch(self, listed: Listed, *, results: bool) -> None:
         """Fetch the record, or all, for what is read in a moment; whatever fails is raised there."""
         with contextlib.suppress(TuneJobsError):
-            self._parts.fetch_record(self._record_key, listed)
+            record = self._parts.fetch_record(self._record_key, listed)
             if results:
+                with contextlib.suppress(*MALFORMED):
+                    self._state.is_over = record is not None and json.loads(record)["status"] == "completed"
                 self._state.local()
 
     def fetch_checkpoint(self, iteration: int) -> None:
@@ -299,6 +306,10 @@ class ObjectTrial:
     def remove_leftovers(self) -> None:
         """Remove objects that no head names any more."""
         self._state.remove_leftovers()
+
+    def leftovers(self, present: Sequence[str]) -> list[str]:
+        """Return those of the trial's objects, which were listed before this call, that no head names any more."""
+        return self._state.leftovers(present) if present else []
 
     # -- its curves, log and tally
 

@@ -109,7 +109,8 @@ class Outbox:
         errors = [upload.error for key in left if (upload := self._waiting.get(key)) is not None and upload.error]
         why = f" {errors[0].message}" if errors else ""
         hint = errors[0].hint if errors else "Check that the storage is reached from this machine."
-        return CannotRunError(f"{len(left)} uploads have not ended within {timeout_s:.0f} s.{why}", hint)
+        passes = any(isinstance(error, StorageError) and error.passes for error in errors)
+        return StorageError(f"{len(left)} uploads have not ended within {timeout_s:.0f} s.{why}", hint, passes=passes)
 
     def forget(self, keys: Collection[Hashable]) -> None:
         """Leave out uploads that have not begun, and forget what failed; wait for those that have."""
@@ -125,7 +126,7 @@ class Outbox:
         for key in keys:
             if key in self._failed:
                 error = self._failed[key]
-                raise type(error)(error.message, error.hint) from error
+                raise error.again() from error
 
     def _is_under_way(self, key: Hashable) -> bool:
         return key in self._waiting or key in self._running

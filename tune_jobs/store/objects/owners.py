@@ -16,12 +16,13 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Self
 
 from policies.errors import CannotRunError
-from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError
+from tune_jobs.store.objects.at_once import side_by_side
+from tune_jobs.store.objects.bucket import Bucket, ConflictError, Found, StorageError
 from tune_jobs.store.objects.held import held
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.trial_contract import Ownership
@@ -113,22 +114,32 @@ class ObjectOwner:
             OwnershipLostError: Another process has taken `under`, or has taken this in a later run.
             CannotRunError: It cannot be written.
         """
-        for _ in range(_ATTEMPTS):
-            found = bucket.get(key)
-            before = Epoch.of(_token_in(found.data) if found is not None else "")
+        # Who holds the sweep's lock knows the run's owner: it has taken the run itself, or nobody ever has.
+        ours = held(bucket.url) if key == RUN else None
+        for attempt in range(_ATTEMPTS):
+            found = ours.found(key) if ours is not None and not attempt else None
+            asked: list[Callable[[], Found | None]] = []
+            if found is None and (ours is None or not ours.is_absent(key)):
+                asked.append(lambda: bucket.get(key))
             if under is not None:
-                under.check()
+                asked.append(under.check)
+            # Who has taken `under` since has replaced this by then, or is refused itself.
+            answers = side_by_side(lambda ask: ask(), asked)
+            found = found or (answers[0] if answers else None)
+            before = Epoch.of(_token_in(found.data) if found is not None else "")
             if is_run:
                 epoch = Epoch(before.run + 1)
             else:
                 epoch = before.next(under.token if under is not None else None, bucket.name_of(key))
             token = epoch.token()
             data = json.dumps({"owner": token}).encode()
+            over = None if found is None else found.tag
             try:
-                if found is None:
-                    bucket.put(key, data, is_new=True)
+                if ours is None:
+                    bucket.put(key, data, over=over, is_new=over is None)
                 else:
-                    bucket.put(key, data, over=found.tag)
+                    with ours.writing(key, data) as write:
+                        write.tag = bucket.put(key, data, over=over, is_new=over is None)
             except ConflictError:
                 continue
             return cls(bucket, key, token)

@@ -6,7 +6,7 @@ import contextlib
 import re
 import secrets
 import threading
-from collections.abc import Callable, Collection, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -91,7 +91,7 @@ class Parts:
         except TuneJobsError as error:
             local = re.compile(rf"{re.escape(str(self.own()))}(/[0-9a-f]{{8}}(?=/))?")
             message, hint = (local.sub(lambda _: self.bucket.url.short, text) for text in (error.message, error.hint))
-            raise type(error)(message, hint) from error.__cause__
+            raise error.again(message, hint) from error.__cause__
 
     # -- records: small objects that are replaced whole
 
@@ -156,6 +156,8 @@ class Parts:
         ours = held(self.bucket.url)
         found, mark = (None, None) if ours is None else (ours.found(key), ours.mark())
         if found is None:
+            if ours is not None and ours.is_absent(key):
+                return None
             found = self.bucket.get(key)
             if ours is not None and found is not None:
                 ours.note(key, found, mark)
@@ -170,21 +172,31 @@ class Parts:
         as_of = self.snapshot
         if as_of is not None and self._listed is not None and self._listed[0] is as_of:
             return self._listed[1]
-        prefix, ours = f"{RECORDS}/", held(self.bucket.url)
+        found = self.listed(f"{RECORDS}/")
+        self._listed = as_of, found
+        return found
+
+    def listed(self, prefix: str) -> dict[str, Listed]:
+        """Return the objects, by their keys, below one of the prefixes that the sweep's driver alone writes below.
+
+        Raises:
+            StorageError: They cannot be listed.
+        """
+        ours = held(self.bucket.url)
         known, mark = (None, None) if ours is None else (ours.listed(prefix), ours.mark())
         found = {item.key: item for item in self.bucket.listed(prefix)} if known is None else known
         if ours is not None and known is None:
             ours.note_listed(prefix, found, mark)
-        self._listed = as_of, found
         return found
 
-    def write_record(self, key: str, record: BaseModel | str, *, soon: bool = False) -> None:
+    def write_record(self, key: str, record: BaseModel | str, *, soon: bool = False, after_s: float = 0.0) -> None:
         """Replace a record, atomically.
 
         Args:
             key: Its object.
             record: The record, or its text.
             soon: Whether it may be in the store a little later; `settle` waits for it.
+            after_s: Seconds in which a newer one may come, which is written instead; for `soon`.
 
         Raises:
             OwnershipLostError: Another process runs the sweep by now; the record is the other's.
@@ -195,7 +207,7 @@ class Parts:
         self._listed = None
         if soon:
             self.jobs.add(self._job(key))
-            outbox().add(self._job(key), lambda: self._upload(key))
+            outbox().add(self._job(key), lambda: self._upload(key), after_s=after_s)
             return
         outbox().forget([self._job(key)])
         try:
@@ -210,11 +222,18 @@ class Parts:
         Raises:
             StorageError: It cannot be removed.
         """
+        ours = held(self.bucket.url)
+        if ours is not None and ours.is_absent(key):
+            return
         self.bucket.delete([key])
         self._tags.pop(key, None)
         self._known.pop(key, None)
-        if (ours := held(self.bucket.url)) is not None:
+        if ours is not None:
             ours.forget(key)
+
+    def tag_of(self, key: str) -> Tag:
+        """Return what the content of a record is known by that this process has written last."""
+        return self._known[key].tag
 
     def settle(self) -> None:
         """Wait until all records are in the store.
@@ -235,8 +254,9 @@ class Parts:
         for _ in range(_ATTEMPTS):
             if key not in self._tags:
                 # Whoever is the owner after this look has written nothing yet, or what is written over is not this.
-                found = self._ours(key)
-                if found is None:
+                ours = held(self.bucket.url)
+                found = None if ours is None else ours.found(key)
+                if found is None and (ours is None or not ours.is_absent(key)):
                     found = self.bucket.get(key)
                     self._check_ours()
                 self._tags[key] = found.tag if found is not None else None
@@ -258,19 +278,26 @@ class Parts:
         if self._pending.get(key) is data:
             self._pending.pop(key, None)
 
-    def _ours(self, key: str) -> Found | None:
-        ours = held(self.bucket.url)
-        return None if ours is None else ours.found(key)
-
     def _put(self, key: str, data: bytes, over: Tag | None) -> Tag:
-        ours, tag = held(self.bucket.url), None
-        write = None if ours is None else ours.begin(key)
-        try:
-            tag = self.bucket.put(key, data, over=over, is_new=over is None)
-        finally:
-            if ours is not None and write is not None:
-                ours.end(write, data, tag)
+        ours = held(self.bucket.url)
+        if ours is None:
+            return self.bucket.put(key, data, over=over, is_new=over is None)
+        with ours.writing(key, data) as write:
+            write.tag = tag = self.bucket.put(key, data, over=over, is_new=over is None)
         return tag
+
+    def put_files(self, files: Mapping[str, Path]) -> dict[str, Tag]:
+        """Write files that the sweep's driver alone writes, side by side; see `Bucket.put_all`."""
+        ours = held(self.bucket.url)
+        if ours is None:
+            return self.bucket.put_all(files)
+        writes, tags = {key: ours.begin(key) for key in files}, dict[str, Tag]()
+        try:
+            tags = self.bucket.put_all(files)
+        finally:
+            for key, write in writes.items():
+                ours.end(write, None, tags.get(key), files[key].stat().st_size)
+        return tags
 
     def _check_ours(self) -> None:
         """Find out whether this process may write over what another one has written.
@@ -278,6 +305,10 @@ class Parts:
         Raises:
             OwnershipLostError: It may not.
         """
+        ours = held(self.bucket.url)
+        if ours is not None and ours.is_known:
+            # Nobody else takes the run as long as this process has the lock.
+            return
         if self.run is not None:
             self.run.check()
         elif self.is_locked is not None and not self.is_locked():

@@ -10,7 +10,9 @@ from tune_jobs.store.objects.bucket import Bucket, ConflictError, StorageError, 
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.probe import FailedOperationError, Operation
 
-_FOLDER, _QUESTION = "probe", "question"
+FOLDER = "probe"
+"""What the keys of a question and its answers begin with."""
+_QUESTION = "question"
 
 
 class ObjectProbe:
@@ -32,7 +34,7 @@ class ObjectProbe:
     def is_same(self, question: str, machine: str) -> bool:
         """Whether a machine has read this question, and its answer can be seen here."""
         try:
-            found = self._bucket.get(f"{_FOLDER}/{machine}")
+            found = self._bucket.get(f"{FOLDER}/{machine}")
         except StorageError:
             return False
         return found is not None and question == self._token == found.data.decode(errors="replace")
@@ -46,12 +48,12 @@ def probing(bucket: Bucket) -> Iterator[ObjectProbe]:
         CannotRunError: The store cannot be written.
     """
     token = secrets.token_hex(8)
-    bucket.put(f"{_FOLDER}/{_QUESTION}", token.encode())
+    bucket.put(f"{FOLDER}/{_QUESTION}", token.encode())
     try:
         yield ObjectProbe(bucket, token)
     finally:
         with contextlib.suppress(StorageError):
-            bucket.delete([item.key for item in bucket.listed(f"{_FOLDER}/")])
+            bucket.delete([item.key for item in bucket.listed(f"{FOLDER}/")])
 
 
 def answer(place: str, machine: str) -> str:
@@ -66,17 +68,17 @@ def answer(place: str, machine: str) -> str:
         FailedOperationError: An operation fails here, or does not do what it says.
     """
     bucket = Bucket(ObjectUrl.parse(place))
-    mine = f"{_FOLDER}/{machine}.try"
+    mine = f"{FOLDER}/{machine}.try"
     with _trying("read"):
-        found = bucket.get(f"{_FOLDER}/{_QUESTION}")
+        found = bucket.get(f"{FOLDER}/{_QUESTION}")
     if found is None:
-        raise FileNotFoundError(bucket.name_of(_FOLDER))
+        raise FileNotFoundError(bucket.name_of(FOLDER))
     with _trying("write"):
         tag = bucket.put(mine, b"1")
-        bucket.put(f"{_FOLDER}/{machine}", found.data)
+        bucket.put(f"{FOLDER}/{machine}", found.data)
     with _trying("list"):
-        listed = {item.key for item in bucket.listed(f"{_FOLDER}/")}
-        if not {mine, f"{_FOLDER}/{machine}"} <= listed:
+        listed = {item.key for item in bucket.listed(f"{FOLDER}/")}
+        if not {mine, f"{FOLDER}/{machine}"} <= listed:
             raise FailedOperationError("list", "objects that are there are not listed")
     with _trying("lock"):
         bucket.put(mine, b"2", over=tag)

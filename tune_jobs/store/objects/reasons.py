@@ -14,6 +14,11 @@ _CODE, _MESSAGE = re.compile(r"<Code>([^<]{1,80})</Code>"), re.compile(r"<Messag
 _STATUS = re.compile(r"status code: (\d{3})[^:\n]{0,40}")
 MISSING_BUCKET = ("NoSuchBucket", "ContainerNotFound", "The specified bucket does not exist")
 """What S3, Azure and Google say of a bucket that does not exist."""
+NO_STORE = (
+    "what answers there is no object store",
+    "Correct the endpoint in the storage's address: its host and its port.",
+)
+"""Why nothing can be done with what is no object store, and what to do."""
 _PASSING_CODES = ("RequestTimeout", "OperationAborted", "ConditionalRequestConflict", "SlowDown")
 _EXPIRED = ("ExpiredToken", "TokenRefreshRequired", "InvalidToken", "ExpiredTokenException", "RequestExpired")
 _REGION = ("PermanentRedirect", "AuthorizationHeaderMalformed", "IllegalLocationConstraintException")
@@ -66,8 +71,7 @@ def reason_of(error: Exception, place: str) -> Reason:
         why, hint = ", ".join(part for part in parts if part), _hint(number, code, text, place) or reach
     elif "Header missing from response" in text:
         # A web server's page, say: an object has a tag and a length.
-        why, passes = "what answers there is no object store", False
-        hint = "Correct the endpoint in the storage's address: its host and its port."
+        why, passes, hint = NO_STORE[0], False, NO_STORE[1]
     elif "redirect without LOCATION" in text:
         why, passes, hint = "the store sends to another place (status code: 301)", False, _hint(301, "", text, place)
     elif "invalid path" in text:

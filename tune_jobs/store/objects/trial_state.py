@@ -7,7 +7,6 @@ no head names any more is removed.
 
 from __future__ import annotations
 
-import itertools
 import secrets
 import shutil
 import threading
@@ -21,7 +20,8 @@ from tune_jobs.store import names
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, StorageError, Tag
 from tune_jobs.store.objects.checkpoint_objects import CheckpointObjects
-from tune_jobs.store.objects.head import Chunk, Head, StoredCheckpoint, read_head
+from tune_jobs.store.objects.head import NAMED, Chunk, Head, StoredCheckpoint, free, read_head, unnamed
+from tune_jobs.store.objects.held import Held, held
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
 from tune_jobs.store.objects.parts import Parts
@@ -31,6 +31,8 @@ from tune_jobs.store.trial_store import TrialStore
 
 _RESULTS_AFTER_S = 3.0
 """Seconds in which results are gathered, if no checkpoint is uploaded sooner."""
+_CHECKPOINTS_AFTER_S = 2.0
+"""Seconds in which another checkpoint may come, with which the first may be needed no more."""
 _LOOK_EVERY_S = 1.0
 _ATTEMPTS = 20
 
@@ -66,6 +68,9 @@ class TrialState:
         self._lock = threading.RLock()
         # What the head and the local results are as of, while much is read.
         self._head_of: object | None = None
+        self.is_over = False
+        """Whether the trial was completed when the head was asked for, so that nobody writes it any more."""
+        self._last_for: Held | None = None
         self._results_of: object | None = None
 
     # -- who writes
@@ -196,10 +201,14 @@ class TrialState:
         return self.folder() / "fetched" / stored.key / f"{iteration:06d}"
 
     def _look_head(self) -> Head:
-        as_of = self._parts.snapshot
-        if as_of is None or as_of is not self._head_of:
-            self._head, self._tag = read_head(self._bucket, self._head_key)
+        as_of, ours = self._parts.snapshot, held(self._bucket.url)
+        is_known = ours is not None and ours.is_known
+        if is_known and ours is self._last_for:
+            # Only who has the sweep's lock could let somebody write it again.
             self._head_of = as_of
+        elif as_of is None or as_of is not self._head_of:
+            self._head, self._tag = read_head(self._bucket, self._head_key)
+            self._head_of, self._last_for = as_of, ours if is_known and self.is_over else None
         return self._head
 
     def _look(self) -> None:
@@ -259,7 +268,7 @@ class TrialState:
         with self._lock:
             self._checkpoints[iteration] = None
             self._keys[iteration] = secrets.token_hex(8)
-        self.changed(after_s=0.0)
+        self.changed(after_s=_CHECKPOINTS_AFTER_S)
 
     def remove_checkpoint(self, iteration: int) -> None:
         """Leave a checkpoint out of the state."""
@@ -275,7 +284,7 @@ class TrialState:
         self.settle()
         with self._lock:
             stored = self._checkpoints.pop(iteration, None)
-            name = self._free(f"{iteration:06d}")
+            name = free(f"{iteration:06d}", self._damaged)
             if stored is not None:
                 self._damaged[name] = stored.key
         self.changed(after_s=0.0)
@@ -285,16 +294,12 @@ class TrialState:
         """Take all results out of the state, and return their name among what is damaged."""
         self.settle()
         with self._lock:
-            name = self._free(names.RESULTS)
+            name = free(names.RESULTS, self._damaged)
             self._damaged[name] = " ".join(chunk.key for chunk in self._results)
             self._results, self._has_results = (), False
             (self.folder() / names.RESULTS).unlink(missing_ok=True)
         self.changed(after_s=0.0)
         return name
-
-    def _free(self, name: str) -> str:
-        numbered = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-        return next(free for free in numbered if free not in self._damaged)
 
     def _upload(self) -> None:
         self.check()
@@ -374,27 +379,21 @@ class TrialState:
 
     def _remove_unnamed(self, before: Head, now: Head) -> None:
         """Remove the objects that one head named, and no head names any more."""
-        named = {chunk.key for chunk in now.results} | {key for text in now.damaged.values() for key in text.split()}
-        unnamed = {chunk.key for chunk in before.results} - named
-        gone = self._chunks.forget(unnamed)
-        kept = {checkpoint.key for checkpoint in now.checkpoints.values()} | named
+        named = now.named()
+        gone = self._chunks.forget({chunk.key for chunk in before.results} - named)
         for iteration, checkpoint in before.checkpoints.items():
-            if checkpoint.key not in kept:
+            if checkpoint.key not in named:
                 gone += self._stored.keys_of(iteration, checkpoint)
         # Nobody waits for it: what is not removed is a leftover.
         self._parts.remove_later(gone)
 
     def remove_leftovers(self) -> None:
         """Remove objects that no head names: those of a process that ended before it wrote its head."""
-        if self._is_first:
-            return
+        if not self._is_first:
+            present = side_by_side(self._bucket.listed, [f"{self._prefix}/{folder}/" for folder in NAMED])
+            self._bucket.delete(self.leftovers([item.key for items in present for item in items]))
+
+    def leftovers(self, present: Sequence[str]) -> list[str]:
+        """Return those of the trial's objects, which were listed before this call, that no head names."""
         head = self._head if self._is_writing else self._look_head()
-        named = {chunk.key for chunk in head.results} | {item.key for item in head.checkpoints.values()}
-        named |= {key for text in head.damaged.values() for key in text.split()} | set(self._keys.values())
-        gone = []
-        for folder in ("results", names.CHECKPOINTS_FOLDER):
-            for item in self._bucket.listed(f"{self._prefix}/{folder}/"):
-                part = item.key.removeprefix(f"{self._prefix}/{folder}/").partition("/")[0]
-                if part.removesuffix(".jsonl").rpartition("-")[2] not in named:
-                    gone.append(item.key)
-        self._bucket.delete(gone)
+        return unnamed(self._prefix, present, head.named() | set(self._keys.values()))
