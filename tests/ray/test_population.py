@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 
@@ -66,9 +66,10 @@ class Future:
 
 
 class Controller:
-    """What is asked of Tune's controller."""
+    """What is asked of Tune's controller. No process takes any time to start."""
 
     search_alg = None
+    _trial_to_actor = MappingProxyType[Any, Any]({})
 
     def __init__(self, trials: Sequence[Trial], rng: np.random.Generator) -> None:
         self.trials, self.rng = trials, rng

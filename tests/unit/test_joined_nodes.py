@@ -1,5 +1,6 @@
 """A process on a node that joined while a sweep ran: what it says if the node can't take part; Ray is faked."""
 
+import json
 import pickle
 import types
 from pathlib import Path
@@ -31,11 +32,18 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SweepStore:
 
 
 def config(store: SweepStore, **changed: str) -> dict[str, Any]:
-    return {"sweep_place": store.place, "trial_id": "t0000", "pack_id": "p00", "versions": {**versions(), **changed}}
+    told = json.dumps({**versions(), **changed})
+    return {"sweep_place": store.place, "trial_id": "t0000", "pack_id": "p00", "versions": told}
 
 
 def test_a_node_like_those_of_the_start_is_used(store: SweepStore) -> None:
     assert refusal(config(store)) is None
+
+
+def test_where_no_node_can_join_nothing_is_looked_at(store: SweepStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joined_nodes, "open_sweep", None)
+    monkeypatch.setattr(joined_nodes, "versions", None)
+    assert refusal({"sweep_place": store.place, "trial_id": "t0000"}) is None
 
 
 def test_versions_are_compared_with_the_drivers(store: SweepStore) -> None:

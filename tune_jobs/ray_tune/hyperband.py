@@ -23,7 +23,7 @@ from ray.tune.experiment import Trial
 from typing_extensions import override
 
 from tune_jobs.ray_tune.scheduling import Decision, Others, Standing, is_unscored
-from tune_jobs.ray_tune.tune_scheduler import TuneScheduler, name_of
+from tune_jobs.ray_tune.tune_scheduler import TuneScheduler, is_starting, name_of
 
 if TYPE_CHECKING:
     from ray.tune.execution.tune_controller import TuneController
@@ -174,7 +174,7 @@ def _score(standing: Standing | None) -> float:
 
 
 class HyperBandScheduler(TuneScheduler):
-    """Connects `HyperBand` to Ray Tune; only public methods of Tune's controller are used."""
+    """Connects `HyperBand` to Ray Tune; but for `is_starting`, only public methods of Tune's controller are used."""
 
     def __init__(self, scheduler: HyperBand) -> None:
         super().__init__(scheduler)
@@ -205,7 +205,8 @@ class HyperBandScheduler(TuneScheduler):
             name_of(trial): trial
             for trial in tune_controller.get_trials()
             # A trial whose process died while it saved is pending, although it waits.
-            if trial.status == Trial.PENDING or (trial.status == Trial.PAUSED and not self._band.waits(name_of(trial)))
+            if (trial.status == Trial.PENDING and not is_starting(tune_controller, trial))
+            or (trial.status == Trial.PAUSED and not self._band.waits(name_of(trial)))
         }
         return next((idle[name] for name in self._band.in_turn() if name in idle), None)
 

@@ -7,6 +7,7 @@ it has room, so the process itself looks, before it trains anything.
 from __future__ import annotations
 
 import importlib.util
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,9 +27,11 @@ def refusal(config: Mapping[str, Any]) -> NodeRefusedError | None:
     It is returned, as Tune tells nobody the kind of an error that is raised while a process is set up.
 
     Args:
-        config: The settings that the process was started with: `sweep_place`, and from the driver `versions`, its own;
-            without these only the storage is looked at.
+        config: The settings that the process was started with: `sweep_place`, and from the driver of a sweep on a
+            cluster `versions`, its own as JSON. Without these no node can have joined, and nothing is looked at.
     """
+    if "versions" not in config:
+        return None
     place = str(config["sweep_place"])
     told: dict[str, Any] = {"versions": versions(), "modules": {}, "question": ""}
     try:
@@ -37,7 +40,7 @@ def refusal(config: Mapping[str, Any]) -> NodeRefusedError | None:
         told["unseen"] = True
     except (TuneJobsError, OSError) as error:
         told["failed"] = ("read", str(error).partition("\n")[0])
-    problems = problems_of(told, config.get("versions") or versions(), place, lambda _: True, here="the sweep's driver")
+    problems = problems_of(told, json.loads(config["versions"]), place, lambda _: True, here="the sweep's driver")
     if given := ray.get_gpu_ids():
         problems += problems_of_gpus({**told, "uses_gpus": uses_gpus()}, len(given))
     if not problems:

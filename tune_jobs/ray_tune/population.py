@@ -24,7 +24,7 @@ from policies import random_streams
 from policies.errors import CheckpointError, SpecError
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
-from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, name_of, standing_of
+from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, is_starting, name_of, standing_of
 from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
@@ -172,7 +172,12 @@ class PopulationScheduler(TuneScheduler):
 
     @override
     def choose_trial_to_run(self, tune_controller: TuneController) -> Trial | None:
-        waiting = [trial for trial in tune_controller.get_trials() if trial.status in (Trial.PENDING, Trial.PAUSED)]
+        waiting = [
+            trial
+            for trial in tune_controller.get_trials()
+            if trial.status == Trial.PAUSED
+            or (trial.status == Trial.PENDING and not is_starting(tune_controller, trial))
+        ]
         return min(waiting, key=lambda trial: self._population.compared_at(name_of(trial)), default=None)
 
     def _take_over(self, trial: Trial, decision: CopyFrom, result: dict[str, Any], controller: TuneController) -> None:

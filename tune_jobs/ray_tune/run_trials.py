@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 from ray import tune
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
-from ray.tune.search import BasicVariantGenerator, SearchAlgorithm, Searcher
+from ray.tune.search import SearchAlgorithm, Searcher
 
 from policies.errors import CannotRunError
 from policies.parents import this_process
@@ -26,7 +27,7 @@ from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import going_on
-from tune_jobs.ray_tune.lean import without_state_of_trials
+from tune_jobs.ray_tune.lean import lean_run
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
 from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -35,7 +36,7 @@ from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
 from tune_jobs.ray_tune.reporter import reporter
 from tune_jobs.ray_tune.run_waits import RunWaits
 from tune_jobs.ray_tune.scheduling import EveryoneGoesOn
-from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher
+from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher, TrialsInOrder
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.ray_tune.tune_events import PackEvents, TrialEvents, pack_id_of, trial_id_of
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
@@ -133,11 +134,12 @@ class _Run:
         self._job = job
         self._watch = watch
         self._store = self.store = store
-        # The settings of every process: its sweep, its run, the driver with which it ends, and what its node must have.
-        self._config = {
-            "sweep_place": store.place, "run": owner.token, "driver": this_process(), "versions": versions(),
-        }  # fmt: skip
         self._record = store.read_record()
+        # The settings of every process: its sweep, its run, the driver with which it ends, and what its node must have.
+        self._config: dict[str, Any] = {"sweep_place": store.place, "run": owner.token, "driver": this_process()}
+        if self._record.address is not None:
+            # As one text: Tune copies the settings of each trial some times, part by part.
+            self._config["versions"] = json.dumps(versions())
         self._spec = stored_spec(self._record)
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
         self.waits = RunWaits(store, self.keeper)
@@ -206,7 +208,7 @@ class _Run:
             # The driver decides which of a dead pack's trials are retried, and the run ends when none is left.
             run_config=self._run_config(folder, events, -1, lambda: driver.is_finished),
         )
-        with losses.not_counted(), without_state_of_trials():
+        with losses.not_counted(), lean_run():
             tuner.fit()
 
     def _single_trials(self, trial_ids: Sequence[str], folder: str) -> None:
@@ -222,9 +224,7 @@ class _Run:
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)
         else:
-            # As a grid, Tune would copy the ids of all trials for each of them.
-            param_space["trial_id"] = None
-            searcher = BasicVariantGenerator([{"trial_id": name} for name in trial_ids], max_concurrent=at_once or 0)
+            searcher = TrialsInOrder(trial_ids, max_concurrent=at_once or 0)
         tuner = tune.Tuner(
             tune.with_resources(TrialTrainable, resources),
             param_space=param_space,
@@ -240,7 +240,7 @@ class _Run:
             ),
             run_config=self._run_config(folder, events, spec.max_retries),
         )
-        with losses.not_counted(), without_state_of_trials():
+        with losses.not_counted(), lean_run():
             tuner.fit()
 
     def _reached(self, trial: Trial) -> int:

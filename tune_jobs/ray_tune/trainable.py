@@ -165,7 +165,10 @@ def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> Non
 
 
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
-    """Runs trials; `config` holds `sweep_place` and `trial_id`, and from the driver `run`, `driver` and `versions`."""
+    """Runs trials; `config` holds `sweep_place` and `trial_id`, and from the driver `run` and `driver`.
+
+    On a cluster it holds `versions` too; see `joined_nodes.refusal`.
+    """
 
     _refusal: NodeRefusedError | None = None
 

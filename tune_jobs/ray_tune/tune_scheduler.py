@@ -41,6 +41,16 @@ class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
         self.scheduler.begins(name_of(trial))
 
     @override
+    def choose_trial_to_run(self, tune_controller: TuneController) -> Trial | None:
+        # Of those that run or wait: Ray's own looks at all trials, those that have ended too, at each of its events.
+        waiting = [trial for trial in tune_controller.get_live_trials() if trial.status == Trial.PENDING]
+        if waiting:
+            waiting = [trial for trial in waiting if not is_starting(tune_controller, trial)]
+        else:
+            waiting = [trial for trial in tune_controller.get_live_trials() if trial.status == Trial.PAUSED]
+        return min(waiting, key=_order_of, default=None)
+
+    @override
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
         decision = self.scheduler.reached(standing_of(trial, result), OfTune(tune_controller))
         # Copying needs the trial to be paused, which `PopulationScheduler` does.
@@ -72,6 +82,24 @@ class OfTune:
     def ended(self) -> set[str]:
         """Return the ids of the trials that have ended."""
         return {name_of(trial) for trial in self.controller.get_trials() if trial.is_finished()}
+
+
+def is_starting(tune_controller: TuneController, trial: Trial) -> bool:
+    """Whether a process is started for a trial, which has its place already.
+
+    Tune (2.60) gives a trial that is chosen the process of one that has ended, and ends the one that is started for it;
+    for the next trial it then starts another one. Where trials are shorter than the start of a process, processes
+    would be started and ended all the time, and never as many run as there are places. So such a trial is not chosen:
+    the next one, which has none, takes the process that is there. Nothing public tells which they are.
+    """
+    controller = getattr(tune_controller, "_tune_controller", tune_controller)
+    actor = controller._trial_to_actor.get(trial)  # noqa: SLF001
+    return actor is not None and bool(controller._actor_manager.is_actor_started(actor))  # noqa: SLF001
+
+
+def _order_of(trial: Trial) -> tuple[int, str]:
+    """Trials are numbered; the numbers of more than 10,000 have more digits than those of the first."""
+    return len(name_of(trial)), name_of(trial)
 
 
 def name_of(trial: Trial) -> str:
