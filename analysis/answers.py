@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from analysis.records import Objective, SettingsRecord, SweepRecord, TrialRecord
+from analysis.best_records import SettingsRecord
+from analysis.records import Objective, SweepRecord, TrialRecord
 from analysis.wording import counted, return_text
 
 _MEANS: dict[Objective, str] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from analysis.records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
+from analysis.best_records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
 from analysis.statistics import mean_with_ci
 from analysis.successive_rejects import TIED
 from analysis.wording import NONE, counted, interval_text, return_text

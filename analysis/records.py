@@ -1,4 +1,6 @@
-"""The results of a sweep as typed records, which the files of a sweep folder hold as JSON.
+"""A sweep and its trials as typed records, which the files of a sweep folder hold as JSON.
+
+What came of them, the policy and the setting, is in `analysis.best_records`.
 
 Words: *training return* is the mean undiscounted return of the last 100 whole exploring episodes; *evaluation return*
 the mean of greedy episodes on the sweep's fixed evaluation seeds. `None` stands for "not known (yet)"; a score that is
@@ -14,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
 
-from analysis.notebook import Brief, facts_html
+from analysis.notebook import Brief
 from analysis.waits import WaitRecord
 
 FORMAT_VERSION = 2
@@ -45,7 +47,9 @@ Number = Annotated[float, BeforeValidator(_nan_for_null)]
 """A number that is always known, but may be NaN or infinite."""
 
 
-class _Record(BaseModel):
+class Record(BaseModel):
+    """What all records have in common."""
+
     # Unknown keys are ignored, so that an older version can read what a newer one wrote.
     model_config = ConfigDict(frozen=True, extra="ignore", ser_json_inf_nan="strings")
 
@@ -58,7 +62,7 @@ class _Record(BaseModel):
                 yield name, Brief(value)
 
 
-class CheckpointRecord(_Record):
+class CheckpointRecord(Record):
     """One kept checkpoint of a trial."""
 
     trial_id: TrialId
@@ -79,7 +83,7 @@ class CheckpointRecord(_Record):
         return f"trials/{self.trial_id}/checkpoints/{self.iteration:06d}"
 
 
-class IterationRecord(_Record):
+class IterationRecord(Record):
     """One iteration of one trial: a line of results.jsonl."""
 
     iteration: Iteration
@@ -98,7 +102,7 @@ class IterationRecord(_Record):
         return finite_or_none(value)
 
 
-class ChangeRecord(_Record):
+class ChangeRecord(Record):
     """A trial of a population that continued from a copy of another's checkpoint, with other hyperparameters."""
 
     iteration: int = Field(description="Iterations the trial itself had done.")
@@ -110,7 +114,7 @@ class ChangeRecord(_Record):
     time: Number = Field(description="Unix time, seconds.")
 
 
-class TrialPlan(_Record):
+class TrialPlan(Record):
     """What is known about a trial before it begins: its point, its seed and its place in the sweep."""
 
     trial_id: TrialId
@@ -129,7 +133,7 @@ class TrialPlan(_Record):
     changes: tuple[ChangeRecord, ...] = Field((), description="What population based training changed, oldest first.")
 
 
-class TrialState(_Record):
+class TrialState(Record):
     """The state of a trial, which its process reports; the process that drives the sweep counts the failures."""
 
     status: TrialStatus = "pending"
@@ -176,170 +180,7 @@ class TrialRecord(TrialState, TrialPlan):
         return {**self.hyperparams, **self.changes[0].before} if self.changes else self.hyperparams
 
 
-class EvaluationRecord(_Record):
-    """Greedy episodes of one policy on known seeds."""
-
-    policy: str = Field(description="What was evaluated: a path, or 'random'.")
-    env_id: str
-    env_args: dict[str, Any] = Field(default_factory=dict)
-    seeds: tuple[int, ...]
-    returns: tuple[Number, ...] = Field(description="Undiscounted return of each episode, in the order of seeds.")
-    lengths: tuple[int, ...] = Field(description="Env steps of each episode.")
-    threshold: float | None = Field(None, description="The env's reward threshold; None if it has none.")
-
-    @property
-    def num_episodes(self) -> int:
-        """Number of episodes."""
-        return len(self.returns)
-
-    @property
-    def mean_return(self) -> float:
-        """Mean episode return."""
-        return sum(self.returns) / len(self.returns)
-
-    @property
-    def std_return(self) -> float:
-        """Population standard deviation of the episode returns."""
-        mean = self.mean_return
-        return math.sqrt(sum((value - mean) * (value - mean) for value in self.returns) / len(self.returns))
-
-    @property
-    def solved(self) -> bool | None:
-        """Whether the mean reaches the env's threshold; None if it has none."""
-        return None if self.threshold is None else self.mean_return >= self.threshold
-
-
-class SettingRecord(_Record):
-    """A point of a sweep as a setting to train with, judged over its training seeds."""
-
-    point_index: Count
-    point: dict[str, Any]
-    trial_ids: tuple[TrialId, ...] = Field(description="The trials it was trained in, one a training seed.")
-    scores: tuple[Number, ...] = Field(description="The objective's value of each of them, higher is better.")
-    num_failed: Count = Field(description="How many of them failed; their scores are the worst of the sweep.")
-    num_solved: Count | None = Field(None, description="How many reached the threshold; None: the env has none.")
-    score: Number = Field(description="Mean of the scores.")
-    expected: Number = Field(description="What it is expected to be over many seeds, by which settings are ranked.")
-    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: one seed a setting.")
-    upper: float | None = None
-    probability_best: float | None = Field(None, description="That no other is better; None: one seed a setting.")
-    may_be_best: bool = Field(default=True, description="Whether the data can't tell it from the best.")
-
-
-class SettingsRecord(_Record):
-    """The settings of a sweep, ranked: which to train with."""
-
-    objective: Objective = Field(description="What they are judged by.")
-    threshold: float | None = None
-    num_settings: Count = Field(description="All that were trained, not only those that are listed.")
-    num_may_be_best: Count = Field(description="How many of all the data can't tell from the best, itself included.")
-    ranking: tuple[SettingRecord, ...] = Field(min_length=1, description="The leading ones, best first.")
-
-    @property
-    def best(self) -> SettingRecord:
-        """The setting to train with."""
-        return self.ranking[0]
-
-
-class CandidateRecord(_Record):
-    """A kept checkpoint that might have been the policy to deploy, and how it fared."""
-
-    checkpoint: CheckpointRecord
-    point: dict[str, Any]
-    num_episodes: Count = Field(description="Greedy episodes that it was judged by, those of its evaluation included.")
-    score: Number = Field(description="Mean return over them.")
-    lower: float | None = Field(
-        None, description="The 95 % interval over episodes of this policy; None: none were played."
-    )
-    upper: float | None = None
-    rejected_in: Count | None = Field(
-        None, description="The round after which it was rejected; 0: it played in none; None: it won."
-    )
-    reason: str = Field("", description="Why it was rejected; empty: for its score.")
-    confirmation: EvaluationRecord | None = Field(
-        None, description="A runner-up on the confirmation seeds; the winner's is the record's own."
-    )
-
-
-class ChoiceRecord(_Record):
-    """How the policy to deploy was chosen: by successive rejects among the leading checkpoints of all trials."""
-
-    candidates: tuple[CandidateRecord, ...] = Field(min_length=1, description="The winner first.")
-    num_known: Count = Field(description="All kept checkpoints that had an evaluation.")
-    num_evaluation_episodes: Count = Field(description="The episodes of an evaluation during training.")
-    first_seed: Count | None = Field(None, description="The seed of the first further episode; None: there was none.")
-    num_rounds: Count = 0
-    num_episodes: Count = Field(0, description="Further episodes that were played, of all candidates together.")
-    num_env_steps: Count = Field(0, description="Env steps of these.")
-    max_env_steps: Count = Field(0, description="How many env steps they might take.")
-    note: str = Field("", description="Why the rounds ended before the last one; empty: they did not.")
-
-    @property
-    def winner(self) -> CandidateRecord:
-        """The policy to deploy."""
-        return self.candidates[0]
-
-    @property
-    def played(self) -> tuple[CandidateRecord, ...]:
-        """The candidates that could play, the winner first."""
-        return tuple(item for item in self.candidates if item.rejected_in != 0)
-
-    @property
-    def runners_up(self) -> tuple[CandidateRecord, ...]:
-        """Those that were confirmed beside the winner."""
-        return tuple(item for item in self.candidates if item.confirmation is not None)
-
-
-class BestRecord(_Record):
-    """Both answers of a sweep, the policy to deploy and the setting to train with: best/evaluation.json."""
-
-    format_version: int = FORMAT_VERSION
-    checkpoint: CheckpointRecord
-    point: dict[str, Any]
-    seed: int
-    selection_score: Number = Field(description="Mean return of the greedy episodes it was chosen by.")
-    confirmation: EvaluationRecord = Field(description="The winner on seeds it was not chosen on.")
-    random: EvaluationRecord = Field(description="A random policy on the confirmation seeds.")
-    settings: SettingsRecord | None = Field(
-        None, description="The settings, which are another question than the policy; None: of an older version."
-    )
-    choice: ChoiceRecord | None = Field(
-        None, description="What the policy was chosen from, and how; None: of an older version."
-    )
-
-    @property
-    def optimism_gap(self) -> float:
-        """Selection score minus confirmation mean: how much choosing the maximum raised the score."""
-        return self.selection_score - self.confirmation.mean_return
-
-    def _repr_html_(self) -> str:
-        from analysis.wording import difference_text, return_text, setting_text
-
-        point = ", ".join(f"{name} {setting_text(value)}" for name, value in self.point.items())
-        confirmed = self.confirmation
-        facts = {
-            "values": point or "no searched values",
-            "trial": f"{self.checkpoint.trial_id}, at {self.checkpoint.num_env_steps:,} env steps",
-            "chosen by": f"{return_text(self.selection_score)} mean evaluation return"
-            + (f" over {self.choice.winner.num_episodes:,} episodes" if self.choice is not None else ""),
-            "confirmed at": f"{return_text(confirmed.mean_return)} over {confirmed.num_episodes} fresh episodes; "
-            f"gap {difference_text(self.optimism_gap)}",
-            "random policy": return_text(self.random.mean_return),
-        }
-        if confirmed.solved is not None:
-            solved = "solved" if confirmed.solved else "not solved"
-            facts[confirmed.env_id] = f"{solved} (threshold {confirmed.threshold:g})"
-        return facts_html("Best policy", facts)
-
-
-class FilmsRecord(_Record):
-    """Whose films lie in best/: films.json, written once they are whole."""
-
-    format_version: int = FORMAT_VERSION
-    checkpoint: CheckpointRecord = Field(description="The winner that they show.")
-
-
-class ReplicationRecord(_Record):
+class ReplicationRecord(Record):
     """More seeds that some points of a sweep were given, one each; see `analysis.numbering`."""
 
     num_points: Annotated[int, Field(ge=1, le=2**31)] = Field(description="The points that the sweep had then.")
@@ -354,7 +195,7 @@ class ReplicationRecord(_Record):
     num_seeds: Annotated[int, Field(ge=0, le=100_000)] = Field(0, description="The most seeds that it gives a point.")
 
 
-class ChosenPointRecord(_Record):
+class ChosenPointRecord(Record):
     """A point that somebody chose, beside those that the search gives; see `analysis.numbering`."""
 
     num_points: Annotated[int, Field(ge=0, le=2**31)] = Field(
@@ -363,14 +204,14 @@ class ChosenPointRecord(_Record):
     point: dict[str, Any] = Field(description="Its values of the searched hyperparameters.")
 
 
-class JobRecord(_Record):
+class JobRecord(Record):
     """The job of a Ray cluster that drives a sweep, or was asked to."""
 
     id: str = Field(description="Its submission id.")
     address: str = Field(description="The address of the Jobs API that runs it; it never holds a token.")
 
 
-class SweepRecord(_Record):
+class SweepRecord(Record):
     """The record of a sweep: sweep.json."""
 
     format_version: int = FORMAT_VERSION

@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis import report_data, wording
+from analysis.best_records import BestRecord, SettingsRecord
 from analysis.page import all_trials, answer, cards, charts, cost, head, how_sure, mattered, next_steps, repeat
 from analysis.page.bounded import bounded
 from analysis.page.figures import draw_figures
 from analysis.page.source import Source
 from analysis.page_templates import make_environment, template_file
 from analysis.plot_style import CSS_DARK, CSS_LIGHT
-from analysis.records import BestRecord, IterationRecord, SettingsRecord, SweepRecord, TrialRecord
+from analysis.records import IterationRecord, SweepRecord, TrialRecord
 from analysis.tables import iterations_frame, steps_to_solve_frame, trials_frame, write_csv
 from policies.files import write_atomic
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from analysis.records import BestRecord, SweepRecord, finite_or_none
+from analysis.best_records import BestRecord
+from analysis.records import SweepRecord, finite_or_none
 from policies.portable.file import BASELINE_KINDS
 
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from analysis.records import BestRecord, IterationRecord, TrialRecord
+from analysis.best_records import BestRecord
+from analysis.records import IterationRecord, TrialRecord
 from analysis.selection import rank_points
 from analysis.tables import groups_frame, point_names, steps_to_solve_frame, trials_frame
 from analysis.wording import NONE, is_number, number, return_text

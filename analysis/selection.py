@@ -23,7 +23,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.records import FINISHED, BestRecord, CheckpointRecord, TrialRecord, finite_or_none
+from analysis.best_records import BestRecord
+from analysis.records import FINISHED, CheckpointRecord, TrialRecord, finite_or_none
 from policies.errors import NotFoundError
 
 _MAX_ERROR_CHARS = 300

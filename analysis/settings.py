@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.objectives import SettingScores, rank_settings
-from analysis.records import IterationRecord, Objective, SettingRecord, SettingsRecord, TrialRecord
+from analysis.records import IterationRecord, Objective, TrialRecord
 from analysis.statistics import probability_of_being_best, seed_intervals, tie_groups
 from analysis.tables import env_steps_to
 from policies import random_streams

@@ -7,10 +7,11 @@ import shlex
 from dataclasses import dataclass
 
 from analysis.answers import certainty, setting_score
+from analysis.best_records import EvaluationRecord, SettingRecord, SettingsRecord
 from analysis.page.estimates import replicate_takes
 from analysis.page.scores import score_text
 from analysis.page.source import Source, point_text
-from analysis.records import FINISHED, EvaluationRecord, SettingRecord, SettingsRecord
+from analysis.records import FINISHED
 from analysis.selection import NoUsableTrialError, score_trial, select_best
 from analysis.statistics import mean_with_ci, median_steps
 from analysis.wording import counted, interval_text, known_return_text, number, return_text

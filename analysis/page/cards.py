@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from analysis.answers import certainty
+from analysis.best_records import BestRecord, SettingRecord
 from analysis.choice_words import COLUMNS, candidate_rows, chosen_from
 from analysis.collapse import collapses, collapses_text
 from analysis.page.scores import interval_of, score_means, score_text
 from analysis.page.source import Source, point_pairs
-from analysis.records import BestRecord, SettingRecord, SweepRecord, TrialRecord
+from analysis.records import SweepRecord, TrialRecord
 from analysis.report_tables import Cell, Table
 from analysis.selection import NoUsableTrialError, is_current, select_best
 from analysis.statistics import mean_with_ci, paired_difference

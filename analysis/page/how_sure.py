@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.page.scores import counts_env_steps, interval_of, score_means, score_text
 from analysis.page.source import Source
-from analysis.records import IterationRecord, SettingRecord, SettingsRecord, TrialRecord, finite_or_none
+from analysis.records import IterationRecord, TrialRecord, finite_or_none
 from analysis.report_tables import Cell, Table, steps_table
 from analysis.statistics import tie_groups
 from analysis.strip_plot import Strip

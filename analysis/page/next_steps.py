@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from analysis.best_records import SettingRecord
 from analysis.page.estimates import replicate_takes, takes
 from analysis.page.narrowed import narrowed_space
 from analysis.page.source import Source, point_text
-from analysis.records import SettingRecord
 from analysis.wording import counted
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis.records import SettingRecord, SettingsRecord
+from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.wording import number, return_text
 
 _MEANS = {

@@ -8,11 +8,12 @@ from functools import cached_property
 from typing import Any
 
 from analysis import report_data
+from analysis.best_records import BestRecord, SettingsRecord
 from analysis.core_seconds import core_seconds
 from analysis.importance import WhatMattered, what_mattered
 from analysis.objectives import SettingScores, rank_settings
 from analysis.plot_style import numeric_names
-from analysis.records import BestRecord, IterationRecord, SettingsRecord, SweepRecord, TrialRecord
+from analysis.records import IterationRecord, SweepRecord, TrialRecord
 from analysis.tables import cell_value, env_steps_to
 from analysis.wording import number, shown_path
 

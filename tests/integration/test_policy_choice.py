@@ -12,7 +12,7 @@ from fake_engine import FakeEngine
 from policy_factory import balancing_policy, make_policy
 from sweep_folders import MACHINE, SPEC, train
 
-from analysis.records import BestRecord, ChoiceRecord
+from analysis.best_records import BestRecord, ChoiceRecord
 from analysis.selection import NoUsableTrialError
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.policy import NetworkPolicy

@@ -9,8 +9,9 @@ from page_sweeps import write_sweep
 from selenium.webdriver.common.keys import Keys
 from synthetic_sweep import make_sweep
 
+from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.page.scores import interval_of, score_text
-from analysis.records import Objective, SettingRecord, SettingsRecord
+from analysis.records import Objective
 from tune_jobs.store.sweep_store import SweepStore
 
 pytestmark = IN_A_BROWSER

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.records import EvaluationRecord, TrialRecord
+from analysis.best_records import EvaluationRecord
+from analysis.records import TrialRecord
 from analysis.statistics import median_steps
 from analysis.tables import env_steps_to
 from tests.learning.targets import NUM_EPISODES, Target, Task

@@ -208,6 +208,13 @@ def test_the_health_check_of_the_service_says_what_is_ready(compose: dict[str, A
     assert subprocess.run([sys.executable, *test], check=False, capture_output=True, timeout=60).returncode != 0
 
 
+@pytest.mark.parametrize("name", ["head", "worker"])
+def test_a_node_is_not_killed_while_ray_drains_it(compose: dict[str, Any], name: str) -> None:
+    from ray._private.ray_constants import RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S as DRAIN_S
+
+    assert int(compose["services"][name]["stop_grace_period"].removesuffix("s")) > DRAIN_S
+
+
 def test_workers_scale(compose: dict[str, Any]) -> None:
     worker = compose["services"]["worker"]
     assert "container_name" not in worker

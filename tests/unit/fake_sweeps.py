@@ -11,7 +11,8 @@ import click.testing
 import pytest
 from fake_results import COMPARISON, EQUAL, IMPORTANCE
 
-from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord, SweepRecord, TrialRecord
+from analysis.best_records import BestRecord, EvaluationRecord
+from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
 from tune_jobs.cli.commands import cli
 from tune_jobs.sweeps.status import SweepStatus
 

@@ -4,8 +4,8 @@ from typing import Any
 
 from synthetic_sweep import Synthetic
 
+from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.page.source import Source
-from analysis.records import SettingRecord, SettingsRecord
 from analysis.report_data import goal_of
 
 

@@ -9,14 +9,8 @@ from typing import Any
 import pytest
 from stores import HARNESSES, Harness
 
-from analysis.records import (
-    BestRecord,
-    CheckpointRecord,
-    EvaluationRecord,
-    IterationRecord,
-    SweepRecord,
-    TrialRecord,
-)
+from analysis.best_records import BestRecord, EvaluationRecord
+from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.objects import asked, owners, trial_state
 

@@ -8,17 +8,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from analysis.records import (
-    BestRecord,
-    CandidateRecord,
-    CheckpointRecord,
-    ChoiceRecord,
-    EvaluationRecord,
-    IterationRecord,
-    SweepRecord,
-    TrialRecord,
-    TrialStatus,
-)
+from analysis.best_records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
+from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, policy_candidates, select_best
 from analysis.settings import judge_settings
 from analysis.successive_rejects import TIED

@@ -5,8 +5,9 @@ import json
 import pytest
 from synthetic_sweep import make_sweep, with_choice
 
+from analysis.best_records import BestRecord
 from analysis.choice_words import CandidateRow, candidate_rows, chosen_from
-from analysis.records import BestRecord, TrialRecord
+from analysis.records import TrialRecord
 from analysis.selection import is_current, policy_candidates
 from analysis.wording import NONE
 from tests.narrowing import present

@@ -1,13 +1,18 @@
 """A run whose storage is gone in the middle says so, whatever error that led to, and how to go on."""
 
+import shlex
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
+from s3_faults import Faults
+from store_parts import make_sweep
 from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError, NotFoundError
+from tune_jobs.ray_tune.run_trials import _saying_how_to_go_on
 from tune_jobs.store.objects import outbox
 from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.objects.object_sweep import ObjectSweep
@@ -17,7 +22,7 @@ from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.storage_watch import StorageWatch
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import stages
-from tune_jobs.sweeps.drive import Shared
+from tune_jobs.sweeps.drive import Shared, _giving_way_to
 from tune_jobs.sweeps.lost_storage import told_if_it_is_gone
 from tune_jobs.sweeps.monitor import SweepMonitor
 
@@ -72,10 +77,28 @@ def test_an_object_store_that_does_not_answer_is_gone_too(url: ObjectUrl) -> Non
         raise StorageError("s3://x cannot be written: the connection was refused.", "Check it.", passes=True)
     assert "is gone: s3://x cannot be written: the connection was refused. It was missed at" in caught.value.message
     assert "tune-jobs resume" in caught.value.hint
-    refused = StorageError("s3://x cannot be written: AccessDenied.", "Check the credentials.")
-    with pytest.raises(StorageError) as refusal, told_if_it_is_gone(store, lambda: None):
-        raise refused
-    assert refusal.value is refused
+
+
+@pytest.mark.parametrize("what", ["read", "list", "write"])
+def test_credentials_that_expire_in_the_middle_are_one_error_that_says_what_to_do(
+    faults: Faults, url: ObjectUrl, what: str
+) -> None:
+    store = ObjectSweep(url)
+    store.write_record(make_sweep())
+    store = ObjectSweep(url)
+    body = "<Error><Code>ExpiredToken</Code><Message>The provided token has expired.</Message></Error>"
+    faults.rule("status", status=403, body=body, times=10_000)
+    ask: dict[str, Callable[[], object]] = {
+        "read": store.stop_requested,
+        "list": store.read_trials,
+        "write": lambda: store.write_record(make_sweep(state="completed")),
+    }
+    with pytest.raises(CannotRunError) as caught, told_if_it_is_gone(store, lambda: None):
+        ask[what]()
+    assert (type(caught.value), caught.value.exit_code) == (CannotRunError, 5)
+    assert "403 Forbidden, ExpiredToken, The provided token has expired." in caught.value.message
+    assert "has expired or is not valid: get new ones" in caught.value.hint
+    assert f"What is done is kept; continue with `tune-jobs resume {shlex.quote(store.place)}`." in caught.value.hint
 
 
 def test_no_folder_is_made_where_a_storage_is_gone(store: SweepStore) -> None:
@@ -160,3 +183,30 @@ def test_a_folder_that_is_away_for_a_moment_is_waited_for_and_one_that_stays_awa
     clock.now = 9.0
     with pytest.raises(CannotRunError, match="has not been there for 4 s"):
         watch.check()
+
+
+def test_what_cannot_be_written_at_the_end_gives_way_to_what_ended_the_run() -> None:
+    full = CannotRunError("sweep.json cannot be written: read-only.", "Free it.")
+    earlier = CannotRunError("trial.json cannot be written: read-only.")
+    with _giving_way_to(earlier):
+        raise full
+    # Nothing else has told it.
+    with pytest.raises(CannotRunError) as caught, _giving_way_to(None):
+        raise full
+    assert caught.value is full
+    # A defect is none of the storage's.
+    with pytest.raises(KeyError), _giving_way_to(earlier):
+        raise KeyError("x")
+
+
+def test_a_storage_that_ends_a_run_says_how_to_go_on_once(store: SweepStore) -> None:
+    full = CannotRunError("trial.json cannot be written: read-only.", "Free it.")
+    with pytest.raises(CannotRunError) as caught, _saying_how_to_go_on(store):
+        raise full
+    assert caught.value.message == full.message
+    assert caught.value.hint == "Free it. What is done is kept; continue with `tune-jobs resume mine`."
+    # Those that are more than that say it themselves.
+    for other in (OwnershipLostError("/x has been taken over."), StorageError("s3://x is refused."), KeyError("x")):
+        with pytest.raises(type(other)) as kept, _saying_how_to_go_on(store):
+            raise other
+        assert kept.value is other

@@ -12,8 +12,9 @@ import pytest
 from fake_sweeps import BEST, SWEEP, TRIALS, evaluation
 from test_monitor import make_monitor, make_trial
 
+from analysis.best_records import EvaluationRecord
 from analysis.notebook import BriefList, film_html
-from analysis.records import EvaluationRecord, SweepRecord, TrialRecord
+from analysis.records import SweepRecord, TrialRecord
 from tune_jobs.spec.file import list_presets
 from tune_jobs.sweeps import live_view, notebook_view
 from tune_jobs.sweeps.create import CreatedSweep

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from analysis.answers import certainty, setting_score
+from analysis.best_records import SettingsRecord
 from analysis.objectives import SettingScores, expected_means, rank_settings, score_of, trial_score
 from analysis.racing import Race
-from analysis.records import IterationRecord, Objective, SettingsRecord, TrialRecord, TrialStatus
+from analysis.records import IterationRecord, Objective, TrialRecord, TrialStatus
 from analysis.settings import judge_settings
 from tests.narrowing import present
 

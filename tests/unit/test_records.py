@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from synthetic_sweep import make_sweep
 
-from analysis.records import (
-    BestRecord,
-    ChangeRecord,
-    CheckpointRecord,
-    EvaluationRecord,
-    IterationRecord,
-    SweepRecord,
-    TrialRecord,
-)
+from analysis.best_records import BestRecord, EvaluationRecord
+from analysis.records import ChangeRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from tests.narrowing import present
 from tune_jobs.store.manifests import read_manifest
 from tune_jobs.store.sweep_store import SweepStore

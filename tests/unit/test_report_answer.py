@@ -6,8 +6,8 @@ import pytest
 from report_sources import setting, settings_of, source_of
 from synthetic_sweep import Synthetic, make_sweep
 
+from analysis.best_records import SettingsRecord
 from analysis.page import answer
-from analysis.records import SettingsRecord
 from analysis.wording import known_return_text
 from tests.narrowing import present
 

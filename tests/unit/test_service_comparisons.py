@@ -11,8 +11,9 @@ from live_service import Live, live, serving, serving_a_viewer  # noqa: F401 (a 
 from store_parts import make_best, make_checkpoint, make_iteration
 from sweep_folders import make_sweep_folder
 
+from analysis.best_records import EvaluationRecord
 from analysis.best_so_far import best_so_far
-from analysis.records import EvaluationRecord, IterationRecord, TrialRecord
+from analysis.records import IterationRecord, TrialRecord
 from tune_jobs.service import derived
 from tune_jobs.spec.differences import differences
 from tune_jobs.store.sweep_store import SweepStore

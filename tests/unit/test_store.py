@@ -10,12 +10,8 @@ from pathlib import Path
 import pytest
 from store_parts import make_iteration, make_sweep, make_trial
 
-from analysis.records import (
-    FORMAT_VERSION,
-    BestRecord,
-    CheckpointRecord,
-    EvaluationRecord,
-)
+from analysis.best_records import BestRecord, EvaluationRecord
+from analysis.records import FORMAT_VERSION, CheckpointRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from tests.narrowing import present
 from tune_jobs.store.manifests import read_manifest, verify_checkpoint

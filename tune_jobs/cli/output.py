@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from analysis.records import BestRecord, EvaluationRecord, SettingsRecord, SweepRecord, TrialRecord, TrialStatus
+    from analysis.best_records import BestRecord, EvaluationRecord, SettingsRecord
+    from analysis.records import SweepRecord, TrialRecord, TrialStatus
     from tune_jobs.spec.file import Preset
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 

@@ -12,9 +12,10 @@ from tune_jobs.client import Client, ConflictError
 from tune_jobs.sweeps.outcome import Film
 
 if TYPE_CHECKING:
+    from analysis.best_records import BestRecord
     from analysis.comparison.compare import Comparison
     from analysis.importance.answer import WhatMattered
-    from analysis.records import BestRecord, Objective, TrialRecord
+    from analysis.records import Objective, TrialRecord
     from tune_jobs.plan.sweep_plan import SweepPlan
     from tune_jobs.spec.sweep_spec import SweepSpec
     from tune_jobs.sweeps.status import SweepStatus

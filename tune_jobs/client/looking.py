@@ -9,9 +9,10 @@ from tune_jobs.client.answers import Curves, FileOfSweep, Job, Me, Summary, Tria
 from tune_jobs.client.asking import Asking, sweep_path, trial_path
 
 if TYPE_CHECKING:
+    from analysis.best_records import BestRecord
     from analysis.comparison.compare import Comparison
     from analysis.importance.answer import WhatMattered
-    from analysis.records import BestRecord, IterationRecord, Objective, TrialRecord
+    from analysis.records import IterationRecord, Objective, TrialRecord
     from tune_jobs.sweeps.status import SweepStatus
 
 
@@ -126,7 +127,7 @@ class Looking(Asking):
         Raises:
             NotFoundError: There is no such sweep, or it has no best policy yet.
         """
-        from analysis.records import BestRecord
+        from analysis.best_records import BestRecord
 
         return self._read(BestRecord, self._ask("GET", f"{sweep_path(name)}/best"))
 

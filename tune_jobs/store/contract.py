@@ -38,7 +38,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
-from analysis.records import BestRecord, CheckpointRecord, SweepRecord, TrialRecord
+from analysis.best_records import BestRecord
+from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
 from policies.portable.file import PortablePolicy
 from tune_jobs.store.pack_contract import Assignment, Pack
 from tune_jobs.store.probe import Probe

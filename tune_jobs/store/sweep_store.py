@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from analysis.records import FINISHED, BestRecord, CheckpointRecord, FilmsRecord, SweepRecord, TrialRecord
+from analysis.best_records import BestRecord, FilmsRecord
+from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.records import BestRecord, CheckpointRecord, EvaluationRecord
+from analysis.best_records import BestRecord, EvaluationRecord
+from analysis.records import CheckpointRecord
 from analysis.selection import NoUsableTrialError
 from analysis.selection import best_checkpoint as best_of
 from policies.acting.baselines import BASELINES, ConstantPolicy

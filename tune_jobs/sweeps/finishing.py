@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
-from analysis.records import BestRecord
+from analysis.best_records import BestRecord
 from policies.errors import EnvFailedError, TuneJobsError
 from tune_jobs.process.interruption import current
 from tune_jobs.store.contract import Sweep

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from analysis.best_records import BestRecord
 from analysis.exports.frames import SweepData
-from analysis.records import BestRecord
 from policies.errors import NotFoundError
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Say so where a run ends because its storage is gone: nothing of the sweep can be read any more, nor be written."""
+"""Say so where a run ends because of its storage: it is gone, or refuses what it did before, and how to go on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from tune_jobs.store.urls import is_url
 
 @contextlib.contextmanager
 def told_if_it_is_gone(store: Sweep, last_report: Callable[[], float | None]) -> Iterator[None]:
-    """Let an error of the block say that the sweep's storage is gone, if it is: what it says itself is a consequence.
+    """Let an error of the block say that the sweep's storage is gone or refuses, if it does.
+
+    What the error says itself is a consequence then.
 
     A folder that is not mounted any more, say, looks as if there had never been a sweep, and as if its trials had been
     taken over.
@@ -25,11 +27,16 @@ def told_if_it_is_gone(store: Sweep, last_report: Callable[[], float | None]) ->
         last_report: Returns when a trial last reported, Unix time in seconds; None: none has. It has written then.
 
     Raises:
-        CannotRunError: The storage can't be read; the message has the place and since when, the hint how to go on.
+        CannotRunError: The storage can't be read, or an object store refuses, as credentials have expired, say; the
+            message has the place and why, the hint how to go on.
     """
     try:
         yield
     except Exception as error:
+        how = f"continue with `tune-jobs resume {shlex.quote(name_for_commands(store))}`."
+        refused = _refused(store, error)
+        if refused is not None:
+            raise CannotRunError(refused.message, f"{refused.hint} What is done is kept; {how}".strip()) from error
         why = _why_unreadable(store, error)
         if not why:
             raise
@@ -38,9 +45,19 @@ def told_if_it_is_gone(store: Sweep, last_report: Callable[[], float | None]) ->
         since = f"{noticed}; a trial last reported at {_clock(at)}." if at else f"{noticed}."
         raise CannotRunError(
             f"The storage of sweep {store.name} is gone: {why} {since}",
-            "Mount or connect it again. What was saved there is kept with it; continue with "
-            f"`tune-jobs resume {shlex.quote(name_for_commands(store))}`.",
+            f"Mount or connect it again. What was saved there is kept with it; {how}",
         ) from error
+
+
+def _refused(store: Sweep, error: Exception) -> TuneJobsError | None:
+    """Return what an object store refused to do, to which an error is due; None: it did not, or it may do it later."""
+    if not is_url(store.place):
+        return None
+    from tune_jobs.store.objects.bucket import StorageError
+
+    # Whoever lists the records says that they can't be read, which is another kind of error.
+    causes = (error, error.__cause__)
+    return next((each for each in causes if isinstance(each, StorageError) and not each.passes), None)
 
 
 def _why_unreadable(store: Sweep, error: Exception) -> str:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from analysis.best_records import BestRecord
 from analysis.notebook import brief_repr, facts_html
-from analysis.records import BestRecord, SweepRecord, TrialRecord
+from analysis.records import SweepRecord, TrialRecord
 from analysis.wording import counted
 from tune_jobs.sweeps.storage import folder_at, shown_place
 

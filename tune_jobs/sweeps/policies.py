@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from analysis.records import BestRecord, EvaluationRecord
+from analysis.best_records import BestRecord, EvaluationRecord
 from policies.arguments import NumEpisodes, Seed, checked
 from policies.envs.modules import allowed_again
 from policies.guard.guard import guarding

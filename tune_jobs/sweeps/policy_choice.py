@@ -13,7 +13,8 @@ import json
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
-from analysis.records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord, TrialRecord
+from analysis.best_records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
+from analysis.records import TrialRecord
 from analysis.selection import (
     TrialScore,
     is_current,

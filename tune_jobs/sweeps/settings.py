@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from analysis.best_records import BestRecord, SettingsRecord
 from analysis.objectives import SettingScores, rank_settings
-from analysis.records import BestRecord, IterationRecord, SettingsRecord, TrialRecord
+from analysis.records import IterationRecord, TrialRecord
 from analysis.settings import judge_settings
 from policies.guard.guarded import check_env
 from policies.portable.file import read_policy

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from analysis.best_records import BestRecord
 from analysis.best_so_far import BestSoFar, best_so_far, has_evaluations
 from analysis.comparison.compare import Comparison, why_not_comparable
 from analysis.comparison.compare import compare as compare_all
 from analysis.comparison.entries import Entry, Wanted, judged_alike
 from analysis.comparison.wording import fact_rows, pair_lines
 from analysis.exports.frames import ranked_settings
-from analysis.records import BestRecord
 from analysis.statistics import mean_with_ci
 from analysis.wording import PLAIN_NONE, counted, interval_text, return_text
 from policies import random_streams

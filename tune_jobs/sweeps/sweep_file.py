@@ -14,8 +14,9 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
+from analysis.best_records import BestRecord
 from analysis.importance import what_mattered
-from analysis.records import BestRecord, IterationRecord, SweepRecord, TrialRecord
+from analysis.records import IterationRecord, SweepRecord, TrialRecord
 from analysis.selection import score_trial
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.store.candidates import readable_trials

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from analysis.records import BestRecord, FilmsRecord
+from analysis.best_records import BestRecord, FilmsRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.files import atomic_path, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
