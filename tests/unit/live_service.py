@@ -43,13 +43,18 @@ class Live:
 
 @contextlib.contextmanager
 def serving(
-    storage: Path, *, require_token: bool = False, certificate: tuple[Path, Path] | None = None, **limits: Any
+    storage: Path | str,
+    *,
+    require_token: bool = False,
+    certificate: tuple[Path, Path] | None = None,
+    own_folder: Path | None = None,
+    **limits: Any,
 ) -> Iterator[Live]:
     """Serve a storage folder, with TLS if there is a certificate and its key; its queue stands still."""
     chain, key = certificate or (None, None)
     config = ServiceConfig(
         storage=storage, port=0, spare_idle_s=0, limits=Limits(**limits), drain_s=1.0, require_token=require_token,
-        tls_certificate=chain, tls_key=key,
+        tls_certificate=chain, tls_key=key, own_folder=own_folder,
     )  # fmt: skip
     started = threading.Event()
     with listening_socket(config) as listening, _idle(config) as service:

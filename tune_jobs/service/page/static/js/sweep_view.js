@@ -2,8 +2,8 @@
 import { makeActions } from "./actions.js";
 import { BestChart } from "./best_chart.js";
 import { COLOURS, CurvesChart } from "./curves_chart.js";
-import { makeAlert, refusal } from "./dialogs.js";
-import { colour, el, isTyping } from "./dom.js";
+import { makeAlert, notYet, refusal } from "./dialogs.js";
+import { colour, el, isTyping, setAttribute } from "./dom.js";
 import { filterOf } from "./filter.js";
 import { Finished } from "./finished.js";
 import { ImportanceCard } from "./importance.js";
@@ -58,7 +58,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
         },
       });
   const page = el("div", { class: "sweep-page", hidden: true });
-  const loading = el("p", { class: "empty quiet", role: "status" }, "Loading…");
+  const loading = el("div", { class: "empty quiet", role: "status" }, "Loading…");
   const content = el("div", { class: "sweep-content" });
   page.append(content);
   main.append(loading, page);
@@ -230,9 +230,12 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     },
     show(error) {
       if (error === null) return showAll();
-      const back = el("p", {}, el("a", { href: "#/" }, "To all sweeps"));
-      if (page.hidden) loading.replaceChildren(...refusal(error), error.status === 404 ? back : "");
-      else if (error.status === 404) alert.show(error);
+      const isGone = error.status === 404;
+      if (page.hidden) {
+        const back = el("p", {}, el("a", { href: "#/" }, "To all sweeps"));
+        setAttribute(loading, "class", isGone ? "empty quiet" : null);
+        loading.replaceChildren(...(isGone ? [...refusal(error), back] : [el("h1", {}, source.name), notYet(error)]));
+      } else if (isGone) alert.show(error);
       return undefined;
     },
   });

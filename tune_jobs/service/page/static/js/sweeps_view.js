@@ -1,6 +1,7 @@
 // All sweeps: what runs, waits and ended; it keeps itself up to date.
 import { askAll } from "./api.js";
 import { CompareChoice, makeBox, namesOf } from "./compare_choice.js";
+import { notYet } from "./dialogs.js";
 import { el, reconcile, setAttribute, setText } from "./dom.js";
 import { ago, count, counted, duration, moment, percent, pointText, returnText, timeLeft } from "./format.js";
 import { follow } from "./follow.js";
@@ -76,6 +77,7 @@ export function openSweeps(main, route) {
   });
   const told = el("p", { class: "quiet small", role: "status" }, "Loading…");
   const card = el("div", { class: "card table-card", hidden: true }, table, empty);
+  const problem = el("div", { role: "alert" });
   main.append(
     el(
       "div",
@@ -84,6 +86,7 @@ export function openSweeps(main, route) {
       maySubmit() ? el("a", { class: "button primary", href: "#/new" }, "New sweep") : null,
     ),
     el("div", { class: "controls" }, groups, search, told),
+    problem,
     card,
     more,
   );
@@ -171,7 +174,8 @@ export function openSweeps(main, route) {
     },
     show(error) {
       if (error === null) sweeps = [...known.values()];
-      else if (sweeps === null) told.replaceChildren(error.message);
+      else setText(told, sweeps === null ? "" : "as it was");
+      problem.replaceChildren(...(error === null ? [] : [notYet(error)]));
       show();
     },
   });
