@@ -83,6 +83,8 @@ def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(
 
 
 def test_a_run_that_can_write_no_more_says_how_to_go_on() -> None:
-    error = going_on(CannotRunError("Cannot write trial.json: No space left on device.", "Free some."), "my sweep")
-    assert error.hint == "Free some. What is done is kept; continue with `tune-jobs resume 'my sweep'`."
+    error = going_on(
+        CannotRunError("Cannot write trial.json: No space left on device.", "Free some."), "tune-jobs resume x"
+    )
+    assert error.hint == "Free some. What is done is kept; continue with `tune-jobs resume x`."
     assert error.message == "Cannot write trial.json: No space left on device."

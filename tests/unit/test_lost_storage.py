@@ -11,6 +11,7 @@ from s3_faults import Faults
 from store_parts import make_sweep
 from sweep_folders import make_sweep_folder
 
+from analysis.records import JobRecord
 from policies.errors import CannotRunError, NotFoundError
 from tune_jobs.ray_tune.run_trials import _saying_how_to_go_on
 from tune_jobs.store.objects import outbox
@@ -18,6 +19,7 @@ from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.objects.object_sweep import ObjectSweep
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.url import ObjectUrl
+from tune_jobs.store.opening import resume_command
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.storage_watch import StorageWatch
 from tune_jobs.store.sweep_store import SweepStore
@@ -53,6 +55,7 @@ def test_an_error_of_a_storage_that_is_gone_says_so(
         taken_away(store)
         raise error
 
+    store.write_record(store.read_record().model_copy(update={"address": "10.0.0.1:6379"}))
     monkeypatch.setattr(stages, "_run_sweep", run)
     plan: object = None
     with pytest.raises(CannotRunError) as caught:
@@ -61,7 +64,23 @@ def test_an_error_of_a_storage_that_is_gone_says_so(
     assert caught.value.exit_code == 5
     assert f"The storage of sweep mine is gone: No sweep at {store.record_path}. It was missed at" in str(caught.value)
     assert "; a trial last reported at 13:02:01." in caught.value.message
-    assert "`tune-jobs resume mine`" in caught.value.hint
+    assert f"`tune-jobs resume {store.place} --address 10.0.0.1:6379`" in caught.value.hint
+
+
+def test_the_command_that_goes_on_finds_the_sweep_and_its_cluster(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = store.read_record()
+    assert resume_command(store, record) == f"tune-jobs resume {store.place}"
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", str(store.folder.parent))
+    assert resume_command(store, None) == "tune-jobs resume mine"
+    on_cluster = record.model_copy(update={"address": "ray://head:10001"})
+    assert resume_command(store, on_cluster) == "tune-jobs resume mine --address ray://head:10001"
+    job = JobRecord(id="a", address="http://head:8265")
+    by_job = on_cluster.model_copy(update={"job": job})
+    assert resume_command(store, by_job) == "tune-jobs resume mine --address http://head:8265 --detach"
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "s3://bucket/sweeps")
+    assert resume_command(store, None) == f"tune-jobs resume {store.place}"
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
@@ -199,14 +218,14 @@ def test_what_cannot_be_written_at_the_end_gives_way_to_what_ended_the_run() -> 
         raise KeyError("x")
 
 
-def test_a_storage_that_ends_a_run_says_how_to_go_on_once(store: SweepStore) -> None:
+def test_a_storage_that_ends_a_run_says_how_to_go_on_once() -> None:
     full = CannotRunError("trial.json cannot be written: read-only.", "Free it.")
-    with pytest.raises(CannotRunError) as caught, _saying_how_to_go_on(store):
+    with pytest.raises(CannotRunError) as caught, _saying_how_to_go_on("tune-jobs resume mine"):
         raise full
     assert caught.value.message == full.message
     assert caught.value.hint == "Free it. What is done is kept; continue with `tune-jobs resume mine`."
     # Those that are more than that say it themselves.
     for other in (OwnershipLostError("/x has been taken over."), StorageError("s3://x is refused."), KeyError("x")):
-        with pytest.raises(type(other)) as kept, _saying_how_to_go_on(store):
+        with pytest.raises(type(other)) as kept, _saying_how_to_go_on("tune-jobs resume mine"):
             raise other
         assert kept.value is other

@@ -224,7 +224,10 @@ class TestPostgreSQL:
 def test_a_cluster_that_does_not_answer_is_named_in_the_job(tmp_path: Path) -> None:
     store = make_sweep_folder(tmp_path / "mine")
     store.write_record(store.read_record().model_copy(update={"state": "created"}))
-    request = {"sweep": str(store.folder), "verb": "drive", "arguments": {}, "address": "127.0.0.1:1", "attempt": 1}
+    request = {
+        "sweep": str(store.folder), "verb": "drive", "arguments": {}, "address": "127.0.0.1:1", "attempt": 1,
+        "wait_for_nodes": 0.0,
+    }  # fmt: skip
     ended = _ended(request)
     assert ended.outcome == "failed"
     assert "127.0.0.1:1" in (ended.message or "")

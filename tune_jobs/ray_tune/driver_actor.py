@@ -8,7 +8,6 @@ when a client is killed, Ray ends the actor only half a minute later, and until 
 from __future__ import annotations
 
 import contextlib
-import shlex
 import threading
 import time
 from typing import Any
@@ -17,9 +16,9 @@ import ray
 from ray.exceptions import RayActorError
 
 from analysis.records import TrialRecord
-from policies.errors import CannotRunError
+from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.ray_tune.run_trials import RunJob, run_trials
-from tune_jobs.store.opening import open_sweep, others_write
+from tune_jobs.store.opening import open_sweep, others_write, resume_command
 from tune_jobs.store.record_keeper import Listener
 
 _POLL_INTERVAL_S = 0.5
@@ -74,7 +73,7 @@ def run_trials_remotely(job: RunJob, listener: Listener) -> None:
         ray.get(running)
     except (RayActorError, ConnectionError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        go_on = f"tune-jobs resume {shlex.quote(job.sweep_place)}"
+        go_on = _resume_command(job)
         raise CannotRunError(
             f"The sweep's driver on the cluster was lost: {reason}",
             f"What is done is kept; continue with `{go_on}` once the cluster works again.",
@@ -82,3 +81,10 @@ def run_trials_remotely(job: RunJob, listener: Listener) -> None:
     finally:
         with contextlib.suppress(Exception):
             ray.kill(driver)
+
+
+def _resume_command(job: RunJob) -> str:
+    store, record = open_sweep(job.sweep_place), None
+    with contextlib.suppress(TuneJobsError):
+        record = store.read_record()
+    return resume_command(store, record)

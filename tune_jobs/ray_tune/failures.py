@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 
 from ray.exceptions import OutOfMemoryError, RayActorError, RayTaskError
 
@@ -45,12 +44,12 @@ def describe_failure(error: BaseException | None, tail: str, *, timeout_s: float
     return f"{message}\n{tail}".strip()
 
 
-def going_on(error: CannotRunError, sweep: str) -> CannotRunError:
+def going_on(error: CannotRunError, command: str) -> CannotRunError:
     """Return the error that ended a run in the middle, which says how to go on too.
 
     Args:
         error: The error.
-        sweep: The sweep, as a command names it.
+        command: What goes on with it.
     """
-    how = f"What is done is kept; continue with `tune-jobs resume {shlex.quote(sweep)}`."
+    how = f"What is done is kept; continue with `{command}`."
     return CannotRunError(error.message, f"{error.hint} {how}".strip())

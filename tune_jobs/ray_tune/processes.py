@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shlex
 import signal
 import socket
 import threading
@@ -63,17 +62,16 @@ class RayDiedError(BaseException):
     """A part of Ray is gone. It is not an Exception, because Ray Tune would clean up after one, and wait for Ray."""
 
 
-def ray_died(sweep: str, death: RayDiedError) -> CannotRunError:
+def ray_died(command: str, death: RayDiedError) -> CannotRunError:
     """Return the error that reports the death of a part of Ray.
 
     Args:
-        sweep: The sweep, as a command names it.
+        command: What goes on with the sweep.
         death: The part that died.
     """
     return CannotRunError(
         f"Ray's {death} died, or does not answer any more, so no trial can run on it.",
-        "Check whether the machine ran out of memory. What is done is kept; continue with "
-        f"`tune-jobs resume {shlex.quote(sweep)}`.",
+        f"Check whether the machine ran out of memory. What is done is kept; continue with `{command}`.",
     )
 
 

@@ -44,7 +44,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.copies import remove_uncounted_copies
-from tune_jobs.store.opening import name_for_commands, open_sweep
+from tune_jobs.store.opening import open_sweep, resume_command
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.record_keeper import Listener, RecordKeeper
 from tune_jobs.store.storage_watch import StorageWatch
@@ -88,28 +88,31 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     with owner.held():
         store.clear_tune_folder()
         # Only population based training makes copies.
-        if stored_spec(store.read_record()).scheduler.type == "pbt":
+        record = store.read_record()
+        if stored_spec(record).scheduler.type == "pbt":
             with store.reading(results=False):
                 for trial_id in job.trial_ids:
                     remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
+    # Asked now, as the storage may be gone when it is told.
+    go_on = resume_command(store, record)
     with RayWatch.of_this_process() as watch:
         run = _Run(job, store, listener, owner, watch)
-        watch.when_stuck = functools.partial(_give_up, run)
+        watch.when_stuck = functools.partial(_give_up, run, go_on)
         try:
             run.all_trials()
         except (RayDiedError, Exception) as error:
             if isinstance(error, RayDiedError):
-                raise ray_died(name_for_commands(store), error) from error
+                raise ray_died(go_on, error) from error
             # Errors that Ray raises when a part of it is gone do not name the cause.
             try:
                 watch.check_after(error)
             except RayDiedError as death:
-                raise ray_died(name_for_commands(store), death) from error
-            with _saying_how_to_go_on(store):
+                raise ray_died(go_on, death) from error
+            with _saying_how_to_go_on(go_on):
                 raise
         finally:
             # What ended the run may keep the last records from being written too, and is told in this way then.
-            with current().shielded(), _saying_how_to_go_on(store):
+            with current().shielded(), _saying_how_to_go_on(go_on):
                 with contextlib.suppress(OwnershipLostError):
                     run.waits.end()
                 run.keeper.close()
@@ -117,14 +120,14 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 
 
 @contextlib.contextmanager
-def _saying_how_to_go_on(store: Sweep) -> Iterator[None]:
+def _saying_how_to_go_on(command: str) -> Iterator[None]:
     try:
         yield
     except CannotRunError as error:
         if type(error) is not CannotRunError:
             raise
         # The storage, say, can't be written any more.
-        raise going_on(error, name_for_commands(store)) from error
+        raise going_on(error, command) from error
 
 
 class _Run:
@@ -308,7 +311,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         return not self._keeper.running or time.monotonic() - self._asked_at > STOP_GRACE_S
 
 
-def _give_up(run: _Run, death: RayDiedError) -> None:
+def _give_up(run: _Run, go_on: str, death: RayDiedError) -> None:
     """Save the records and end this process, whose main thread waits for Ray; Ray would end it within a minute.
 
     This is done in the background because the main thread is blocked, so it cannot change anything meanwhile.
@@ -316,4 +319,4 @@ def _give_up(run: _Run, death: RayDiedError) -> None:
     from tune_jobs.store.closing import end_process
 
     run.keeper.close()
-    end_process(run.store, ray_died(name_for_commands(run.store), death))
+    end_process(run.store, ray_died(go_on, death))

@@ -25,7 +25,7 @@ from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
-from tune_jobs.store.urls import name_of_place
+from tune_jobs.store.urls import name_of_place, outer_place
 
 _log = logging.getLogger(__name__)
 
@@ -77,6 +77,8 @@ def _do(request: Mapping[str, Any], lock: int, log: int) -> None:
     logs.configure("text", process={"job": request["number"], "sweep": sweep}, level=logging.WARNING, anew=True)
     _log.setLevel(logging.INFO)
     _log.info("Attempt %d is run by process %d.", request["attempt"], os.getpid())
+    # Who is told how to go on asks the service, which knows its sweeps by their names.
+    os.environ["TUNE_JOBS_STORAGE"] = outer_place(request["sweep"])
     ended = _ended(request)
     _log.info("Attempt %d has ended: %s.", request["attempt"], ended.outcome)
     # Whatever comes now, the outcome is written.

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import shlex
 import time
 from collections.abc import Callable, Iterator
 
 from policies.errors import CannotRunError, TuneJobsError, said_by
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands
+from tune_jobs.store.opening import resume_command
 from tune_jobs.store.urls import is_url
 
 
@@ -30,10 +29,14 @@ def told_if_it_is_gone(store: Sweep, last_report: Callable[[], float | None]) ->
         CannotRunError: The storage can't be read, or an object store refuses, as credentials have expired, say; the
             message has the place and why, the hint how to go on.
     """
+    record = None
+    # Asked now: when it is told, nothing can be read.
+    with contextlib.suppress(TuneJobsError, OSError):
+        record = store.read_record()
+    how = f"continue with `{resume_command(store, record)}`."
     try:
         yield
     except Exception as error:
-        how = f"continue with `tune-jobs resume {shlex.quote(name_for_commands(store))}`."
         refused = _refused(store, error)
         if refused is not None:
             raise CannotRunError(refused.message, f"{refused.hint} What is done is kept; {how}".strip()) from error

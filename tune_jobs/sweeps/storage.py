@@ -12,10 +12,9 @@ from policies.errors import SpecError
 from policies.files import absolute
 from tune_jobs.spec.sweep_spec import check_sweep_name
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import is_url, open_storage
+from tune_jobs.store.opening import DEFAULT_STORAGE, is_url, open_storage
 from tune_jobs.store.urls import URL_SCHEMES, folder_of, name_of_place, outer_place
 
-DEFAULT_STORAGE = "sweeps"
 _KNOWN = ", ".join(f"{scheme}://" for scheme in URL_SCHEMES)
 _URL = re.compile(
     r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*)://(?P<bucket>[^/?]*)(?P<path>[^?]*)(?:\?(?P<query>.*))?", re.DOTALL
