@@ -11,6 +11,8 @@ import pytest
 import yaml
 from jsonschema import Draft7Validator  # type: ignore[import-untyped]
 
+from tune_jobs.cli.commands import cli
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
@@ -96,3 +98,13 @@ def test_what_is_installed_is_pinned_and_of_this_version(config: dict[str, Any])
     wheel = f"tune_jobs-{PROJECT['version']}-py3-none-any.whl"
     assert config["file_mounts"][f"~/install/{wheel}"] == f"dist/{wheel}"
     assert any(f"{wheel}[cluster]" in command for command in installs)
+
+
+def test_the_first_sweep_waits_for_the_first_machine(config: dict[str, Any]) -> None:
+    types = config["available_node_types"]
+    assert types["head"]["resources"]["CPU"] == 0
+    assert types["spot"]["min_workers"] == 0
+    told = (ROOT / "docker" / "README.md").read_text()
+    (command,) = [line for line in told.splitlines() if line.startswith("RAY_AUTH_MODE=token ray exec")]
+    words = command.rstrip("'").partition("bin/tune-jobs launch ")[2].split()
+    assert cli.commands["launch"].make_context("launch", words).params["wait_for_nodes"] > 0

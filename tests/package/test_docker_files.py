@@ -183,6 +183,7 @@ def test_the_service_is_asked_for_what_it_has_and_stopped_after_sweeps_have_save
     given = serve.make_context("serve", options).params
     assert (given["address"], given["host"], given["port"]) == ("ray://head:10001", "0.0.0.0", 8470)
     assert given["drain_s"] < int(service["stop_grace_period"].removesuffix("s"))
+    assert given["wait_for_nodes"] > 0
     assert f":{given['port']}/readyz" in service["healthcheck"]["test"][-1]
     # A folder of its own: with sweeps in a bucket there is no other.
     assert f"service:{given['folder']}" in service["volumes"]

@@ -264,6 +264,7 @@ def test_a_job_resumes_its_sweep_or_launches_it(folder: str, kind: str) -> None:
     assert [name for name, _ in commands] == ["resume", "launch"]
     given = cli.commands["launch"].make_context("launch", commands[1][1].split()).params
     assert given["address"] == "auto"
+    assert given["wait_for_nodes"] > 0
     assert commands[0][1].split()[0] == given["name"]
     assert "[ $? -eq 4 ]" in job["entrypoint"]
     head = job["rayClusterSpec"]["headGroupSpec"]["template"]["spec"]
@@ -289,6 +290,8 @@ def test_the_service_is_asked_for_what_it_has(storage: str) -> None:
     assert (program, command) == ("tune-jobs", "serve")
     given = serve.make_context("serve", options).params
     assert given["address"] == f"ray://{cluster['metadata']['name']}-head-svc:{PORTS['client']}"
+    # There may be no worker.
+    assert given["wait_for_nodes"] > 0
     assert (given["host"], given["port"]) == ("0.0.0.0", container["ports"][0]["containerPort"])
     assert given["public_names"] == (service["metadata"]["name"],)
     # With sweeps in a bucket, too, the service has a folder: one pod's.
