@@ -27,11 +27,11 @@ def main() -> None:
     options, _ = parser.parse_known_args()
     raylet = os.getppid()
     for name in _PORTS:
-        place = options.session_dir / f"{name}_{options.node_id}"
+        told = options.session_dir / f"{name}_{options.node_id}"
         # The raylet looks for it continually, and must not see it empty.
-        unfinished = place.with_suffix(".new")
+        unfinished = told.with_suffix(".new")
         unfinished.write_text(_NOWHERE, encoding="ascii")
-        unfinished.replace(place)
+        unfinished.replace(told)
     while os.getppid() == raylet:
         time.sleep(_INTERVAL_S)
 
