@@ -127,7 +127,7 @@ def test_two_writes_at_once_that_the_store_refuses_both_are_done_again(
         (403, "RequestTimeTooSkewed", "clock"),
         (400, "ExpiredToken", "has expired"),
         (400, "AuthorizationHeaderMalformed", r"\?region="),
-        (301, "PermanentRedirect", r"\?region="),
+        (301, "PermanentRedirect", r"\?region=REGION to .* `curl -sI https://sweeps.s3.amazonaws.com` tells it"),
         (404, "NoSuchBucket", "Make the bucket"),
     ],
 )

@@ -107,12 +107,20 @@ def _hint(status: int, code: str, text: str, place: str) -> str:
     if code == "RequestTimeTooSkewed":
         return "Set this machine's clock: it differs from the store's by more than that allows."
     if status == 301 or code in _REGION:
-        told = _REGION_TOLD.search(text)
-        region = told[1] if told is not None else "REGION"
-        return f"The bucket is in another region: add ?region={region} to the storage's address."
+        return _region_hint(text, place)
     if status in (401, 403) or (status == 400 and not code):
         return _credentials(place)
     return ""
+
+
+def _region_hint(text: str, place: str) -> str:
+    told, hint = _REGION_TOLD.search(text), "The bucket is in another region: add ?region={} to the storage's address."
+    if told is not None:
+        return hint.format(told[1])
+    # AWS says it in a header of its redirect, which obstore 0.12 does not hand on.
+    bucket = place.partition("://")[2].partition("/")[0]
+    look = f" At AWS, `curl -sI https://{bucket}.s3.amazonaws.com` tells it: x-amz-bucket-region."
+    return hint.format("REGION") + (look if place.startswith("s3://") else "")
 
 
 def _first_line(text: str) -> str:
