@@ -12,7 +12,7 @@ import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, Self, cast, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -160,7 +160,7 @@ class Evaluator:
         results: dict[int, tuple[float, int]] = {}
         running = [_Running(env, *waiting.popleft()) for env in self._envs[: len(self.seeds)]]
         while running:
-            actions = cast("NDArray[Any]", policy.act(np.stack([episode.observation for episode in running])))
+            actions = policy.act_on_rows(np.stack([episode.observation for episode in running]))
             for episode, action in zip(running, actions, strict=True):
                 if episode.step(action) or episode.length >= self.max_episode_steps:
                     results[episode.index] = (episode.total, episode.length)
@@ -385,7 +385,7 @@ class _CartPoles:
         running = np.ones(num_episodes, dtype=bool)
         actions = np.zeros(env.num_envs, dtype=np.int64)
         for _ in range(max_episode_steps):
-            actions[:num_episodes] = policy.act(observations[:num_episodes])
+            actions[:num_episodes] = policy.act_on_rows(observations[:num_episodes])
             observations, rewards, terminated, truncated, _ = env.step(actions)
             # Sub-environments whose episode has ended begin further ones by themselves, which do not count.
             returns[running] += rewards[:num_episodes][running]

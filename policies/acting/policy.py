@@ -24,6 +24,7 @@ from typing_extensions import override
 
 from policies import random_streams
 from policies.envs.action_bounds import ToBounds
+from policies.envs.flat import FlatBox
 from policies.envs.make import check_env
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
@@ -67,11 +68,12 @@ class Policy(ABC):
         self.env_args = dict(env_args or {})
         self.description = description
 
-    def act(self, observations: ArrayLike) -> Action:
+    def act(self, observations: Any) -> Action:
         """Return the greedy action for one observation, or for each observation of a batch.
 
         Args:
-            observations: Shape: that of one observation, or (num, *that shape).
+            observations: Shape: that of one observation, or (num, *that shape). Where observations were made vectors
+                (`policies.envs.flat`), also what the environment itself gives: a dict, a tuple, a choice.
 
         Returns:
             For one observation, what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
@@ -82,10 +84,12 @@ class Policy(ABC):
         """
         shape = self.observation_space.shape or ()
         try:
+            if isinstance(self.observation_space, FlatBox):
+                observations = self.observation_space.flat_or_own(observations)
             batch = np.asarray(observations, dtype=np.float32)
         except (TypeError, ValueError) as error:
             raise ObservationError(
-                f"Observations must be numbers of shape {shape}: {error}.",
+                f"Observations of {self.env_id} must be {self._wanted()}: {error}.",
                 "Pass what env.reset or env.step returned.",
             ) from error
         single = batch.ndim == len(shape)
@@ -101,6 +105,15 @@ class Policy(ABC):
         return (
             int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", actions[0])
         )
+
+    def act_on_rows(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """Return the greedy actions, shape (num,) or (num, action_dim), for vectors or images of shape (num, ...)."""
+        return self._act_batch(np.asarray(observations, dtype=np.float32))
+
+    def _wanted(self) -> str:
+        numbers = f"numbers of shape {self.observation_space.shape}"
+        space = self.observation_space
+        return f"of {space.original}, or {numbers}" if isinstance(space, FlatBox) else numbers
 
     def check_finite(self) -> None:  # noqa: B027 (a baseline has no weights)
         """Raise an error unless all weights are finite.

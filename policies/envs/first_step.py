@@ -16,6 +16,7 @@ import numpy as np
 
 from policies.envs.checked import is_sound, reward_as_number
 from policies.envs.faults import env_failed
+from policies.envs.flat import FlatBox, needs_flattening
 from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
@@ -150,6 +151,8 @@ def _is_bool(value: Any) -> bool:
 
 
 def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
+    if needs_flattening(space):
+        return _unflattened_problem(observation, space)
     wanted = np.dtype(space.dtype)
     try:
         array = np.asarray(observation)
@@ -163,6 +166,15 @@ def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
     for place in np.ndindex(array.shape) if not is_sound(array) else ():
         if not is_sound(value := np.asarray(array[place])):
             return f"observations that are not finite: {value} at {list(place)}{_if_finite(value)}"
+    return None
+
+
+def _unflattened_problem(observation: Any, space: gym.Space[Any]) -> str | None:
+    """What is wrong with an environment's own observation, which a wrapper could not make a vector."""
+    try:
+        FlatBox(space).flat(observation)
+    except ValueError as error:
+        return str(error)
     return None
 
 

@@ -26,6 +26,7 @@ from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.envs.faults import close_env, is_of_env
 from policies.envs.first_step import check_first_step
+from policies.envs.flat import FlatBox, UnsupportedMemberError, flattened, is_flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
 from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint
@@ -115,7 +116,8 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
             max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
-            has_vector_entry_point=not wrappers.pixels and _takes_vector_entry_point(spec, kwargs),
+            has_vector_entry_point=not (wrappers.pixels or is_flattened(env))
+            and _takes_vector_entry_point(spec, kwargs),
             failure=failure_rule(env_id, spec, env.metadata, kwargs),
         )
         _check_observation_space(info)
@@ -178,14 +180,18 @@ def make_vector_env(
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
+            env = None
             if not wrappers.pixels and _takes_vector_entry_point(spec, kwargs):
                 env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
-            else:
+                if needs_flattening(env.single_observation_space):
+                    close_env(env)
+                    env = None
+            if env is None:
                 if wrappers.pixels:
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
                 env = gym.make_vec(
                     spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
-                    wrappers=(wrappers.wrap_pixels, PlainSteps), **kwargs,
+                    wrappers=(wrappers.wrap_pixels, flattened, PlainSteps), **kwargs,
                 )  # fmt: skip
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
@@ -310,25 +316,17 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
 
 def _check_observation_space(info: EnvInfo) -> None:
     space = info.observation_space
-    if not isinstance(space, gym.spaces.Box):
-        raise EnvError(
-            f"{info.env_id} has observations of kind {type(space).__name__} ({space}); only Box observations are "
-            "supported: vectors of numbers, and images.",
-            observation_hint(info.env_id, space),
-        )
-    if len(space.shape) not in (1, 3) or 0 in space.shape:
-        raise EnvError(
-            f"{info.env_id} has observations of shape {space.shape}; only vectors, of shape (n,), and images, of shape "
-            "(rows, columns, channels), are supported.",
-            observation_hint(info.env_id, space),
-        )
-    if not np.issubdtype(space.dtype, np.floating) and not (info.observes_images and space.dtype == np.uint8):
-        kinds = "bytes (uint8) and floating-point numbers" if info.observes_images else "floating-point observations"
-        raise EnvError(
-            f"{info.env_id} has {'images' if info.observes_images else 'observations'} of dtype {space.dtype}; only "
-            f"{kinds} are supported.",
-            f"{observation_hint(info.env_id, space)} Scale them to about [-1, 1] there, or set normalize_observations.",
-        )
+    if not needs_flattening(space):
+        return
+    # It would have been made vectors, if that could be done.
+    hint = observation_hint(info.env_id, space)
+    try:
+        FlatBox(space)
+    except UnsupportedMemberError as error:
+        raise EnvError(f"{info.env_id} has observations of which no vector can be made: {error}.", hint) from error
+    except ValueError as error:
+        raise EnvError(f"{info.env_id} cannot be trained on: {error} ({space}).", hint) from error
+    raise EnvError(f"{info.env_id} has observations {space}, which were not made vectors.", hint)
 
 
 def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:

@@ -11,27 +11,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-_HOW = "Wrap it in a module of your own, as 'Other spaces' in docs/guides/own-environment.md shows"
+_HOW = "Wrap it in a module of your own, as 'Spaces' in docs/guides/own-environment.md shows"
 _MAX_COMBINATIONS = 10_000
 
 
 def observation_hint(env_id: str, space: gym.Space[Any]) -> str:
-    """Suggest what turns these observations into vectors of float32, or into images."""
-    if not space.is_np_flattenable or 0 in (space.shape or ()):
-        return f"{_HOW}, in a gymnasium.ObservationWrapper that makes a vector of float32 of an observation."
-    env, dimensions = _make(env_id), len(space.shape or ()) if isinstance(space, gym.spaces.Box) else 0
-    if dimensions == 2 and space.dtype == np.uint8:
-        env = f"gymnasium.wrappers.ReshapeObservation({env}, {(*(space.shape or ()), 1)})"
-        return f"{_HOW}: `{env}` makes images of one channel of them."
-    if dimensions not in (1, 3):
-        env = f"gymnasium.wrappers.FlattenObservation({env})"
-    if not np.issubdtype(gym.spaces.flatten_space(space).dtype, np.floating):
-        env = f"gymnasium.wrappers.DtypeObservation({env}, numpy.float32)"
-    has_choices = any(isinstance(part, (gym.spaces.Discrete, gym.spaces.MultiDiscrete)) for part in _parts(space))
-    what = (
-        "images" if dimensions == 3 else "vectors, with a 1 at the place of each choice," if has_choices else "vectors"
-    )
-    return f"{_HOW}: `{env}` makes {what} of float32 of them."
+    """Suggest what makes vectors of observations of which `policies.envs.flat` makes none."""
+    # Texts are: Gymnasium counts their letters.
+    if space.is_np_flattenable and 0 not in (space.shape or ()):
+        flat = f"gymnasium.wrappers.FlattenObservation({_make(env_id)})"
+        return f"{_HOW}: `{flat}` makes vectors of them."
+    return f"{_HOW}, in a gymnasium.ObservationWrapper that makes a vector of float32 of an observation."
 
 
 def action_hint(env_id: str, space: gym.Space[Any]) -> str:
@@ -59,14 +49,6 @@ def action_hint(env_id: str, space: gym.Space[Any]) -> str:
 def _make(env_id: str) -> str:
     module, colon, name = env_id.partition(":")
     return f"{module}.{name}()" if colon and name.isidentifier() else f"gymnasium.make({env_id!r})"
-
-
-def _parts(space: gym.Space[Any]) -> list[gym.Space[Any]]:
-    if isinstance(space, gym.spaces.Dict):
-        return [part for inner in space.spaces.values() for part in _parts(inner)]
-    if isinstance(space, gym.spaces.Tuple):
-        return [part for inner in space.spaces for part in _parts(inner)]
-    return [space]
 
 
 def _combinations(space: gym.Space[Any]) -> tuple[int, ...] | None:

@@ -1,4 +1,4 @@
-"""Write Box and Discrete spaces as JSON objects and read them again, and choose the dtype of observations."""
+"""Write spaces as JSON objects and read them again, and choose the dtype of observations."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.flat import MAX_SIZE, FlatBox
 from policies.errors import MALFORMED, CheckpointError
 
-_MAX_SIZE = 10_000_000
-"""The most numbers an observation may have: 25 times as many as four frames of an Atari screen."""
+_FLAT = "made_of"
+"""In the description of the vectors that observations are made, the space of the observations themselves."""
 
 
 def observation_dtype(space: gym.Space[Any]) -> type[np.uint8 | np.float32]:
@@ -25,22 +26,46 @@ def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
     """Return a Box or Discrete space as a JSON object.
 
     Infinite bounds become the strings "inf" and "-inf". Bounds that are all equal become one number, because the bounds
-    of an image would fill pages.
+    of an image would fill pages. A `FlatBox` has a key for the space that it is made of, too.
 
     Raises:
         CheckpointError: The space is of another kind.
     """
+    if isinstance(space, FlatBox):
+        return {**_describe_box(space), _FLAT: _describe_any(space.original)}
+    if isinstance(space, gym.spaces.Box | gym.spaces.Discrete):
+        return _describe_any(space)
+    raise _cannot_describe(space)
+
+
+def _describe_any(space: gym.Space[Any]) -> dict[str, Any]:
     if isinstance(space, gym.spaces.Box):
-        return {
-            "type": "box",
-            "shape": [int(size) for size in space.shape],
-            "low": _bounds_to_json(space.low),
-            "high": _bounds_to_json(space.high),
-            "dtype": str(space.dtype),
-        }
+        return _describe_box(space)
     if isinstance(space, gym.spaces.Discrete):
         return {"type": "discrete", "n": int(space.n), "start": int(space.start)}
-    raise CheckpointError(
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return {"type": "multi_discrete", "nvec": space.nvec.tolist(), "start": space.start.tolist()}
+    if isinstance(space, gym.spaces.MultiBinary):
+        return {"type": "multi_binary", "shape": [int(size) for size in space.shape]}
+    if isinstance(space, gym.spaces.Dict):
+        return {"type": "dict", "members": [[key, _describe_any(inner)] for key, inner in space.spaces.items()]}
+    if isinstance(space, gym.spaces.Tuple):
+        return {"type": "tuple", "members": [_describe_any(inner) for inner in space.spaces]}
+    raise _cannot_describe(space)
+
+
+def _describe_box(space: gym.spaces.Box) -> dict[str, Any]:
+    return {
+        "type": "box",
+        "shape": [int(size) for size in space.shape],
+        "low": _bounds_to_json(space.low),
+        "high": _bounds_to_json(space.high),
+        "dtype": str(space.dtype),
+    }
+
+
+def _cannot_describe(space: gym.Space[Any]) -> CheckpointError:
+    return CheckpointError(
         f"A policy file cannot describe a space of kind {type(space).__name__}.",
         "Use Box or Discrete spaces.",
     )
@@ -53,25 +78,52 @@ def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | g
         CheckpointError: The description is incomplete or contradicts itself.
     """
     try:
-        if description["type"] == "discrete":
-            return gym.spaces.Discrete(int(description["n"]), start=int(description.get("start", 0)))
-        if description["type"] == "box":
-            dtype = np.dtype(description["dtype"])
-            shape = tuple(int(size) for size in description["shape"])
-            # Checked before an array of that size is made.
-            if min(shape, default=0) < 0 or math.prod(shape) > _MAX_SIZE:
-                raise ValueError(f"its shape is {shape}")
-            low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))
-            return gym.spaces.Box(low, high, shape, dtype.type)
+        if (original := description.get(_FLAT)) is not None:
+            made = FlatBox(_any_from_description(original))
+            if list(made.shape) != list(description["shape"]) or str(made.dtype) != description["dtype"]:
+                raise ValueError(f"a {_FLAT} that makes {made}")
+            return made
+        space = _any_from_description(description) if description["type"] in ("box", "discrete") else None
     except MALFORMED as error:
         raise CheckpointError(
             f"A space is described as {str(description)[:200]}, which makes none: {str(error)[:200]}.",
             "Write the policy file again from its checkpoint.",
         ) from error
+    if isinstance(space, gym.spaces.Box | gym.spaces.Discrete):
+        return space
     raise CheckpointError(
         f"A space is described as of type {str(description['type'])[:80]!r}; known are 'box' and 'discrete'.",
         "Write the policy file again from its checkpoint, or update tune-jobs.",
     )
+
+
+def _any_from_description(description: Mapping[str, Any]) -> gym.Space[Any]:
+    kind = description["type"]
+    if kind == "discrete":
+        return gym.spaces.Discrete(int(description["n"]), start=int(description.get("start", 0)))
+    if kind == "multi_discrete":
+        nvec, start = (np.array(description[key], np.int64) for key in ("nvec", "start"))
+        return gym.spaces.MultiDiscrete(nvec, start=start)
+    if kind == "multi_binary":
+        shape = _checked_shape(description)
+        return gym.spaces.MultiBinary(shape if len(shape) != 1 else shape[0])
+    if kind == "dict":
+        return gym.spaces.Dict({key: _any_from_description(inner) for key, inner in description["members"]})
+    if kind == "tuple":
+        return gym.spaces.Tuple([_any_from_description(inner) for inner in description["members"]])
+    if kind == "box":
+        dtype, shape = np.dtype(description["dtype"]), _checked_shape(description)
+        low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))
+        return gym.spaces.Box(low, high, shape, dtype.type)
+    raise ValueError(f"no space is of type {str(kind)[:80]!r}")
+
+
+def _checked_shape(description: Mapping[str, Any]) -> tuple[int, ...]:
+    shape = tuple(int(size) for size in description["shape"])
+    # Checked before an array of that size is made.
+    if min(shape, default=0) < 0 or math.prod(shape) > MAX_SIZE:
+        raise ValueError(f"its shape is {shape}")
+    return shape
 
 
 def _bounds_to_json(bounds: NDArray[Any]) -> Any:

@@ -20,6 +20,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from policies.envs.failures import FailureRule
+from policies.envs.flat import flattened
 from policies.errors import EnvError
 
 FRAME_STACK, PIXELS = "frame_stack", "pixels"
@@ -52,8 +53,11 @@ class ObservationWrappers:
         return cls(frames, pixels)
 
     def wrap(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-        """Return an environment with these wrappers; for pixels, it must have been made with a render mode."""
-        env = self.wrap_pixels(env)
+        """Return an environment with these wrappers; for pixels, it must have been made with a render mode.
+
+        What it observes is made vectors, or images, first.
+        """
+        env = flattened(self.wrap_pixels(env))
         return StackFrames(env, self.frame_stack) if self.frame_stack > 1 else env
 
     def wrap_pixels(self, env: gym.Env[Any, Any]) -> Any:

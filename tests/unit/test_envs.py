@@ -145,13 +145,8 @@ def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error() -> None
 @pytest.mark.parametrize(
     ("spaces", "words"),
     [
-        ({"observation_space": gym.spaces.Discrete(4)}, "observations of kind Discrete.*only Box"),
-        ({"observation_space": gym.spaces.Box(0, 255, (8, 8), np.uint8)}, r"shape \(8, 8\)"),
-        ({"observation_space": gym.spaces.Box(0, 255, (8, 0, 3), np.uint8)}, r"shape \(8, 0, 3\)"),
-        ({"observation_space": gym.spaces.Box(0, 255, (8, 8, 3), np.int64)}, "images of dtype int64.*uint8"),
-        ({"observation_space": gym.spaces.Box(-1, 1, ())}, r"shape \(\)"),
-        ({"observation_space": gym.spaces.Box(0, 255, (4,), np.uint8)}, "dtype uint8"),
-        ({"observation_space": gym.spaces.Dict(a=gym.spaces.Discrete(2))}, "kind Dict"),
+        ({"observation_space": gym.spaces.Box(0, 255, (8, 0, 3), np.uint8)}, "have 0 numbers"),
+        ({"observation_space": gym.spaces.Dict(a=gym.spaces.Text(2))}, r"observation\['a'\] is of kind Text"),
         ({"action_space": gym.spaces.MultiDiscrete([2, 2])}, "actions of kind MultiDiscrete"),
         ({"action_space": gym.spaces.Box(-1, 1, (2, 2))}, r"actions of shape \(2, 2\)"),
         ({"action_space": gym.spaces.Box(0, 5, (2,), np.int32)}, "int32"),

@@ -17,8 +17,9 @@ from pydantic import TypeAdapter
 from analysis.numbering import planned_places
 from analysis.records import FINISHED, ChosenPointRecord, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
+from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo
-from policies.errors import MALFORMED, CannotRunError, SpecError, said_by
+from policies.errors import MALFORMED, CannotRunError, SpecError, said_by, shortened
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams
@@ -333,6 +334,10 @@ def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
             f"The space has no random domain, so num_samples {spec.num_samples} repeats every point; "
             "seeds_per_point does that and averages over the seeds."
         )
+    seen = env.observation_space
+    if isinstance(seen, FlatBox):
+        kind = "images of shape" if env.observes_images else "vectors of shape"
+        notes.append(f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}.")
     target = spec.stop.training_return
     if env.threshold is not None and target is not None and target < env.threshold:
         notes.append(

@@ -64,7 +64,7 @@ class BaselineEngine:
         goal = self._num_env_steps + self._hyperparams.env_steps_per_iteration
         finished: list[tuple[float, int]] = []
         while self._num_env_steps < goal:
-            actions = cast("NDArray[Any]", self._policy.act(self._observations))
+            actions = self._policy.act_on_rows(self._observations)
             self._observations, rewards, terminated, truncated, _ = self._env.step(actions)
             # NEXT_STEP autoreset: the step after an episode's last one only resets; it is no env step.
             running = ~self._ended

@@ -240,6 +240,68 @@ class Precise(gym.Env[NDArray[Any], Any]):
         return self._observation(), float(np.sum(action)), self.ticks >= 10, False, {}
 
 
+_BITS = gym.spaces.Box(0, 1, (1, 2), np.int64)
+SECRETS: dict[str, gym.Space[Any]] = {
+    "discrete": gym.spaces.Discrete(4, start=2),
+    "multi-discrete": gym.spaces.MultiDiscrete([2, 2], start=[1, 0]),
+    "multi-binary": gym.spaces.MultiBinary(2),
+    "matrix of whole numbers": _BITS,
+    "infinite bounds": gym.spaces.Box(-np.inf, np.inf, (2, 2), np.float64),
+    "tuple": gym.spaces.Tuple((gym.spaces.Discrete(2), gym.spaces.MultiBinary(1))),
+    "nested dict": gym.spaces.Dict(
+        {
+            "second": gym.spaces.Tuple((gym.spaces.Discrete(2), gym.spaces.Box(-1.0, 1.0, (2, 1), np.float32))),
+            "first": gym.spaces.Dict({"bit": gym.spaces.MultiBinary(1), "choices": gym.spaces.MultiDiscrete([3, 2])}),
+        }
+    ),
+}
+
+
+class Secret(gym.Env[Any, np.int64]):
+    """The observation tells which of four actions is the right one, in a space of each kind.
+
+    16 steps; the reward is 1 for the right action. Always the same action gets 4 of 16, on average.
+
+    Args:
+        kind: A key of `SECRETS`.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, *, kind: str) -> None:
+        self.kind = kind
+        self.observation_space = SECRETS[kind]
+        self.action_space = gym.spaces.Discrete(4)
+        self.right, self.ticks = 0, 0
+
+    def _observation(self) -> Any:
+        self.right = int(self.np_random.integers(4))
+        first, second = divmod(self.right, 2)
+        noise = self.np_random.uniform(-1.0, 1.0, (2, 1)).astype(np.float32)
+        return {
+            "discrete": np.int64(2 + self.right),
+            "multi-discrete": np.array([1 + first, second]),
+            "multi-binary": np.array([first, second], np.int8),
+            "matrix of whole numbers": np.array([[first, second]]),
+            "infinite bounds": np.eye(4)[self.right].reshape(2, 2),
+            "tuple": (first, np.array([second], np.int8)),
+            "nested dict": {
+                "first": {"bit": np.array([first], np.int8), "choices": np.array([self.ticks % 3, 1])},
+                "second": (second, noise),
+            },
+        }[self.kind]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.ticks = 0
+        return self._observation(), {}
+
+    def step(self, action: np.int64) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.ticks += 1
+        reward = float(action == self.right)
+        return self._observation(), reward, self.ticks >= 16, False, {}
+
+
 def register() -> None:
     """What the entry point names; more than once does no harm."""
     for env_id, entry_point, limit in (
@@ -248,6 +310,7 @@ def register() -> None:
         ("TestLaps-v0", Laps, None),
         ("TestShades-v0", Shades, None),
         ("TestPrecise-v0", Precise, None),
+        ("TestSecret-v0", Secret, None),
     ):
         if env_id not in gym.registry:
             # Gymnasium's type asks for classes that take any keywords.

@@ -1,0 +1,269 @@
+"""Make vectors of observations that are none: choices, dicts, tuples, matrices and whole numbers, also nested.
+
+Networks take vectors of floating-point numbers and images. What else an environment observes is made one of these
+where the environment is made, so that training, evaluation, videos and whoever asks a policy see the same:
+
+* a choice (Discrete, each number of a MultiDiscrete) becomes as many numbers as there are choices, with a 1 at the
+  place of the one that was made, and 0 elsewhere;
+* a MultiBinary becomes its zeros and ones; a Box of any shape and dtype its numbers, as float32 and not scaled;
+* a Dict and a Tuple become the numbers of their members, one after another, a Dict's in the order of Gymnasium's Dict;
+* a picture of one channel, uint8 of shape (rows, columns), becomes (rows, columns, 1); one whose numbers are neither
+  bytes nor floating-point becomes float32.
+
+All but the last is what `gymnasium.spaces.flatten` does, which says less about an observation that does not fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from policies.errors import shortened
+
+MAX_SIZE = 10_000_000
+"""The most numbers an observation may have: 25 times as many as four frames of an Atari screen."""
+_IMAGE = 3
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A member of a space that has none itself, and where its numbers stand."""
+
+    keys: tuple[Any, ...]
+    space: gym.Space[Any]
+    start: int
+    end: int
+
+
+class UnsupportedMemberError(ValueError):
+    """A space has a member of which no vector can be made; `place` and `space` say which."""
+
+    def __init__(self, place: str, space: gym.Space[Any]) -> None:
+        super().__init__(f"{place} is of kind {type(space).__name__} ({shortened(space)})")
+        self.place, self.space = place, space
+
+
+class FlatBox(gym.spaces.Box):
+    """The vectors, or images, that observations of another space are made.
+
+    Args:
+        original: The environment's own space.
+
+    Attributes:
+        original: The same.
+
+    Raises:
+        UnsupportedMemberError: A member of the space is of a kind of which no vector can be made.
+        ValueError: The vectors would have no numbers, or more than `MAX_SIZE`.
+    """
+
+    def __init__(self, original: gym.Space[Any]) -> None:
+        self.original = original
+        sizes = [(keys, space, _size(keys, space)) for keys, space in _leaves(original, ())]
+        total = sum(size for _, _, size in sizes)
+        if not 0 < total <= MAX_SIZE:
+            raise ValueError(f"its observations have {total:,} numbers; from 1 to {MAX_SIZE:,} can be trained on")
+        parts, end = [], 0
+        for keys, space, size in sizes:
+            parts.append(_Part(keys, space, end, end := end + size))
+        self._parts = tuple(parts)
+        low, high = np.zeros(total, np.float32), np.ones(total, np.float32)
+        # Bounds beyond what 32 bits hold are infinite there.
+        with np.errstate(over="ignore"):
+            for part in parts:
+                if isinstance(part.space, gym.spaces.Box):
+                    low[part.start : part.end] = part.space.low.ravel()
+                    high[part.start : part.end] = part.space.high.ravel()
+        shape, dtype = _shape_and_dtype(original, total)
+        super().__init__(low.reshape(shape).astype(dtype), high.reshape(shape).astype(dtype), shape, dtype)
+
+    def flat(self, observation: Any) -> NDArray[Any]:
+        """Return the vector, or image, of one observation of the environment's own.
+
+        Raises:
+            ValueError: The observation is not of the space; the message says where, and fits behind "returns".
+        """
+        numbers = np.zeros(self._parts[-1].end, np.float32)
+        for part in self._parts:
+            value = observation
+            for depth, key in enumerate(part.keys):
+                value = _member(value, key, _named(part.keys[:depth]))
+            _write(numbers[part.start : part.end], part.space, value, _named(part.keys))
+        return numbers.reshape(self.shape).astype(self.dtype, copy=False)
+
+    def flat_or_own(self, observations: Any) -> Any:
+        """Return vectors: what is one, or a batch of them, as it is; one observation of the environment's own as one.
+
+        A list of such observations, or an array of choices, is a batch; one of shape (1, n), if the environment's are
+        of that shape, is an observation and not a batch of one vector.
+
+        Raises:
+            ValueError: It is neither.
+        """
+        if isinstance(self.original, gym.spaces.Discrete):
+            values = np.asarray(observations)
+            if values.dtype.kind not in "iu" or values.ndim > 1:
+                return observations
+            is_one = values.ndim == 0
+        elif isinstance(self.original, gym.spaces.Dict | gym.spaces.Tuple):
+            is_one = isinstance(observations, Mapping | tuple)
+            first = observations[0] if isinstance(observations, list) and observations else None
+            if not is_one and not isinstance(first, Mapping | tuple):
+                return observations
+        else:
+            shape, own = np.shape(observations), self.original.shape or ()
+            is_one = shape == own
+            if self.shape in (own, shape) or not (is_one or shape[1:] == own):
+                return observations
+        return self.flat(observations) if is_one else self._batch(observations)
+
+    def _batch(self, observations: Any) -> NDArray[Any]:
+        return np.stack([self.flat(one) for one in observations])
+
+    @override
+    def __repr__(self) -> str:
+        return f"{super().__repr__()} of {self.original}"
+
+    @override
+    def __eq__(self, other: object) -> bool:
+        # A vector is a vector, whatever it was made of: policies fit, and are said to.
+        return super().__eq__(other)
+
+    __hash__ = None  # type: ignore[assignment]  # as a Box's
+
+
+class FlatObservations(gym.ObservationWrapper[Any, Any, Any]):
+    """Observe the vectors, or images, that a `FlatBox` makes."""
+
+    def __init__(self, env: gym.Env[Any, Any], space: FlatBox) -> None:
+        super().__init__(env)
+        self.observation_space = self._space = space
+
+    def observation(self, observation: Any) -> NDArray[Any]:
+        """Return the vector, or image, of an observation.
+
+        Raises:
+            ValueError: The observation is not of the environment's space.
+        """
+        try:
+            return self._space.flat(observation)
+        except ValueError as error:
+            raise ValueError(f"the environment returned {error}") from None
+
+
+def needs_flattening(space: gym.Space[Any]) -> bool:
+    """Whether a space is neither of vectors of floating-point numbers nor of images."""
+    if not isinstance(space, gym.spaces.Box) or 0 in space.shape:
+        return True
+    is_float = np.issubdtype(space.dtype, np.floating)
+    if len(space.shape) == _IMAGE:
+        return not is_float and space.dtype != np.uint8
+    return len(space.shape) != 1 or not is_float
+
+
+def flattened(env: gym.Env[Any, Any]) -> Any:
+    """Return an environment that observes vectors or images: itself if it does, or if none can be made."""
+    space = env.observation_space
+    if not isinstance(space, gym.Space) or not needs_flattening(space):
+        return env
+    try:
+        return FlatObservations(env, FlatBox(space))
+    except ValueError:
+        # Said by who checks the environment.
+        return env
+
+
+def is_flattened(env: gym.Env[Any, Any]) -> bool:
+    """Whether a wrapper of this environment makes vectors of its observations."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, FlatObservations):
+            return True
+        env = env.env
+    return False
+
+
+def _leaves(space: gym.Space[Any], keys: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], gym.Space[Any]]]:
+    if isinstance(space, gym.spaces.Dict):
+        for key, inner in space.spaces.items():
+            yield from _leaves(inner, (*keys, key))
+    elif isinstance(space, gym.spaces.Tuple):
+        for index, inner in enumerate(space.spaces):
+            yield from _leaves(inner, (*keys, index))
+    else:
+        yield keys, space
+
+
+def _size(keys: tuple[Any, ...], space: gym.Space[Any]) -> int:
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.n)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return int(np.sum(space.nvec, dtype=np.int64))
+    if isinstance(space, (gym.spaces.Box, gym.spaces.MultiBinary)):
+        return math.prod(space.shape)
+    raise UnsupportedMemberError(_named(keys), space)
+
+
+def _shape_and_dtype(original: gym.Space[Any], total: int) -> tuple[tuple[int, ...], Any]:
+    if isinstance(original, gym.spaces.Box):
+        if len(original.shape) == _IMAGE:
+            return original.shape, np.float32
+        if len(original.shape) == _IMAGE - 1 and original.dtype == np.uint8:
+            return (*original.shape, 1), np.uint8
+    return (total,), np.float32
+
+
+def _named(keys: tuple[Any, ...]) -> str:
+    return "observation" + "".join(f"[{key!r}]" for key in keys)
+
+
+def _member(value: Any, key: Any, place: str) -> Any:
+    try:
+        return value[key]
+    except (KeyError, IndexError, TypeError):
+        kind = "tuple" if isinstance(key, int) else "dict"
+        what = f"with no member {key!r}" if isinstance(value, Mapping | tuple | list) else f"that is no {kind}"
+        raise ValueError(f"{shortened(value)} as {place}, {what}") from None
+
+
+def _write(numbers: NDArray[np.float32], space: gym.Space[Any], value: Any, place: str) -> None:
+    """Write the numbers of one member, all zero so far.
+
+    Raises:
+        ValueError: The value is not of the space.
+    """
+    try:
+        array = np.asarray(value)
+    except Exception:  # noqa: BLE001 (ragged lists, say)
+        array = np.empty(0, dtype=object)
+    shape = space.shape or ()
+    # A number alone may come as an array of one.
+    if array.dtype.kind not in "biuf" or not (array.shape == shape or (shape == () and array.size == 1)):
+        wanted = f"numbers of shape {shape}" if shape else "a number"
+        raise ValueError(f"{shortened(value)} as {place}, not {wanted}")
+    if isinstance(space, gym.spaces.Box):
+        with np.errstate(over="ignore"):
+            numbers[:] = array.ravel()
+        return
+    if array.dtype.kind not in "biu":
+        raise ValueError(f"{shortened(value)} as {place}, not whole numbers")
+    if isinstance(space, gym.spaces.MultiBinary):
+        if not np.isin(array, (0, 1)).all():
+            raise ValueError(f"{shortened(value)} as {place}, not zeros and ones")
+        numbers[:] = array.ravel()
+        return
+    if isinstance(space, gym.spaces.Discrete):
+        sizes, start = np.array([space.n]), np.array([space.start])
+    else:
+        several = cast("gym.spaces.MultiDiscrete", space)
+        sizes, start = several.nvec.ravel(), several.start.ravel()
+    choices = array.ravel().astype(np.int64) - start
+    if not ((choices >= 0) & (choices < sizes)).all():
+        raise ValueError(f"{shortened(value)} as {place}, which is outside of {space}")
+    numbers[np.cumsum(sizes) - sizes + choices] = 1.0
