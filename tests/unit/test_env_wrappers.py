@@ -122,13 +122,31 @@ def test_stacked_frames_of_the_vectorised_cartpole_begin_anew_for_each_part() ->
     assert resets > 4
 
 
-def test_what_is_neither_vector_nor_image_does_not_stack() -> None:
+def test_what_is_neither_vector_nor_image_is_made_a_vector_and_stacked() -> None:
     gym.register("TestGrid-v0", cast("Any", lambda: gym.wrappers.ReshapeObservation(Counter(), (1, 2))))
     try:
-        with pytest.raises(EnvError, match=r"TestGrid-v0 has frame_stack 2, .*\(1, 2\)"):
-            make_env("TestGrid-v0", {"frame_stack": 2})
+        env = make_env("TestGrid-v0", {"frame_stack": 2})
+        plain = make_env("TestGrid-v0")
     finally:
         del gym.registry["TestGrid-v0"]
+    first, second = plain.reset()[0], plain.step(0)[0]
+    assert first.shape == (2,)
+    np.testing.assert_array_equal(env.reset()[0], [*first, *first])
+    np.testing.assert_array_equal(env.step(0)[0], [*first, *second])
+
+
+def test_what_no_vector_can_be_made_of_does_not_stack() -> None:
+    class Reads(Counter):
+        def __init__(self) -> None:
+            super().__init__()
+            self.observation_space = gym.spaces.Text(3)
+
+    gym.register("TestText-v0", cast("Any", Reads))
+    try:
+        with pytest.raises(EnvError, match=r"TestText-v0 has frame_stack 2, .*Text"):
+            make_env("TestText-v0", {"frame_stack": 2})
+    finally:
+        del gym.registry["TestText-v0"]
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.0, True, "4", None])
