@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,8 +22,10 @@ from tests.benchmarks.ppo import machine_name
 
 Row = tuple[str, str, str]
 _MOST_MS, _MOST_BYTES = 9.0, 2 * 1024**3
-_NUM_NODES, _CPUS_A_NODE = 3, 8
-WORK_S = 3.0
+_NUM_NODES, _CPUS_A_NODE = 3, 16
+_FEW_AT_ONCE = 24
+"""As each process takes three seconds of CPU time to start, a small sweep has fewer than there are places."""
+WORK_S, _LONG_S = 3.0, 60.0
 _FEW = 300
 
 
@@ -79,35 +82,39 @@ class Case:
 
 
 def cases(num_trials: int) -> list[Case]:
-    """What is measured.
+    """What is measured beside the largest sweep.
 
     Args:
-        num_trials: Of the largest sweep.
+        num_trials: Of each, at most.
     """
-    few, at_once = min(num_trials, _FEW), _NUM_NODES * _CPUS_A_NODE
-    found = [
+    few, at_once = min(num_trials, _FEW), _FEW_AT_ONCE
+    return [
+        Case("waits", f"1 trial of {_LONG_S:g} s", waiting(1, 1, work_s=_LONG_S, reports=1)),
         Case("single", f"{few:,} single trials, 1 report each", waiting(few, at_once, reports=1)),
         Case("single", f"{few:,} single trials, 6 reports each", waiting(few, at_once, reports=6)),
         Case("objects", f"{few:,} single trials in an object store", waiting(few, at_once)),
         Case("packed", f"{few:,} packed trials", packed(few)),
+        Case("single", f"{few:,} single trials x {WORK_S:g} s", waiting(few, at_once)),
     ]
-    return [
-        *found, *(Case("single", f"{num:,} single trials x {WORK_S:g} s", waiting(num, at_once)) for num in
-                  sorted({few, num_trials})),
-    ]  # fmt: skip
 
 
-def rows(num_trials: int, save: Path | None = None) -> list[Row]:
+def largest(num_trials: int) -> Case:
+    """The largest sweep, on all places that there are."""
+    name = f"{num_trials:,} single trials x {WORK_S:g} s"
+    return Case("single", name, waiting(num_trials, _NUM_NODES * _CPUS_A_NODE))
+
+
+def rows(cases: Sequence[Case], save: Path | None = None) -> list[Row]:
     """Measure and return the rows.
 
     Args:
-        num_trials: Of the largest sweep.
-        save: A file for what was measured, which `model` reads; None: it is only told.
+        cases: What to measure.
+        save: A file for what was measured, which `model` reads, added to what it has; None: it is only told.
     """
     found: list[Row] = []
-    kept = []
+    kept = json.loads(save.read_text(encoding="utf-8"))["sweeps"] if save is not None and save.exists() else []
     with nodes.cluster(_NUM_NODES, _CPUS_A_NODE) as here:
-        for case in cases(num_trials):
+        for case in cases:
             driven = nodes.drive(here, case.settings, objects=case.kind == "objects")
             found += _told(case.name, driven)
             kept.append({"kind": case.kind, "name": case.name, "driven": driven.as_json()})
@@ -119,6 +126,9 @@ def rows(num_trials: int, save: Path | None = None) -> list[Row]:
 
 
 def _told(name: str, driven: Driven) -> list[Row]:
+    if driven.num_trials == 1:
+        share = 1e3 * driven.run_cpu_s / driven.run_wall_s
+        return [(f"CPU ms of the driver a second, {name}", f"{share:.1f}, its start included", "-")]
     others = ", ".join(f"{kind} {1e3 * used / driven.num_trials:.1f}" for kind, used in driven.daemons_cpu_s.items())
     requests = f", {sum(driven.num_requests.values()) / driven.num_trials:.1f} requests" if driven.num_requests else ""
     told = (

@@ -17,4 +17,14 @@ def rows(repeats: int, num_trials: int, save: Path | None) -> list[Row]:
         num_trials: Of the largest sweep.
         save: As for `costs.rows`.
     """
-    return [*scaling.rows(repeats), *costs.rows(num_trials, save)]
+    return [*scaling.rows(repeats), *costs.rows(costs.cases(num_trials), save), *largest(num_trials, save)]
+
+
+def largest(num_trials: int, save: Path | None) -> list[Row]:
+    """Measure the largest sweep alone.
+
+    Args:
+        num_trials: Its trials.
+        save: As for `costs.rows`.
+    """
+    return costs.rows([costs.largest(num_trials)], save)
