@@ -31,6 +31,9 @@ def image() -> Iterator[Image]:
         yield image
 
 
+MOST_BYTES = 1_500_000_000
+
+
 def canonical(name: str) -> str:
     """A package's name as the index compares it."""
     return re.sub("[-_.]+", "-", name).lower()
@@ -53,6 +56,17 @@ def test_the_image_holds_the_pinned_versions_and_nothing_runs_as_root(image: Ima
     assert image.run(["touch", "/opt/tune-jobs/file"], environment={}).returncode != 0
     assert image.run(["touch", "/sweeps/file"], environment={}).returncode == 0
     assert image.run(["rm", "/sweeps/file"], environment={}).returncode == 0
+
+
+def test_the_image_is_no_larger_than_promised(image: Image) -> None:
+    built = ["python", "-c", "import torch; print(torch.version.cuda)"]
+    if image.run(built, environment=image.environment).stdout.strip() != "None":
+        pytest.skip("the index has PyTorch's build for CUDA")
+    done = image.run(["du", "--bytes", "--apparent-size", "--summarize", "/opt/tune-jobs"], environment={})
+    installed = int(done.stdout.split()[0])
+    # Its publisher's figure; no engine builds it here.
+    base = 130_000_000
+    assert installed + base < MOST_BYTES, installed
 
 
 def test_the_composed_services_run_a_sweep_on_two_workers(image: Image, tmp_path: Path) -> None:
