@@ -12,6 +12,7 @@ import ray
 from ray.air.execution._internal import RayActorManager
 from ray.exceptions import ActorUnavailableError, OutOfMemoryError, RayActorError, RayTaskError
 from ray.tune.experiment import Trial
+from tune_trial import TuneTrial
 
 from tune_jobs.ray_tune.failures import describe_failure
 from tune_jobs.ray_tune.lost_nodes import DrainNotice, NodeLeavesError, NodeLosses, node_that_left
@@ -80,18 +81,6 @@ def test_a_process_learns_that_its_node_is_drained(nodes: dict[str, Any]) -> Non
         node_that_left(RayTaskError("step", "a traceback", notice.error())) == "Node 10.0.0.7 (aaaaaaaa) was drained."
     )
     assert isinstance(notice.error(), NodeLeavesError)
-
-
-class TuneTrial(Trial):  # type: ignore[misc]
-    """As much of a trial of Tune's as counts failures."""
-
-    local_path = None
-
-    def __init__(self) -> None:
-        self.trial_id = "1"
-        # A restore that fails is counted too.
-        self.temporary_state = types.SimpleNamespace(restoring_from=None)
-        self.run_metadata = types.SimpleNamespace(num_failures=0, invalidate_cache=lambda: None)
 
 
 def test_losses_are_not_counted_until_there_is_nothing_else(nodes: dict[str, Any]) -> None:

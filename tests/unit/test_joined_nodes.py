@@ -11,6 +11,7 @@ from ray.exceptions import RayTaskError
 from ray.tune import PlacementGroupFactory
 from ray.tune.experiment import Trial
 from sweep_folders import make_sweep_folder
+from tune_trial import TuneTrial
 
 from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune import joined_nodes
@@ -89,18 +90,6 @@ def test_a_process_that_is_refused_begins_nothing(store: SweepStore, kind: Any) 
     if kind is PackTrainable:
         process.cleanup()
     assert sorted(store.folder.rglob("*")) == before
-
-
-class TuneTrial(Trial):  # type: ignore[misc]
-    """As much of a trial of Tune's as counts failures and is placed."""
-
-    local_path = None
-
-    def __init__(self) -> None:
-        self.trial_id = "1"
-        self.temporary_state = types.SimpleNamespace(restoring_from=None)
-        self.run_metadata = types.SimpleNamespace(num_failures=0, invalidate_cache=lambda: None)
-        self.placement_group_factory = PlacementGroupFactory([{"CPU": 1}, {"CPU": 2}], strategy="SPREAD")
 
 
 def test_a_trial_that_is_refused_has_not_failed_and_goes_elsewhere_but_not_for_ever() -> None:
