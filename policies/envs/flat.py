@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -40,6 +40,12 @@ class _Part:
     space: gym.Space[Any]
     start: int
     end: int
+    sizes: NDArray[np.int64]
+    """How many values each choice has; empty: it is none."""
+    lowest: NDArray[np.int64]
+    """The lowest value of each choice."""
+    offsets: NDArray[np.int64]
+    """Where the numbers of each choice begin, counted from `start`."""
 
 
 class UnsupportedMemberError(ValueError):
@@ -66,14 +72,10 @@ class FlatBox(gym.spaces.Box):
 
     def __init__(self, original: gym.Space[Any]) -> None:
         self.original = original
-        sizes = [(keys, space, _size(keys, space)) for keys, space in _leaves(original, ())]
-        total = sum(size for _, _, size in sizes)
+        self._parts = parts = _parts_of(original)
+        total = parts[-1].end if parts else 0
         if not 0 < total <= MAX_SIZE:
             raise ValueError(f"its observations have {total:,} numbers; from 1 to {MAX_SIZE:,} can be trained on")
-        parts, end = [], 0
-        for keys, space, size in sizes:
-            parts.append(_Part(keys, space, end, end := end + size))
-        self._parts = tuple(parts)
         low, high = np.zeros(total, np.float32), np.ones(total, np.float32)
         # Bounds beyond what 32 bits hold are infinite there.
         with np.errstate(over="ignore"):
@@ -92,10 +94,7 @@ class FlatBox(gym.spaces.Box):
         """
         numbers = np.zeros(self._parts[-1].end, np.float32)
         for part in self._parts:
-            value = observation
-            for depth, key in enumerate(part.keys):
-                value = _member(value, key, _named(part.keys[:depth]))
-            _write(numbers[part.start : part.end], part.space, value, _named(part.keys))
+            _write(numbers[part.start : part.end], part, _member(observation, part.keys))
         return numbers.reshape(self.shape).astype(self.dtype, copy=False)
 
     def flat_or_own(self, observations: Any) -> Any:
@@ -130,13 +129,6 @@ class FlatBox(gym.spaces.Box):
     @override
     def __repr__(self) -> str:
         return f"{super().__repr__()} of {self.original}"
-
-    @override
-    def __eq__(self, other: object) -> bool:
-        # A vector is a vector, whatever it was made of: policies fit, and are said to.
-        return super().__eq__(other)
-
-    __hash__ = None  # type: ignore[assignment]  # as a Box's
 
 
 class FlatObservations(gym.ObservationWrapper[Any, Any, Any]):
@@ -200,14 +192,19 @@ def _leaves(space: gym.Space[Any], keys: tuple[Any, ...]) -> Iterator[tuple[tupl
         yield keys, space
 
 
-def _size(keys: tuple[Any, ...], space: gym.Space[Any]) -> int:
-    if isinstance(space, gym.spaces.Discrete):
-        return int(space.n)
-    if isinstance(space, gym.spaces.MultiDiscrete):
-        return int(np.sum(space.nvec, dtype=np.int64))
-    if isinstance(space, (gym.spaces.Box, gym.spaces.MultiBinary)):
-        return math.prod(space.shape)
-    raise UnsupportedMemberError(_named(keys), space)
+def _parts_of(space: gym.Space[Any]) -> tuple[_Part, ...]:
+    parts, end = list[_Part](), 0
+    for keys, leaf in _leaves(space, ()):
+        sizes, lowest = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        if isinstance(leaf, gym.spaces.Discrete):
+            sizes, lowest = np.array([leaf.n], np.int64), np.array([leaf.start], np.int64)
+        elif isinstance(leaf, gym.spaces.MultiDiscrete):
+            sizes, lowest = (values.ravel().astype(np.int64) for values in (leaf.nvec, leaf.start))
+        elif not isinstance(leaf, gym.spaces.Box | gym.spaces.MultiBinary):
+            raise UnsupportedMemberError(_named(keys), leaf)
+        size = int(sizes.sum()) if sizes.size else math.prod(leaf.shape or ())
+        parts.append(_Part(keys, leaf, end, end := end + size, sizes, lowest, np.cumsum(sizes) - sizes))
+    return tuple(parts)
 
 
 def _shape_and_dtype(original: gym.Space[Any], total: int) -> tuple[tuple[int, ...], Any]:
@@ -223,47 +220,54 @@ def _named(keys: tuple[Any, ...]) -> str:
     return "observation" + "".join(f"[{key!r}]" for key in keys)
 
 
-def _member(value: Any, key: Any, place: str) -> Any:
-    try:
-        return value[key]
-    except (KeyError, IndexError, TypeError):
-        kind = "tuple" if isinstance(key, int) else "dict"
-        what = f"with no member {key!r}" if isinstance(value, Mapping | tuple | list) else f"that is no {kind}"
-        raise ValueError(f"{shortened(value)} as {place}, {what}") from None
+def _member(observation: Any, keys: tuple[Any, ...]) -> Any:
+    """Return the member of an observation that some keys lead to.
+
+    Raises:
+        ValueError: There is none.
+    """
+    value = observation
+    for depth, key in enumerate(keys):
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError):
+            kind = "tuple" if isinstance(key, int) else "dict"
+            what = f"with no member {key!r}" if isinstance(value, Mapping | tuple | list) else f"that is no {kind}"
+            raise ValueError(f"{shortened(value)} as {_named(keys[:depth])}, {what}") from None
+    return value
 
 
-def _write(numbers: NDArray[np.float32], space: gym.Space[Any], value: Any, place: str) -> None:
+def _write(numbers: NDArray[np.float32], part: _Part, value: Any) -> None:
     """Write the numbers of one member, all zero so far.
 
     Raises:
-        ValueError: The value is not of the space.
+        ValueError: The value is not of its space.
     """
+    if problem := _written(numbers, part, value):
+        raise ValueError(f"{shortened(value)} as {_named(part.keys)}, {problem}")
+
+
+def _written(numbers: NDArray[np.float32], part: _Part, value: Any) -> str:
+    """Write them; return what is wrong with the value, as words behind it, or nothing."""
     try:
         array = np.asarray(value)
     except Exception:  # noqa: BLE001 (ragged lists, say)
         array = np.empty(0, dtype=object)
-    shape = space.shape or ()
+    shape = part.space.shape or ()
     # A number alone may come as an array of one.
     if array.dtype.kind not in "biuf" or not (array.shape == shape or (shape == () and array.size == 1)):
-        wanted = f"numbers of shape {shape}" if shape else "a number"
-        raise ValueError(f"{shortened(value)} as {place}, not {wanted}")
-    if isinstance(space, gym.spaces.Box):
+        return f"not numbers of shape {shape}" if shape else "not a number"
+    if isinstance(part.space, gym.spaces.Box):
         with np.errstate(over="ignore"):
             numbers[:] = array.ravel()
-        return
+        return ""
     if array.dtype.kind not in "biu":
-        raise ValueError(f"{shortened(value)} as {place}, not whole numbers")
-    if isinstance(space, gym.spaces.MultiBinary):
-        if not np.isin(array, (0, 1)).all():
-            raise ValueError(f"{shortened(value)} as {place}, not zeros and ones")
+        return "not whole numbers"
+    if part.sizes.size == 0:
         numbers[:] = array.ravel()
-        return
-    if isinstance(space, gym.spaces.Discrete):
-        sizes, start = np.array([space.n]), np.array([space.start])
-    else:
-        several = cast("gym.spaces.MultiDiscrete", space)
-        sizes, start = several.nvec.ravel(), several.start.ravel()
-    choices = array.ravel().astype(np.int64) - start
-    if not ((choices >= 0) & (choices < sizes)).all():
-        raise ValueError(f"{shortened(value)} as {place}, which is outside of {space}")
-    numbers[np.cumsum(sizes) - sizes + choices] = 1.0
+        return "" if ((array == 0) | (array == 1)).all() else "not zeros and ones"
+    choices = array.ravel().astype(np.int64) - part.lowest
+    if not ((choices >= 0) & (choices < part.sizes)).all():
+        return f"which is outside of {part.space}"
+    numbers[part.offsets + choices] = 1.0
+    return ""

@@ -180,12 +180,7 @@ def make_vector_env(
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
-            env = None
-            if not wrappers.pixels and _takes_vector_entry_point(spec, kwargs):
-                env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
-                if needs_flattening(env.single_observation_space):
-                    close_env(env)
-                    env = None
+            env = None if wrappers.pixels else _own_vector_env(spec, num_envs, kwargs)
             if env is None:
                 if wrappers.pixels:
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
@@ -277,6 +272,19 @@ def _check_limit(env_id: str, limit: Any) -> None:
             f"The env argument 'max_episode_steps' of {env_id} is {limit!r}; it must be a whole number >= 1.",
             "Correct it, or leave it out to keep the env's own limit.",
         )
+
+
+def _own_vector_env(
+    spec: EnvSpec, num_envs: int, env_args: dict[str, Any]
+) -> gym.vector.VectorEnv[Any, Any, Any] | None:
+    """Make the env's own vectorised version; None: it has none, or that observes neither vectors nor images."""
+    if not _takes_vector_entry_point(spec, env_args):
+        return None
+    env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **env_args)
+    if not needs_flattening(env.single_observation_space):
+        return env
+    close_env(env)
+    return None
 
 
 def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:

@@ -1,10 +1,12 @@
 """The model of clusters that are not at hand, against what was measured on one that is and against what is known."""
 
+import dataclasses
 import json
 from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.cluster.costs import wait_ms_a_trial
 from tests.benchmarks.cluster.measured import Driven
 from tests.benchmarks.cluster.model import Costs, Load, fitted, limits, predicted_cpu_s, read, table, used
 
@@ -17,6 +19,12 @@ def _driven(num_trials: int, num_reports: int, cpu_s: float) -> Driven:
         num_trials, {}, num_reports, run_cpu_s=0.0, run_wall_s=0.0, launch_cpu_s=cpu_s, launch_wall_s=0.0, peak_bytes=0,
         work_s=0.0, daemons_cpu_s={"gcs_server": 0.002 * num_trials},
     )  # fmt: skip
+
+
+def test_what_a_sweep_takes_beyond_its_trials_work() -> None:
+    driven = dataclasses.replace(_driven(100, 100, 1.0), run_wall_s=8.0, work_s=300.0)
+    # 50 at once: 6 s at least, and so 2 s too many.
+    assert wait_ms_a_trial(driven, 50) == pytest.approx(20.0)
 
 
 def test_costs_are_found_again() -> None:

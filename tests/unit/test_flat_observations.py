@@ -233,9 +233,26 @@ def test_a_damaged_description_is_refused(change: dict[str, Any]) -> None:
         space_from_description(description)
 
 
-def test_an_environment_with_a_vectorised_version_is_stepped_one_by_one_if_that_observes_no_vectors() -> None:
-    assert not check_env("CliffWalking-v1", None, "dqn").has_vector_entry_point
-    envs = make_vector_env("CliffWalking-v1", None, 2)
+def test_an_environment_with_a_vectorised_version_is_stepped_one_by_one_if_that_observes_no_vectors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    closed: list[int] = []
+
+    class Many(gym.vector.SyncVectorEnv):
+        def __init__(self, num_envs: int) -> None:
+            super().__init__([lambda: Samples(spaces.Discrete(4), [])] * num_envs)
+
+        def close_extras(self, **kwargs: Any) -> None:
+            super().close_extras(**kwargs)
+            closed.append(self.num_envs)
+
+    monkeypatch.setitem(gym.registry, "Many-v0", None)
+    del gym.registry["Many-v0"]
+    one = cast("Any", lambda: Samples(spaces.Discrete(4), []))
+    gym.register("Many-v0", one, vector_entry_point=cast("Any", Many))
+    assert not check_env("Many-v0", None, "dqn").has_vector_entry_point
+    envs = make_vector_env("Many-v0", None, 2)
+    assert closed == [2]
     rows, _ = envs.reset(seed=0)
-    assert rows.shape == (2, 48)
+    assert rows.shape == (2, 4)
     assert rows.sum() == 2

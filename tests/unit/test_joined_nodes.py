@@ -18,6 +18,8 @@ from tune_jobs.ray_tune import joined_nodes
 from tune_jobs.ray_tune.joined_nodes import refusal
 from tune_jobs.ray_tune.lost_nodes import NodeLosses, NodeRefusedError
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
+from tune_jobs.ray_tune.processes import RayWatch
+from tune_jobs.ray_tune.run_trials import RunJob, _Run
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.store.sweep_store import SweepStore
 
@@ -45,6 +47,18 @@ def test_where_no_node_can_join_nothing_is_looked_at(store: SweepStore, monkeypa
     monkeypatch.setattr(joined_nodes, "open_sweep", None)
     monkeypatch.setattr(joined_nodes, "versions", None)
     assert refusal({"sweep_place": store.place, "trial_id": "t0000"}) is None
+
+
+@pytest.mark.parametrize("address", [None, "10.0.0.1:6379"])
+def test_the_driver_tells_its_versions_where_nodes_can_join(store: SweepStore, address: str | None) -> None:
+    store.write_record(store.read_record().model_copy(update={"address": address}))
+    owner = store.take()
+    job = RunJob(store.place, ("t0000",), cpus_per_trial=1, gpus_per_trial=0, max_concurrent=1)
+    run = _Run(job, store, lambda _: None, owner, RayWatch({}, grace_s=1.0))
+    told = run._config
+    run.keeper.close()
+    assert ("versions" in told) is (address is not None)
+    assert address is None or json.loads(told["versions"]) == versions()
 
 
 def test_versions_are_compared_with_the_drivers(store: SweepStore) -> None:

@@ -62,7 +62,11 @@ def test_the_agent_says_that_it_listens_nowhere_and_ends_with_its_parent(tmp_pat
     node = "a1" * 28
     command = [sys.executable, idle_agent.__file__, f"--session-dir={tmp_path}", f"--node-id={node}", "--head"]
     # Its parent is a process that ends when its input does.
-    script = "import subprocess, sys; print(subprocess.Popen(sys.argv[1:]).pid, flush=True); sys.stdin.read()"
+    script = """if True:
+        import subprocess, sys
+        print(subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL).pid, flush=True)
+        sys.stdin.read()
+    """
     parent = subprocess.Popen(
         [sys.executable, "-c", script, *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

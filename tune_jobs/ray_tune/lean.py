@@ -11,6 +11,8 @@ from ray.air.execution._internal import RayActorManager
 from ray.tune.execution.tune_controller import TuneController
 from ray.tune.experiment import Trial
 
+from tune_jobs.ray_tune.replaced import replaced
+
 _Report = TypeVar("_Report")
 
 
@@ -34,23 +36,13 @@ _WAIT_S = 0.5
 def lean_run() -> Iterator[None]:
     """Spare Tune, in the block, what nobody reads; nothing public of Ray 2.60 leaves any of it out."""
     with (
-        _replaced(TuneController, "_get_trial_checkpoints", _no_trials),
-        _replaced(TuneController, "checkpoint", _at_the_end(TuneController.checkpoint)),
-        _replaced(RayActorManager, "next", _waiting_longer(RayActorManager.next)),
-        _replaced(Trial, "get_trainable_cls", _once(Trial.get_trainable_cls)),
-        _replaced(Trial, "set_ray_actor", _not_asked),
+        replaced(TuneController, "_get_trial_checkpoints", _no_trials),
+        replaced(TuneController, "checkpoint", _at_the_end(TuneController.checkpoint)),
+        replaced(RayActorManager, "next", _waiting_longer(RayActorManager.next)),
+        replaced(Trial, "get_trainable_cls", _once(Trial.get_trainable_cls)),
+        replaced(Trial, "set_ray_actor", _not_asked),
     ):
         yield
-
-
-@contextlib.contextmanager
-def _replaced(owner: Any, name: str, value: Callable[..., Any]) -> Iterator[None]:
-    original = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, original)
 
 
 def _no_trials(_: Any) -> dict[str, str]:

@@ -20,6 +20,7 @@ from policies.envs.modules import module_folders
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.ray_tune.environment import provide_token
+from tune_jobs.ray_tune.replaced import replaced
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
@@ -63,12 +64,8 @@ def at_loopback() -> Iterator[None]:
     all addresses; but not on macOS and Windows, nor where this says that it is on one of them. A process that joins
     such a Ray has to do so too.
     """
-    constants: Any = ray._private.ray_constants  # noqa: SLF001
-    original, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
-    try:
+    with replaced(ray._private.ray_constants, "ENABLE_RAY_CLUSTER", value=False):  # noqa: SLF001
         yield
-    finally:
-        constants.ENABLE_RAY_CLUSTER = original
 
 
 _UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
@@ -82,14 +79,11 @@ def _without_unused_processes() -> Iterator[None]:
     trial, 200 MB of memory, and a second at the end. Nothing public of Ray 2.60 leaves them out.
     """
     node: Any = ray._private.node.Node  # noqa: SLF001
-    originals = {name: getattr(node, name) for name in _UNUSED if hasattr(node, name)}
-    for name in originals:
-        setattr(node, name, lambda *_, **__: None)
-    try:
+    with contextlib.ExitStack() as stack:
+        for name in _UNUSED:
+            if hasattr(node, name):
+                stack.enter_context(replaced(node, name, lambda *_, **__: None))
         yield
-    finally:
-        for name, original in originals.items():
-            setattr(node, name, original)
 
 
 _AGENT = "--dashboard_agent_command="
@@ -108,11 +102,8 @@ def without_dashboards_agent() -> Iterator[None]:
     def start(command: list[str], *args: Any, **kwargs: Any) -> Any:
         return original([_of_an_idle_agent(part) for part in command], *args, **kwargs)
 
-    services.start_ray_process = start
-    try:
+    with replaced(services, "start_ray_process", start):
         yield
-    finally:
-        services.start_ray_process = original
 
 
 def _of_an_idle_agent(part: str) -> str:
@@ -155,20 +146,14 @@ def without_environments() -> Iterator[None]:
     """
     from ray.tune.execution import class_cache
 
-    cache: Any = class_cache._ActorClassCache  # noqa: SLF001
-    original = cache.get
-
     def get(self: Any, trainable: type[Any]) -> Any:
         known = self._cache
         if trainable not in known:
             known[trainable] = ray.remote(trainable)
         return known[trainable]
 
-    cache.get = get
-    try:
+    with replaced(class_cache._ActorClassCache, "get", get):  # noqa: SLF001
         yield
-    finally:
-        cache.get = original
 
 
 def first_line(error: Exception) -> str:

@@ -20,6 +20,7 @@ from ray.tune.experiment import Trial
 from ray.util.placement_group import NODE_ID_LABEL_KEY
 
 from policies.errors import TuneJobsError
+from tune_jobs.ray_tune.replaced import replaced
 
 _CONNECT_TIMEOUT_S = 2.0
 # A machine that is taken away says so 30 s before at the least (Google Cloud); Ray is asked by each training process.
@@ -98,11 +99,8 @@ def _surviving_lack_of_memory() -> Iterator[None]:
             exception = died
         original(manager, tracked_actor_task=tracked_actor_task, exception=exception)
 
-    RayActorManager._actor_task_failed = failed  # noqa: SLF001
-    try:
+    with replaced(RayActorManager, "_actor_task_failed", failed):
         yield
-    finally:
-        RayActorManager._actor_task_failed = original  # noqa: SLF001
 
 
 class NodeLosses:
@@ -141,12 +139,8 @@ class NodeLosses:
                 trial.run_metadata.num_failures = counted
                 trial.run_metadata.invalidate_cache()
 
-        Trial.handle_error = handle_error
-        try:
-            with _surviving_lack_of_memory():
-                yield
-        finally:
-            Trial.handle_error = original
+        with replaced(Trial, "handle_error", handle_error), _surviving_lack_of_memory():
+            yield
 
     def take(self, trial: Trial) -> str:
         """Return the node whose loss was the trial's last error, once; empty: it was a failure."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 from analysis.records import TRIAL_ID_PATTERN
@@ -137,6 +138,15 @@ def stamp_of(path: str | Path) -> tuple[int, ...]:
     except OSError:
         return ()
     return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def not_older(files: Iterable[Path], others: Iterable[Path]) -> bool:
+    """Whether files exist that were written when others were, or later; others that do not exist do not count."""
+    try:
+        oldest = min(path.stat().st_mtime_ns for path in files)
+        return all(path.stat().st_mtime_ns <= oldest for path in others if path.exists())
+    except OSError:
+        return False
 
 
 def remove_folder(folder: Path) -> None:

@@ -26,6 +26,7 @@ from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.places import (
     is_trial_id,
     names_in,
+    not_older,
     parts_of,
     refuse_link,
     refuse_links_in,
@@ -264,7 +265,7 @@ class SweepStore:
         except (CheckpointError, NotFoundError):
             return False
         # Older versions wrote no such record, and neither does a process that is ended while it films.
-        return self.has_best() and _not_older(films, [self.best_folder / names.BEST_RECORD])
+        return self.has_best() and not_older(films, [self.best_folder / names.BEST_RECORD])
 
     def current_films(self) -> dict[str, Path]:
         """Return all films, if they are of the present winner; see `Sweep.current_films`."""
@@ -285,7 +286,7 @@ class SweepStore:
         """Return the report's page, if nothing that it shows was written since; see `Sweep.current_report`."""
         page = within(self.report_folder, names.REPORT_PAGE)
         shown = [self.record_path, self.best_folder / names.BEST_RECORD, *self.films().values()]
-        return page if _not_older([page], shown) else None
+        return page if not_older([page], shown) else None
 
     def report_files(self) -> dict[str, Path]:
         """Return the report's files by their paths in its folder; see `Sweep.report_files`."""
@@ -373,15 +374,6 @@ class SweepStore:
             f"A cluster still runs sweep {self.name}, for a process that has ended.",
             "Try again in a minute: the cluster is ending the run.",
         )
-
-
-def _not_older(files: Iterable[Path], others: Iterable[Path]) -> bool:
-    """Whether files exist that were written when others were, or later; others that do not exist do not count."""
-    try:
-        oldest = min(path.stat().st_mtime_ns for path in files)
-        return all(path.stat().st_mtime_ns <= oldest for path in others if path.exists())
-    except OSError:
-        return False
 
 
 def name_taken(folder: Path) -> SpecError:

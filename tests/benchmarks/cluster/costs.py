@@ -144,9 +144,10 @@ def _told(name: str, driven: Driven, places: int) -> list[Row]:
         f"{driven.launch_ms_a_trial:.1f} (trials alone {driven.run_ms_a_trial:.1f}; {driven.reports_a_trial:.1f} "
         f"reports{requests}; beside it, Ray's {others}; {driven.run_wall_s:.0f} s)"
     )
+    # In a small sweep it is what processes take to start.
     waited = [(f"ms a trial beyond its work, {name}", f"{wait_ms_a_trial(driven, places):.1f}", f"<= {_MOST_MS:g}")]
     return [
-        *(waited if places else []),
+        *(waited if places > _FEW_AT_ONCE else []),
         (f"CPU ms of the driver a trial, {name}", told, f"<= {_MOST_MS:g}"),
         (f"  memory, {name}", f"{math.ceil(driven.peak_bytes / 2**20):,} MiB", f"<= {_MOST_BYTES // 2**20:,} MiB"),
     ]

@@ -240,12 +240,11 @@ class Precise(gym.Env[NDArray[Any], Any]):
         return self._observation(), float(np.sum(action)), self.ticks >= 10, False, {}
 
 
-_BITS = gym.spaces.Box(0, 1, (1, 2), np.int64)
 SECRETS: dict[str, gym.Space[Any]] = {
     "discrete": gym.spaces.Discrete(4, start=2),
     "multi-discrete": gym.spaces.MultiDiscrete([2, 2], start=[1, 0]),
     "multi-binary": gym.spaces.MultiBinary(2),
-    "matrix of whole numbers": _BITS,
+    "matrix of whole numbers": gym.spaces.Box(0, 1, (1, 2), np.int64),
     "infinite bounds": gym.spaces.Box(-np.inf, np.inf, (2, 2), np.float64),
     "tuple": gym.spaces.Tuple((gym.spaces.Discrete(2), gym.spaces.MultiBinary(1))),
     "nested dict": gym.spaces.Dict(
