@@ -10,7 +10,8 @@ from test_sweeps import assert_results_without_gaps, launch, make_spec, snapshot
 from analysis.records import TrialRecord
 from tests.narrowing import present
 from tune_jobs.ray_tune import searcher
-from tune_jobs.search.tpe import Check, propose_point
+from tune_jobs.search.asking import Check
+from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.domains import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec

@@ -206,7 +206,8 @@ def test_tpe_learns_from_a_point_inside_and_proposes_the_same_with_one_outside()
     from test_tpe import make_spec as tpe_spec
     from test_tpe import record, valley
 
-    from tune_jobs.search.tpe import _known_trials, propose_point
+    from tune_jobs.search.history import known_points
+    from tune_jobs.search.proposal import propose_point
     from tune_jobs.spec.domains import draw_point
 
     spec = tpe_spec(startup=8)
@@ -215,7 +216,7 @@ def test_tpe_learns_from_a_point_inside_and_proposes_the_same_with_one_outside()
     inside = record(8, {"lr": 1e-3, "activation": "silu"}, 50.0)
     beyond = record(8, {"lr": 0.5, "activation": "silu"}, 50.0)
     assert OWN["lr"] == {"loguniform": [1e-5, 1e-1]}
-    assert len(_known_trials(spec, [*records, inside])) == 9
+    assert len(known_points(spec, [*records, inside])) == 9
     # Its index among the drawn points is the same, and so is what is proposed.
     assert propose_point(spec, [*records, beyond], 8, lambda point: None) == before
     assert propose_point(spec, [*records, inside], 8, lambda point: None) != before

@@ -16,7 +16,8 @@ from policies.errors import CannotRunError, SpecError
 from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
-from tune_jobs.search.tpe import _known_trials, propose_point
+from tune_jobs.search.history import known_points
+from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.domains import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -240,5 +241,5 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.Monkey
 def test_the_model_learns_from_the_score_that_the_selection_goes_by() -> None:
     spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
     one = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0})
-    (known,) = _known_trials(spec, [one])
-    assert known.value == present(score_trial(one)).score == 3.0
+    (known,) = known_points(spec, [one])
+    assert known.score == present(score_trial(one)).score == 3.0

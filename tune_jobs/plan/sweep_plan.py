@@ -34,7 +34,7 @@ from tune_jobs.plan.points import num_points_of, num_trials_of, place_of_point, 
 from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.chosen_point import outside_notes
 from tune_jobs.search.points import largest_hyperparams, planned_points
-from tune_jobs.search.tpe import check_installed
+from tune_jobs.search.proposal import check_installed
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.hyperparam_problems import check_distinct
 from tune_jobs.spec.rules import idle_settings
@@ -158,8 +158,7 @@ def make_plan(
             a hyperparameter that can't act, or lists one value in two forms.
         CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
-    if spec.search.type == "tpe":
-        check_installed()
+    check_installed(spec.search.type)
     if not records:
         check_distinct(spec.algorithm, spec.space)
     check_env_args(spec)

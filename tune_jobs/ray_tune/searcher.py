@@ -14,7 +14,7 @@ from analysis.numbering import drawn_index
 from analysis.records import SweepRecord, TrialRecord
 from policies.hyperparams import Hyperparams
 from tune_jobs.plan.points import point_hyperparams
-from tune_jobs.search.tpe import propose_point
+from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.transitions import begun, with_point
 

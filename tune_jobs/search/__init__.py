@@ -1,1 +1,1 @@
-"""Choose the points of a sweep: grid, random draws, TPE, and mutations."""
+"""Choose the points of a sweep: grid, random draws, models of the trials that ended, and mutations."""

@@ -1,0 +1,87 @@
+"""What a search method is told of the points that were tried before.
+
+A point is known to a method by its values, by what became of each of its seeds, and by how far it got:
+
+- ended: of each seed its best evaluation return, which the selection compares too; None for one that failed or was
+  never evaluated with a finite return, which counts as worse than all that was;
+- ended early by a scheduler: the same, and the rung that its first trial reached;
+- running: the scores of those seeds that have ended;
+- planned, but not begun, or chosen by somebody with a value that the search could not give: nothing, as a model has no
+  place for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.records import FINISHED, TrialRecord
+from analysis.selection import score_trial
+from tune_jobs.search.chosen_point import outside
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+@dataclass(frozen=True)
+class KnownPoint:
+    """A point that was tried, or is being tried."""
+
+    point: Mapping[str, Any]
+    """Its values by the names of the space."""
+    scores: tuple[float | None, ...] = ()
+    """What its ended seeds reached, higher is better, in reward units; None: that seed failed or was never scored."""
+    is_running: bool = False
+    """Whether at least one of its seeds has not ended."""
+    level: int | None = None
+    """The rung at which a scheduler ended it; None: none did."""
+
+    @property
+    def score(self) -> float | None:
+        """The mean over its seeds; None: it has none, or one of them failed."""
+        known = [score for score in self.scores if score is not None]
+        return sum(known) / len(known) if known and len(known) == len(self.scores) else None
+
+
+def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownPoint]:
+    """Return what the trials of a sweep tell of its points, in the order of the points.
+
+    Args:
+        spec: The sweep.
+        records: The records of all its trials, in any order.
+    """
+    points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
+    for record in records:
+        if record.has_point:
+            points[record.point_index].append(record)
+    known = []
+    for index in sorted(points):
+        members = sorted(points[index], key=lambda record: record.index)
+        if outside(spec.space, members[0].point) or all(record.status == "pending" for record in members):
+            continue
+        ended = [record for record in members if record.status in FINISHED]
+        known.append(
+            KnownPoint(
+                point=members[0].point,
+                scores=tuple(map(_score, ended)),
+                is_running=len(ended) < len(members),
+                level=_level(spec, members),
+            )
+        )
+    return known
+
+
+def _score(record: TrialRecord) -> float | None:
+    scored = score_trial(record)
+    return None if scored is None else scored.score
+
+
+def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:
+    """Return the rung that the first trial ended by a scheduler reached; None if the scheduler ended none."""
+    steps = [record.num_env_steps for record in members if record.status == "stopped"]
+    if not steps:
+        return None
+    # Trials end at a rung with slightly different env steps, which must not make a difference.
+    rungs = math.log(max(1.0, min(steps) / spec.grace_env_steps), spec.scheduler.reduction_factor)
+    return int(rungs + 1e-9)

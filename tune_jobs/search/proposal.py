@@ -1,0 +1,128 @@
+"""The next point to try, by whichever search method: in a sweep, or of any list of points that were tried.
+
+Within a sweep `propose_point` is asked, with the records of its trials. What asks without a sweep, such as a benchmark
+of the methods, needs neither Ray nor a folder:
+
+    space = load_spec({..., "space": {"lr": {"loguniform": [1e-5, 1e-1]}}}).space
+    known = []
+    for index in range(32):
+        point = next_point("tpe", space, known, index, seed=0)
+        known.append(KnownPoint(point, scores=(train(point, seed=0), train(point, seed=1), None)))
+
+A `KnownPoint` (`tune_jobs.search.history`) is a point, the scores of its seeds (None: that one failed), whether it
+still runs (`is_running=True`: others are proposed meanwhile) and, if it was ended early, the rung that it reached.
+
+One more method is one more module with a function that is a `tune_jobs.search.asking.Method`, a row of `_METHODS`, and
+its name in `tune_jobs.spec.sections`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.records import TrialRecord
+from policies.errors import CannotRunError
+from tune_jobs.search.asking import Check, Method, Question
+from tune_jobs.search.history import KnownPoint, known_points
+from tune_jobs.spec.domains import Domain, draw_point
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+
+@dataclass(frozen=True)
+class _ByModule:
+    """A method that is loaded when it is asked first, as what it computes with takes a second to load."""
+
+    module: str
+    """Of this package; its function `propose` is the method."""
+    needs: str | None = None
+    """What has to be installed beside tune-jobs, as it is imported."""
+    called: str = ""
+    """What people call that."""
+    extra: str = ""
+    """The extra of tune-jobs that installs it."""
+
+    def load(self) -> Method:
+        method: Method = importlib.import_module(f"tune_jobs.search.{self.module}").propose
+        return method
+
+
+_METHODS: Mapping[str, _ByModule] = {
+    "tpe": _ByModule("tpe", needs="optuna", called="Optuna", extra="tpe"),
+}
+
+
+def check_installed(method: str) -> None:
+    """Check that what a search method needs is installed.
+
+    Args:
+        method: `search.type` of a sweep.
+
+    Raises:
+        CannotRunError: It isn't; the hint says how to install it.
+    """
+    known = _METHODS.get(method)
+    if known is not None and known.needs is not None and importlib.util.find_spec(known.needs) is None:
+        raise CannotRunError(
+            f"search.type is {method}, which needs {known.called}, and that is not installed.",
+            f"Install it with `pip install 'tune-jobs[{known.extra}]'`, or set search.type to random.",
+        )
+
+
+def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check) -> dict[str, Any]:
+    """Choose the next point of a sweep by its search method.
+
+    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, the point
+    is the random one of its index.
+
+    Args:
+        spec: The sweep.
+        records: The records of all its trials.
+        drawn_index: The index of the point to choose, among those that nobody chose.
+        check: Raises SpecError for a point whose values contradict each other; then another is proposed.
+
+    Raises:
+        SpecError: None of many proposals is valid.
+        CannotRunError: What the method needs is not installed.
+    """
+    return next_point(
+        spec.search.type, spec.space, known_points(spec, records), drawn_index, seed=spec.seed,
+        num_startup_trials=spec.search.num_startup_trials, check=check,
+    )  # fmt: skip
+
+
+def next_point(
+    method: str,
+    space: Mapping[str, Domain],
+    known: Sequence[KnownPoint],
+    index: int,
+    *,
+    seed: int,
+    num_startup_trials: int = 10,
+    check: Check = lambda _: None,
+) -> dict[str, Any]:
+    """Return the next point to try.
+
+    Args:
+        method: `random`, or another `search.type` of sweeps.
+        space: Domains by name. Grids are lists to choose from.
+        known: What was tried before, in order, and what is being tried.
+        index: The index of the point, from 0: its random numbers belong to it.
+        seed: At least 0; the same seed, index and known points give the same point.
+        num_startup_trials: How many points have to end before a model proposes points; until then they are random.
+        check: Raises SpecError for a point whose values contradict each other; then another is proposed, except of
+            random points.
+
+    Raises:
+        SpecError: None of many proposals is valid.
+        CannotRunError: What the method needs is not installed.
+        KeyError: There is no such method.
+    """
+    check_installed(method)
+    is_too_early = sum(not point.is_running for point in known) < num_startup_trials
+    if method == "random" or is_too_early:
+        return draw_point(space, index, seed)
+    return _METHODS[method].load()(Question(space, known, index, seed), check)
