@@ -148,6 +148,8 @@ def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
         )
     if values.vf_clip_param is not None:
         notes.append("vf_clip_param is left out: clip_range_vf means something else.")
+    if values.vf_clip_range is not None:
+        notes.append("clip_range_vf counts the limited value's error alone, vf_clip_range the larger of two.")
     if values.use_kl_loss:
         notes.append("The KL penalty is left out: target_kl means something else.")
     if values.vf_share_layers:
@@ -160,6 +162,8 @@ def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
         "clip_range": values.clip_param,
         "ent_coef": values.entropy_coeff,
         "vf_coef": values.vf_loss_coeff,
+        **({} if values.vf_clip_range is None else {"clip_range_vf": values.vf_clip_range}),
+        **({} if values.normalize_advantages else {"normalize_advantage": False}),
     }, notes
 
 
@@ -195,6 +199,10 @@ def _rllib_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
         notes.append("clip_param stays at its first value: RLlib has no schedule for it.")
     if values.normalize_rewards:
         notes.append("normalize_rewards is left out: RLlib has none.")
+    if values.vf_clip_range is not None:
+        notes.append("vf_clip_range is left out: RLlib has none.")
+    if not values.normalize_advantages:
+        notes.append("normalize_advantages is left out: RLlib always standardises them.")
     kl = {"kl_coeff": values.kl_coeff, "kl_target": values.kl_target} if values.use_kl_loss else {}
     return {
         "lambda_": values.gae_lambda,
@@ -218,6 +226,9 @@ def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
             "alpha": values.prioritized_alpha,
             "beta": values.prioritized_beta,
         }
+    # The default is too little to be missed.
+    adds = values.prioritized_epsilon != DQNHyperparams.model_fields["prioritized_epsilon"].default
+    lacks = {"replay none": values.replay == "none", "prioritized_epsilon": values.replay == "prioritized" and adds}
     decay = max(1, round(values.epsilon_decay))
     return {
         "train_batch_size_per_learner": values.train_batch_size,
@@ -232,7 +243,7 @@ def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
         "num_steps_sampled_before_learning_starts": values.learning_starts,
         "epsilon": [[0, values.epsilon_initial], [decay, values.epsilon_final]],
         "replay_buffer_config": replay,
-    }, _dqn_notes("RLlib", {"replay none": values.replay == "none"} | _lacking_in_both(values))
+    }, _dqn_notes("RLlib", lacks | _lacking_in_both(values))
 
 
 def _lacking_in_both(values: DQNHyperparams) -> dict[str, bool]:

@@ -107,6 +107,11 @@ class PPOHyperparams(_Hyperparams):
         description="Clip the squared value error at this; null: no clipping. RLlib's own default, 10, stops the value "
         "function from learning where returns are larger than a few units.",
     )
+    vf_clip_range: PositiveFloat | None = Field(
+        None,
+        description="Count the larger of two squared value errors: the value's, and that of the value moved by at most "
+        "this since the batch was sampled; null: the value's alone. vf_clip_param then limits the one that counts.",
+    )
     vf_loss_coeff: NonNegativeFloat = Field(0.5, description="Weight of the value loss.")
     vf_share_layers: bool = Field(False, description="One encoder for policy and value function.")
     entropy_coeff: NonNegativeFloat = Field(0.0, description="Weight of the entropy bonus.")
@@ -119,6 +124,9 @@ class PPOHyperparams(_Hyperparams):
     use_kl_loss: bool = Field(False, description="Add RLlib's adaptive KL penalty to the loss.")
     kl_coeff: NonNegativeFloat = Field(0.2, description="First weight of the KL penalty, if used.")
     kl_target: PositiveFloat = Field(0.01, description="KL divergence the penalty aims at, if used.")
+    normalize_advantages: bool = Field(
+        True, description="Shift and scale advantages to mean 0 and deviation 1 over each train batch."
+    )
     normalize_rewards: bool = Field(
         False,
         description="Divide rewards in training by the running deviation of the discounted return, and clip them at "
@@ -187,6 +195,9 @@ class DQNHyperparams(_Hyperparams):
     replay_capacity: PositiveInt = Field(50_000, description="Transitions the replay buffer holds.")
     prioritized_alpha: Fraction = Field(0.6, description="Exponent of the priorities; 0: uniform.")
     prioritized_beta: Fraction = Field(0.4, description="Exponent of the importance weights.")
+    prioritized_epsilon: PositiveFloat = Field(
+        1e-6, description="Added to a transition's |TD error|, of which prioritized_alpha makes its priority."
+    )
     learning_starts: int = Field(1_000, ge=0, description="Env steps sampled before the first update.")
     epsilon_schedule: Literal["linear", "exponential", "geometric"] = Field(
         "linear",

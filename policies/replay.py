@@ -20,7 +20,6 @@ from policies.hyperparams import DQNHyperparams
 from policies.sum_trees import SumTrees
 
 _MAX_GATHER_BYTES = 64 * 2**20
-_MIN_PRIORITY = 1e-6
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -170,7 +169,7 @@ class LastTransitions(ReplayBuffer):
 
 
 class PrioritizedReplayBuffer(ReplayBuffer):
-    """A ring of transitions, from which batches are drawn in proportion to |TD error|^alpha.
+    """A ring of transitions, from which batches are drawn in proportion to (|TD error| + epsilon)^alpha.
 
     Source: Schaul et al. 2016, "Prioritized Experience Replay", section 3.3 (proportional variant).
 
@@ -179,11 +178,14 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         rng: Draws the batches.
         alpha: Exponent of the priorities.
         beta: Exponent of the importance weights, which are divided by the batch's largest.
+        epsilon: What is added to each |TD error|.
     """
 
-    def __init__(self, capacity: int, rng: np.random.Generator, *, alpha: float, beta: float) -> None:
+    def __init__(
+        self, capacity: int, rng: np.random.Generator, *, alpha: float, beta: float, epsilon: float = 1e-6
+    ) -> None:
         super().__init__(capacity, rng)
-        self.alpha, self.beta = alpha, beta
+        self.alpha, self.beta, self.epsilon = alpha, beta, epsilon
         # One tree, whose leaves are the rows.
         self._priorities = SumTrees(1, capacity)
         self._highest = 1.0
@@ -211,7 +213,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
     def set_priorities(self, indices: NDArray[np.int64], td_errors: NDArray[np.float32]) -> None:
         """Set the priorities of rows from their newest TD errors."""
-        priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self.alpha
+        priorities = (np.abs(td_errors).astype(np.float64) + self.epsilon) ** self.alpha
         priorities = np.where(np.isfinite(priorities), priorities, self._highest)
         self._highest = float(priorities.max(initial=self._highest))
         self._priorities.set(indices, priorities)
@@ -224,6 +226,10 @@ def make_replay(hyperparams: DQNHyperparams, seed: int) -> ReplayBuffer:
         return LastTransitions(hyperparams.train_batch_size, rng)
     if hyperparams.replay == "prioritized":
         return PrioritizedReplayBuffer(
-            hyperparams.replay_capacity, rng, alpha=hyperparams.prioritized_alpha, beta=hyperparams.prioritized_beta
+            hyperparams.replay_capacity,
+            rng,
+            alpha=hyperparams.prioritized_alpha,
+            beta=hyperparams.prioritized_beta,
+            epsilon=hyperparams.prioritized_epsilon,
         )
     return ReplayBuffer(hyperparams.replay_capacity, rng)

@@ -42,6 +42,11 @@ _NO_ADAM = Rule("optimizer is rmsprop", lambda h, _: h.optimizer != "adam", ("op
 _NO_RMSPROP = Rule("optimizer is adam", lambda h, _: h.optimizer != "rmsprop", ("optimizer",))
 _NO_TARGET = Rule("target_network is false", lambda h, _: not h.target_network, ("target_network",))
 _NO_PRIORITIES = Rule("replay is not prioritized", lambda h, _: h.replay != "prioritized", ("replay",))
+_EQUAL_PRIORITIES = Rule(
+    "prioritized_alpha is 0, and all priorities are equal",
+    lambda h, _: h.prioritized_alpha == 0.0,
+    ("prioritized_alpha",),
+)
 
 
 def _updates_no_target(h: DQNHyperparams, limits: Limits) -> bool:
@@ -205,15 +210,8 @@ DQN_RULES: dict[str, Rules] = {
         ),
     ),
     "prioritized_alpha": (_NO_PRIORITIES, NO_UPDATE),
-    "prioritized_beta": (
-        _NO_PRIORITIES,
-        NO_UPDATE,
-        Rule(
-            "prioritized_alpha is 0, and all priorities are equal",
-            lambda h, _: h.prioritized_alpha == 0.0,
-            ("prioritized_alpha",),
-        ),
-    ),
+    "prioritized_beta": (_NO_PRIORITIES, NO_UPDATE, _EQUAL_PRIORITIES),
+    "prioritized_epsilon": (_NO_PRIORITIES, NO_UPDATE, _EQUAL_PRIORITIES),
     "learning_starts": (
         Rule(
             "a trial ends before (after at most {steps} env steps), so no update is made",

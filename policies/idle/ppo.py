@@ -24,6 +24,9 @@ _NO_KL_LOSS = Rule("use_kl_loss is false", lambda h, _: not h.use_kl_loss, ("use
 _NO_KL_COEFF = Rule(
     "kl_coeff is 0, and stays 0 as it is changed by factors", lambda h, _: h.kl_coeff == 0.0, ("kl_coeff",)
 )
+_NO_VALUE_LOSS = Rule(
+    "vf_loss_coeff is 0, and the value error has no weight", lambda h, _: h.vf_loss_coeff == 0.0, ("vf_loss_coeff",)
+)
 _ONE_ITERATION = Rule(
     "a trial makes no second iteration",
     lambda _, limits: limits.num_iterations <= 1,
@@ -69,13 +72,9 @@ PPO_RULES: dict[str, Rules] = {
     "clip_param": (_ONE_UPDATE, *_start_of_schedule("clip_decay_steps", "clip_param_final")),
     "clip_param_final": (_ONE_UPDATE,),
     "clip_decay_steps": (_ONE_UPDATE, *_decay_of_schedule("clip_decay_steps", "clip_param", "clip_param_final")),
-    "vf_clip_param": (
-        Rule(
-            "vf_loss_coeff is 0, and the value error has no weight",
-            lambda h, _: h.vf_loss_coeff == 0.0,
-            ("vf_loss_coeff",),
-        ),
-    ),
+    "vf_clip_param": (_NO_VALUE_LOSS,),
+    # Where one update is made, values have not moved, but for rounding, which a very small range would see.
+    "vf_clip_range": (_NO_VALUE_LOSS,),
     "vf_loss_coeff": ALWAYS,
     "vf_share_layers": ALWAYS,
     "entropy_coeff": _start_of_schedule("entropy_decay_steps", "entropy_coeff_final"),
@@ -84,6 +83,7 @@ PPO_RULES: dict[str, Rules] = {
     "use_kl_loss": (_NO_KL_COEFF, _ONE_UPDATE),
     "kl_coeff": (_NO_KL_LOSS, _ONE_UPDATE),
     "kl_target": (_NO_KL_LOSS, _NO_KL_COEFF, _ONE_UPDATE, _ONE_ITERATION),
+    "normalize_advantages": ALWAYS,
     "normalize_rewards": ALWAYS,
     "train_batch_size": ALWAYS,
     "minibatch_size": ALWAYS,

@@ -20,7 +20,7 @@ from policies.networks.rl_modules import module_spec
 from policies.rllib.dqn_algorithm import ReplayDQNConfig
 from policies.rllib.dqn_learner import DQNLearner
 from policies.rllib.env_runner import ArrayEnvRunner
-from policies.rllib.ppo_learner import CLIP_SCHEDULE, NORMALIZE_REWARDS, PPOLearner
+from policies.rllib.ppo_learner import CLIP_SCHEDULE, NORMALIZE_REWARDS, RAW_ADVANTAGES, VF_CLIP_RANGE, PPOLearner
 
 
 def build_algorithm_config(
@@ -107,6 +107,10 @@ def _ppo(hyperparams: PPOHyperparams) -> AlgorithmConfig:
         own[CLIP_SCHEDULE] = (hyperparams.clip_param_final, hyperparams.clip_decay_steps)
     if hyperparams.normalize_rewards:
         own[NORMALIZE_REWARDS] = True
+    if not hyperparams.normalize_advantages:
+        own[RAW_ADVANTAGES] = True
+    if hyperparams.vf_clip_range is not None:
+        own[VF_CLIP_RANGE] = hyperparams.vf_clip_range
     if own:
         config.training(learner_config_dict=own)
     return config.learners(learner_class=PPOLearner)

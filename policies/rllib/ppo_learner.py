@@ -7,13 +7,21 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from ray.rllib.algorithms.ppo.ppo import (
+    LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY,
+    LEARNER_RESULTS_VF_LOSS_UNCLIPPED_KEY,
+)
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.core import COMPONENT_OPTIMIZER
 from ray.rllib.core.columns import Columns
+from ray.rllib.core.learner.learner import VF_LOSS_KEY
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
+from ray.rllib.evaluation.postprocessing import Postprocessing
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
+from ray.rllib.utils.torch_utils import explained_variance
 from torch import Tensor
 
 from policies.errors import CheckpointError
@@ -25,15 +33,19 @@ CLIP_SCHEDULE = "clip_schedule"
 """The key in an algorithm's `learner_config_dict` of the last clip and the env steps until then."""
 NORMALIZE_REWARDS = "normalize_rewards"
 """The key in an algorithm's `learner_config_dict` that is true if rewards are normalised."""
+RAW_ADVANTAGES = "raw_advantages"
+"""The key in an algorithm's `learner_config_dict` that is true if advantages are not standardised."""
+VF_CLIP_RANGE = "vf_clip_range"
+"""The key in an algorithm's `learner_config_dict` of the `vf_clip_range`, if there is one."""
 _KL_COEFFS, _RETURNS = "kl_coeffs", "return_statistics"
 
 
-class _Clipped:
-    """A config with another clip; RLlib's own is frozen, and slow to copy."""
+class _Changed:
+    """A config with some other values; RLlib's own is frozen, and slow to copy."""
 
-    def __init__(self, config: Any, clip_param: float) -> None:
+    def __init__(self, config: Any, **values: Any) -> None:
         self._config = config
-        self.clip_param = clip_param
+        vars(self).update(values)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._config, name)
@@ -51,6 +63,9 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
     Modules that normalise observations add a phase's observations to their statistics after its updates: a batch is
     trained with the statistics it was sampled with, so that PPO's ratio begins at 1.
 
+    RLlib standardises advantages, always, and forgets the values that they were computed with, which `vf_clip_range`
+    is about. So those are computed once more, if something needs them.
+
     Rewards are normalised here, where the episodes of all env runners come together: see
     `policies.return_statistics`. The episodes that env runners keep for RLlib's own metrics have the rewards as before.
     """
@@ -64,19 +79,44 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         """The discounted return of each running episode, (1,), by the episode's id."""
 
     def compute_loss_for_module(self, *, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Any]) -> Any:
-        """Return RLlib's loss.
+        """Return RLlib's loss, with a range of values where there is one.
 
         Raises:
             NonFiniteWeightsError: The policy's outputs are not finite.
         """
+        limit = config.learner_config_dict.get(VF_CLIP_RANGE)
+        config = self._with_clip(config)
+        # Without a critic, RLlib leaves the value loss out.
+        others = config if limit is None else _Changed(config, use_critic=False)
         try:
-            return super().compute_loss_for_module(
-                module_id=module_id, config=self._with_clip(config), batch=batch, fwd_out=fwd_out
-            )
+            loss = super().compute_loss_for_module(module_id=module_id, config=others, batch=batch, fwd_out=fwd_out)
         except (ValueError, RuntimeError):
             # A distribution's: what it says of its parameters names no cause.
             check_outputs(fwd_out[Columns.ACTION_DIST_INPUTS], self.module[module_id].unwrapped())
             raise
+        if limit is None:
+            return loss
+        return loss + config.vf_loss_coeff * self._value_loss(module_id, limit, config.vf_clip_param, batch, fwd_out)
+
+    def _value_loss(
+        self, module_id: str, limit: float, vf_clip_param: float, batch: Any, fwd_out: dict[str, Any]
+    ) -> Tensor:
+        """Return the value loss with a `vf_clip_range`, and log what RLlib logs of its own value loss."""
+        module = self.module[module_id].unwrapped()
+        values = module.compute_values(batch, embeddings=fwd_out.get(Columns.EMBEDDINGS))
+        old, targets = batch[Columns.VF_PREDS], batch[Postprocessing.VALUE_TARGETS]
+        squares = (values - targets) ** 2
+        at_end = (old + torch.clamp(values - old, -limit, limit) - targets) ** 2
+        rows = torch.clamp(torch.maximum(squares, at_end), 0, vf_clip_param)
+        if Columns.LOSS_MASK in batch:
+            rows, squares = rows[batch[Columns.LOSS_MASK]], squares[batch[Columns.LOSS_MASK]]
+        found = {
+            VF_LOSS_KEY: rows.mean(),
+            LEARNER_RESULTS_VF_LOSS_UNCLIPPED_KEY: squares.mean(),
+            LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY: explained_variance(targets, values),
+        }
+        self.metrics.log_dict(found, key=module_id, window=1)
+        return rows.mean()
 
     def _with_clip(self, config: Any) -> Any:
         """Return the config with the clip that its schedule has now; RLlib has no schedule for it."""
@@ -84,7 +124,8 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         if schedule is None:
             return config
         final, num_env_steps = schedule
-        return _Clipped(config, linear(config.clip_param, final, num_env_steps, self._num_env_steps))
+        clip_param = linear(config.clip_param, final, num_env_steps, self._num_env_steps)
+        return _Changed(config, clip_param=clip_param)
 
     def compute_gradients(self, loss_per_module: dict[str, Any], **kwargs: Any) -> dict[Any, Tensor]:
         """Return RLlib's gradients.
@@ -179,7 +220,22 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
             training_data = replace(training_data, episodes=self._with_normalized_rewards(training_data.episodes))
         batch = super()._make_batch_if_necessary(training_data)
         for module_id, columns in batch.policy_batches.items():
+            if training_data.episodes is not None:
+                self._use_old_values(module_id, columns)
             if hasattr(self.module[module_id].unwrapped(), "update_observation_statistics"):
                 # RLlib adds a row to each episode chunk, for the value after its end; that row is not a step.
                 self._new_observations[module_id] = columns[Columns.OBS][columns[Columns.LOSS_MASK]]
         return batch
+
+    def _use_old_values(self, module_id: str, columns: Any) -> None:
+        """Add the values of the policy that has sampled to a new batch, and advantages by them, if they are needed."""
+        own = self.config.learner_config_dict
+        keeps, is_raw = VF_CLIP_RANGE in own, own.get(RAW_ADVANTAGES)
+        if not keeps and not is_raw:
+            return
+        with torch.no_grad():
+            values = self.module[module_id].unwrapped().compute_values(columns)
+        if keeps:
+            columns[Columns.VF_PREDS] = values
+        if is_raw:
+            columns[Postprocessing.ADVANTAGES] = columns[Postprocessing.VALUE_TARGETS] - values

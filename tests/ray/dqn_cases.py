@@ -333,6 +333,14 @@ def check_prioritized_beta(build: Build, _: object) -> None:
         assert (np.ptp(weights) < 1e-6) == flat
 
 
+@reaches("dqn", field="prioritized_epsilon")
+def check_prioritized_epsilon(build: Build, _: object) -> None:
+    """A row without an error is as likely as the sizes say with epsilon added."""
+    for values, epsilon in (({}, 1e-6), ({"prioritized_epsilon": 0.5}, 0.5)):
+        replay = build("dqn", replay="prioritized", prioritized_alpha=1.0, **values).replay
+        assert priority_ratio(replay, 0.0) == pytest.approx(epsilon / (1.0 + epsilon), rel=1e-6)
+
+
 @reaches("dqn", field="learning_starts")
 def check_learning_starts(build: Build, _: object) -> None:
     algo = build("dqn", learning_starts=50)

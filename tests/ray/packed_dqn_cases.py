@@ -160,6 +160,21 @@ def check_prioritized_beta() -> None:
     assert all(np.ptp(present(batch.weights)) > 0.01 for batch in changed.batches)
 
 
+@arrives("prioritized_epsilon")
+def check_prioritized_epsilon() -> None:
+    stack = make_stack(replay="prioritized")
+    for name, epsilon in (("a", 1e-6), ("b", 0.5)):
+        add(stack, name, 0, replay="prioritized", prioritized_alpha=1.0, prioritized_epsilon=epsilon)
+    replay = stack._replay
+    assert isinstance(replay, StackedPrioritizedReplay)
+    slots = replay.slots(["a", "b"])
+    replay.add(slots, np.zeros((2, 2, replay.num_columns), dtype=np.float32))
+    replay.set_priorities(slots, np.array([[0, 1]] * 2), np.array([[1.0, 0.0]] * 2, dtype=np.float32))
+    leaves = replay._priorities.leaves.reshape(2, -1)[slots, :2]
+    np.testing.assert_allclose(leaves[:, 1] / leaves[:, 0], [1e-6 / (1 + 1e-6), 0.5 / 1.5], rtol=1e-6)
+    stack.envs.close()
+
+
 # -- of the network
 
 

@@ -28,6 +28,19 @@ def check_normalize_rewards() -> None:
     np.testing.assert_array_equal(sampled.fragment.own_rewards, np.ones_like(sampled.fragment.rewards))
 
 
+@arrives
+def check_normalize_advantages() -> None:
+    plain, changed, sampled = updates(normalize_advantages=False)
+    assert_other_gradients(plain, changed)
+    ((_, batch),) = sampled.groups
+    # Both members have the same seed, and so the same rows.
+    standardised, raw = batch.advantages
+    assert abs(standardised.mean()) < 1e-5
+    assert abs(standardised.std() - 1.0) < 1e-5
+    assert raw.std() > 1.5
+    np.testing.assert_allclose(standardised, (raw - raw.mean()) / raw.std(), rtol=1e-4, atol=1e-5)
+
+
 def targets_by_definition(
     values: Sequence[float], fragment: Fragment, row: int, gamma: float, gae_lambda: float
 ) -> list[float]:

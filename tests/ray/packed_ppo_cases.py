@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from packed_rllib import ROUNDING, ROWS, Learned, Sampled, compare, differences, make_stack
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import PPOHyperparams
+from policies.packed.networks import with_ones
 from tests.narrowing import present
 
 Case = Callable[[], object]
@@ -212,6 +214,20 @@ def check_vf_clip_param() -> None:
     plain, changed, _ = updates(vf_clip_param=2.5)
     assert_other_gradients(plain, changed)
     assert changed.losses["vf_loss"] <= 2.5 < plain.losses["vf_loss"]
+
+
+@arrives
+def check_vf_clip_range() -> None:
+    plain, changed, sampled = updates(vf_clip_range=0.01)
+    assert_other_gradients(plain, changed)
+    assert changed.losses["vf_loss"] > plain.losses["vf_loss"]
+    ((group, batch),) = sampled.groups
+    values = group.values(torch.from_numpy(with_ones(batch.observations)))
+    # This group has the weights that sampled, not those that were moved since.
+    np.testing.assert_allclose(present(batch.values), values.detach().numpy(), rtol=1e-5, atol=1e-6)
+    # Nothing is kept where no member has a range.
+    _, _, sampled = updates()
+    assert sampled.groups[0][1].values is None
 
 
 @arrives

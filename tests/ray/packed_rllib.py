@@ -171,6 +171,8 @@ def rllib_batch(sampled: Sampled, member: PPOMember, *, is_gaussian: bool) -> An
         "value_targets": torch.from_numpy(batch.value_targets[index].copy()),
         "loss_mask": torch.ones(len(logp), dtype=torch.bool),
     }
+    if batch.values is not None:
+        columns["vf_preds"] = torch.from_numpy(batch.values[index].copy())
     return MultiAgentBatch({MODULE: SampleBatch(columns)}, env_steps=len(logp))
 
 

@@ -35,6 +35,7 @@ def ppo_loss(algo: Any, hyperparams: PPOHyperparams) -> tuple[float, float]:
         "action_dist_inputs": torch.randn(64, 2, generator=rng),
         "advantages": torch.randn(64, generator=rng),
         "value_targets": 6 * torch.randn(64, generator=rng),
+        "vf_preds": torch.randn(64, generator=rng),
     }
     with torch.no_grad():
         out = module.forward_train(batch)
@@ -44,7 +45,13 @@ def ppo_loss(algo: Any, hyperparams: PPOHyperparams) -> tuple[float, float]:
         ratio = torch.exp(now.log_prob(batch["actions"]) - batch["action_logp"])  # type: ignore[no-untyped-call]
         clipped = torch.clamp(ratio, 1 - hyperparams.clip_param, 1 + hyperparams.clip_param)
         loss = -torch.min(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
-        value_loss = (module.compute_values(batch) - batch["value_targets"]) ** 2
+        values, old = module.compute_values(batch), batch["vf_preds"]
+        value_loss = (values - batch["value_targets"]) ** 2
+        if hyperparams.vf_clip_range is not None:
+            limited = torch.minimum(
+                torch.maximum(values, old - hyperparams.vf_clip_range), old + hyperparams.vf_clip_range
+            )
+            value_loss = torch.maximum(value_loss, (limited - batch["value_targets"]) ** 2)
         if hyperparams.vf_clip_param is not None:
             value_loss = value_loss.clamp(0, hyperparams.vf_clip_param)
         entropy = now.entropy().mean()  # type: ignore[no-untyped-call]
@@ -146,6 +153,35 @@ def check_vf_clip_param(build: Build, _: object) -> None:
     check_loss(build, vf_clip_param=2.5)
 
 
+@reaches("ppo", field="vf_clip_range")
+def check_vf_clip_range(build: Build, _: object) -> None:
+    check_loss(build, vf_clip_range=0.05)
+    # Both: the limit of the error comes after.
+    hyperparams = PPOHyperparams(**SMALL["ppo"], vf_clip_range=0.05, vf_clip_param=2.5)
+    theirs, ours = ppo_loss(build("ppo", vf_clip_range=0.05, vf_clip_param=2.5), hyperparams)
+    assert theirs == pytest.approx(ours, rel=1e-4)
+    # The old values are those that the batch was made with, in all updates of the iteration.
+    algo = build("ppo", vf_clip_range=0.05, num_epochs=3)
+    learner, seen = learner_of(algo), []
+    make, update = learner._make_batch_if_necessary, learner._update
+
+    def making(*args: Any, **kwargs: Any) -> Any:
+        made = make(*args, **kwargs)
+        with torch.no_grad():
+            made[MODULE]["expected"] = module_of(algo).compute_values(made[MODULE])
+        return made
+
+    def reading(batch: Any, *args: Any, **kwargs: Any) -> Any:
+        seen.append((batch[MODULE]["vf_preds"], batch[MODULE].pop("expected")))
+        return update(batch, *args, **kwargs)
+
+    learner._make_batch_if_necessary, learner._update = making, reading
+    algo.train()
+    assert len(seen) >= 6
+    for old_values, expected in seen:
+        torch.testing.assert_close(old_values, expected)
+
+
 @reaches("ppo", field="vf_loss_coeff")
 def check_vf_loss_coeff(build: Build, _: object) -> None:
     check_loss(build, vf_loss_coeff=0.2)
@@ -185,8 +221,8 @@ def check_vf_share_layers(build: Build, _: object) -> None:
     assert {name.split(".")[1] for name in names[True] if name.startswith("encoder")} == {"encoder"}
 
 
-def advantages(algo: Any, rewards: Sequence[float], values_are_zero: bool = True) -> NDArray[Any]:
-    """Advantages and value targets of one terminated episode, from the learner's own pipeline."""
+def learnt_batch(algo: Any, rewards: Sequence[float]) -> Any:
+    """The batch of one terminated episode, from the learner's own pipeline, by a value function that says 1."""
     from ray.rllib.core.learner.training_data import TrainingData
     from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
@@ -204,8 +240,22 @@ def advantages(algo: Any, rewards: Sequence[float], values_are_zero: bool = True
         action_space=algo.env_runner.env.single_action_space,
         len_lookback_buffer=0,
     ).to_numpy()
-    batch = learner_of(algo)._make_batch_if_necessary(TrainingData(episodes=[episode]))[MODULE]
-    return np.asarray(batch["value_targets"])[:length]
+    return learner_of(algo)._make_batch_if_necessary(TrainingData(episodes=[episode]))[MODULE]
+
+
+def value_targets(algo: Any, rewards: Sequence[float]) -> NDArray[Any]:
+    return np.asarray(learnt_batch(algo, rewards)["value_targets"])[: len(rewards)]
+
+
+@reaches("ppo", field="normalize_advantages")
+def check_normalize_advantages(build: Build, _: object) -> None:
+    for normalizes in (True, False):
+        batch = learnt_batch(build("ppo", normalize_advantages=normalizes), [1.0, 5.0, 2.0])
+        expected = np.asarray(batch["value_targets"]) - 1.0
+        if normalizes:
+            # RLlib counts the row that it adds, for the value after the end, too.
+            expected = (expected - expected.mean()) / expected.std()
+        np.testing.assert_allclose(np.asarray(batch["advantages"]), expected, rtol=1e-5, atol=1e-6)
 
 
 def expected_targets(rewards: Sequence[float], gamma: float, gae_lambda: float) -> list[float]:
@@ -221,14 +271,14 @@ def expected_targets(rewards: Sequence[float], gamma: float, gae_lambda: float) 
 @reaches("ppo", field="gamma")
 def check_ppo_gamma(build: Build, _: object) -> None:
     for gamma in (0.0, 0.6):
-        found = advantages(build("ppo", gamma=gamma), [1.0, 5.0, 2.0])
+        found = value_targets(build("ppo", gamma=gamma), [1.0, 5.0, 2.0])
         np.testing.assert_allclose(found, expected_targets([1.0, 5.0, 2.0], gamma, 0.95), rtol=1e-5)
 
 
 @reaches("ppo", field="gae_lambda")
 def check_gae_lambda(build: Build, _: object) -> None:
     for gae_lambda in (0.0, 0.3):
-        found = advantages(build("ppo", gae_lambda=gae_lambda), [1.0, 5.0, 2.0])
+        found = value_targets(build("ppo", gae_lambda=gae_lambda), [1.0, 5.0, 2.0])
         np.testing.assert_allclose(found, expected_targets([1.0, 5.0, 2.0], 0.99, gae_lambda), rtol=1e-5)
 
 

@@ -18,6 +18,7 @@ CASES = [
     ("ppo", "lr", (1e-3, 1e-2), {"lr_final": 1e-4, "lr_decay_steps": 128}),
     ("ppo", "gae_lambda", (0.2, 0.9), {"gamma": 0.0}),
     ("ppo", "vf_clip_param", (0.01, 5.0), {"vf_loss_coeff": 0.0}),
+    ("ppo", "vf_clip_range", (0.001, 5.0), {"vf_loss_coeff": 0.0}),
     ("ppo", "kl_target", (1e-6, 9.0), {"use_kl_loss": True, "kl_coeff": 0.0}),
     ("dqn", "lr_decay_steps", (3, 30), {"lr_final": 1e-4}),
     ("dqn", "n_step", (8, 20), {}),

@@ -45,6 +45,7 @@ PACKS: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {
     "prioritized": ({"replay": "prioritized", "td_loss": "mse", "target_update_freq": 10}, [
         {"prioritized_alpha": 1.0, "prioritized_beta": 1.0},
         {"hidden_sizes": (5,), "prioritized_beta": 0.2, "lr": 1e-3, "lr_final": 0.0, "lr_decay_steps": 190},
+        {"hidden_sizes": (6,), "prioritized_alpha": 0.8, "prioritized_epsilon": 0.3},
     ]),
     "normalised, n-step": ({"normalize_observations": True, "n_step": 3, "tau": 0.2}, [
         {"gamma": 0.9},

@@ -15,6 +15,7 @@ from packed_rllib import MODULE, ROUNDING, PPOMember, compare, differences, epis
 
 from policies.activations import ACTIVATIONS
 from policies.packed.ppo import stack as ppo_stack
+from tests.narrowing import present
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
@@ -24,11 +25,14 @@ PACKS: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
         {},
         {"hidden_sizes": (5,), "clip_param": 0.03, "entropy_coeff": 0.1, "lr": 1e-3},
         {"hidden_sizes": (7,), "vf_clip_param": 3.0, "grad_clip": 0.5, "vf_loss_coeff": 1.5},
+        {"hidden_sizes": (6,), "vf_clip_range": 0.02, "normalize_advantages": False},
+        {"vf_clip_range": 0.1, "vf_clip_param": 30.0},
     ]),
     "relu, shared layers, KL": ("CartPole-v1", {"activation": "relu", "vf_share_layers": True, "use_kl_loss": True}, [
         {"kl_coeff": 0.7, "kl_target": 1e-4},
         {"hidden_sizes": (6,), "kl_coeff": 0.0, "entropy_coeff": 0.02},
-        {"hidden_sizes": (5,), "kl_coeff": 2.0, "kl_target": 0.5, "clip_param": 0.05, "grad_clip": 10.0},
+        {"hidden_sizes": (5,), "kl_coeff": 2.0, "kl_target": 0.5, "clip_param": 0.05, "grad_clip": 10.0,
+         "vf_clip_range": 0.05},
     ]),
     "silu, normalised, schedules": (
         "CartPole-v1", {"activation": "silu", "normalize_observations": True, "hidden_sizes": (12, 7)}, [
@@ -42,7 +46,8 @@ PACKS: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
     ]),
     "gelu, gaussian": ("Pendulum-v1", {"activation": "gelu"}, [
         {"vf_clip_param": 2000.0, "clip_param": 0.05},
-        {"hidden_sizes": (5,), "entropy_coeff": 0.2, "grad_clip": 2.0},
+        {"hidden_sizes": (5,), "entropy_coeff": 0.2, "grad_clip": 2.0, "vf_clip_range": 0.05},
+        {"hidden_sizes": (6,), "normalize_advantages": False, "vf_clip_param": 3000.0, "vf_clip_range": 0.1},
     ]),
     "linear, gaussian, shared layers, normalised": (
         "Pendulum-v1", {"activation": "linear", "vf_share_layers": True, "normalize_observations": True}, [
@@ -77,8 +82,8 @@ def test_an_update_is_rllibs_for_every_member(name: str, num_updates: int) -> No
 
 def rllib_advantages(
     member: PPOMember, env_id: str, episodes: Sequence[Any]
-) -> list[tuple[NDArray[Any], NDArray[Any]]]:
-    """(value targets, advantages before they are standardised) of each episode, from the Learner's own pipeline.
+) -> list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]:
+    """(value targets, advantages before they are standardised, values) of each episode, from the Learner's pipeline.
 
     RLlib standardises over the rows it adds, one an episode, as well: what it hands to the loss is another linear
     function of the same advantages. So these are compared before that.
@@ -93,13 +98,18 @@ def rllib_advantages(
     batch = learner._make_batch_if_necessary(TrainingData(episodes=episodes))[MODULE]
     with torch.no_grad():
         values = learner.module[MODULE].unwrapped().compute_values(batch).numpy()
-    targets, standardised = np.asarray(batch["value_targets"]), np.asarray(batch["advantages"])
+    targets, learnt = np.asarray(batch["value_targets"]), np.asarray(batch["advantages"])
     raw = targets - values
-    np.testing.assert_allclose(standardised, (raw - raw.mean()) / raw.std(), atol=1e-4)
+    if member.hyperparams.normalize_advantages:
+        np.testing.assert_allclose(learnt, (raw - raw.mean()) / raw.std(), atol=1e-4)
+    else:
+        np.testing.assert_array_equal(learnt, raw)
+    assert ("vf_preds" in batch) == (member.hyperparams.vf_clip_range is not None)
+    np.testing.assert_array_equal(batch.get("vf_preds", values), values)
     found, start = [], 0
     for length in lengths:
         stop = start + length
-        found.append((targets[start:stop], raw[start:stop]))
+        found.append((targets[start:stop], raw[start:stop], values[start:stop]))
         assert not batch["loss_mask"][stop]
         start = stop + 1
     assert start == len(targets)
@@ -115,6 +125,8 @@ def test_advantages_and_value_targets_are_rllibs(monkeypatch: pytest.MonkeyPatch
         {"gamma": gamma, "gae_lambda": gae_lambda, "hidden_sizes": (size,), "normalize_observations": True}
         for gamma, gae_lambda, size in ((0.99, 0.95, 8), (0.8, 0.0, 5), (0.9, 1.0, 7))
     ]
+    members[1] |= {"vf_clip_range": 0.2}
+    members[2] |= {"normalize_advantages": False}
     limit = 12 if env_id == "CartPole-v1" else 7
     stack = make_stack(
         env_id, [{**values, "train_batch_size": 160} for values in members], {"max_episode_steps": limit}
@@ -134,8 +146,9 @@ def test_advantages_and_value_targets_are_rllibs(monkeypatch: pytest.MonkeyPatch
         expected = rllib_advantages(stack.member(member.member_id), env_id, [e for some in episodes for e in some])
         chunks = iter(expected)
         for place, some in enumerate(episodes):
-            targets, advantages = (np.concatenate(parts) for parts in zip(*(next(chunks) for _ in some), strict=True))
-            for ours, theirs in ((batch.value_targets, targets), (batch.advantages, advantages)):
+            parts = [np.concatenate(found) for found in zip(*(next(chunks) for _ in some), strict=True)]
+            found = (batch.value_targets, batch.advantages, present(batch.values))
+            for ours, theirs in zip(found, parts, strict=True):
                 own = ours[index].reshape(-1, num_envs)[:, place]
                 np.testing.assert_allclose(own, theirs, rtol=1e-5, atol=1e-5 * np.abs(theirs).max())
     stack.envs.close()

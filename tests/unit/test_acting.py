@@ -81,6 +81,7 @@ CASES = {
         Case((50, 100), {**CLIP, "clip_param_final": 0.001}, CLIP), Case((10, 32), CLIP, other=64),
     ],
     ("ppo", "vf_clip_param"): [Case((0.01, 5.0), {"vf_loss_coeff": 0.0}, {"vf_loss_coeff": 0.5})],
+    ("ppo", "vf_clip_range"): [Case((0.001, 5.0), {"vf_loss_coeff": 0.0}, {"vf_loss_coeff": 0.5})],
     ("ppo", "entropy_coeff"): [
         Case((0.0, 0.7), {"entropy_coeff_final": 1.0, "entropy_decay_steps": 32},
              {"entropy_coeff_final": 1.0, "entropy_decay_steps": 200}),
@@ -157,6 +158,11 @@ CASES = {
         Case((0.1, 0.9), {}, PRIORITIZED),
         no_update(0.1, 0.9, **PRIORITIZED),
         Case((0.1, 0.9), {**PRIORITIZED, "prioritized_alpha": 0.0}, PRIORITIZED),
+    ],
+    ("dqn", "prioritized_epsilon"): [
+        Case((1e-6, 1.0), {}, PRIORITIZED),
+        no_update(1e-6, 1.0, **PRIORITIZED),
+        Case((1e-6, 1.0), {**PRIORITIZED, "prioritized_alpha": 0.0}, PRIORITIZED),
     ],
     ("dqn", "learning_starts"): [Case((121, 999), other=16), Case((0, 8), other=20)],
     ("dqn", "epsilon_schedule"): [

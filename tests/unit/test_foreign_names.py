@@ -51,7 +51,9 @@ def test_the_table_of_names_is_whole(algorithm: Algorithm) -> None:
         ("normalize", "Did you mean 'normalize_observations' and 'normalize_rewards'?"),
         ("train_batch_size_per_learner", "Did you mean 'train_batch_size'? That is RLlib's train_batch_size_per_le"),
         ("lambda_", "Did you mean 'gae_lambda'? That is RLlib's lambda_."),
-        ("clip_range_vf", "SB3's clip_range_vf is no hyperparameter here: it keeps a new value near the old one"),
+        ("clip_range_vf", "Did you mean 'vf_clip_range'? That is SB3's clip_range_vf; SB3 counts the limited value's"),
+        ("normalize_advantage", "Did you mean 'normalize_advantages'? That is SB3's normalize_advantage; over the"),
+        ("target_kl", "SB3's target_kl is no hyperparameter here: it ends an iteration's epochs early"),
         ("total_timesteps", "SB3's total_timesteps is no hyperparameter here: set stop.num_env_steps."),
         ("buffer_size", "(dqn has it: SB3's buffer_size is replay_capacity there.)"),
         ("train_freq", "(dqn has it.)"),
@@ -147,7 +149,7 @@ def test_the_command_lists_all_algorithms_and_names_differences() -> None:
     for algorithm in ALGORITHMS:
         assert f"Hyperparameters of {algorithm}\n" in text
     assert "    Stable-Baselines3: n_steps (it counts each environment's steps: " in text
-    assert "SB3: clip_range_vf: it keeps a new value near the old one" in text
+    assert "SB3: target_kl: it ends an iteration's epochs early" in text
     assert [table["algorithm"] for table in json.loads(run("--json"))] == list(ALGORITHMS)
 
 

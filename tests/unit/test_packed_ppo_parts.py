@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -31,8 +32,10 @@ def column(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)[:, None]
 
 
-def make_case(num_actions: int, *, with_kl: bool, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Minibatch]:
-    """(outputs, values, minibatch) with ratios far from 1 and values far from their targets."""
+def make_case(
+    num_actions: int, *, with_kl: bool, with_old_values: bool = False, seed: int = 0
+) -> tuple[torch.Tensor, torch.Tensor, Minibatch]:
+    """(outputs, values, minibatch) with ratios far from 1 and values far from their targets, and from the old ones."""
     rng = torch.Generator().manual_seed(seed)
     outputs = 2 * torch.randn(M, B, num_actions, generator=rng)
     old_outputs = outputs + torch.randn(M, B, num_actions, generator=rng)
@@ -44,12 +47,16 @@ def make_case(num_actions: int, *, with_kl: bool, seed: int = 0) -> tuple[torch.
         value_targets=3 * torch.randn(M, B, generator=rng),
         old_outputs=old_outputs if with_kl else None,
     )
-    return outputs, torch.randn(M, B, generator=rng), batch
+    values = torch.randn(M, B, generator=rng)
+    if with_old_values:
+        batch.old_values = values + torch.randn(M, B, generator=rng)
+    return outputs, values, batch
 
 
 COEFFICIENTS = ppo.Coefficients(
     clip_param=column(0.1, 0.2, 0.3, 0.05),
     vf_clip_param=column(math.inf, 4.0, 0.5, 10.0),
+    vf_clip_range=column(0.5, math.inf, 1.0, 0.1),
     vf_loss_coeff=column(0.5, 1.0, 0.0, 2.0),
     entropy_coeff=column(0.01, 0.0, 0.2, 0.0),
     kl_coeff=column(0.2, 0.0, 1.0, 3.0),
@@ -57,10 +64,11 @@ COEFFICIENTS = ppo.Coefficients(
 
 
 @pytest.mark.usefixtures("in_double")
+@pytest.mark.parametrize("with_old_values", [False, True])
 @pytest.mark.parametrize("with_kl", [False, True])
 @pytest.mark.parametrize("num_actions", [2, 3, 6])
-def test_gradients_by_hand_are_those_of_the_loss(num_actions: int, with_kl: bool) -> None:
-    outputs, values, batch = make_case(num_actions, with_kl=with_kl)
+def test_gradients_by_hand_are_those_of_the_loss(num_actions: int, with_kl: bool, with_old_values: bool) -> None:
+    outputs, values, batch = make_case(num_actions, with_kl=with_kl, with_old_values=with_old_values)
     ratio = (ppo.log_probabilities(outputs, batch.actions, is_gaussian=False) - batch.logp).exp()
     for limited in (ratio > 1.3, ratio < 0.7):
         for sign in (-1, 1):
@@ -97,10 +105,50 @@ def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
         close(mine, other)
 
 
+def by_definition(values: torch.Tensor, old_values: torch.Tensor, targets: torch.Tensor, limit: float) -> torch.Tensor:
+    """PPO2's squared value error, row by row."""
+    rows = []
+    for value, old, target in zip(values.tolist(), old_values.tolist(), targets.tolist(), strict=True):
+        limited = min(max(value, old - limit), old + limit)
+        rows.append(max((value - target) ** 2, (limited - target) ** 2))
+    return torch.tensor(rows)
+
+
+@pytest.mark.usefixtures("in_double")
+def test_the_larger_of_both_value_errors_counts() -> None:
+    outputs, values, batch = make_case(2, with_kl=False, with_old_values=True)
+    assert batch.old_values is not None
+    found = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False).vf_loss
+    no_range = ppo.loss(outputs, values, replace(batch, old_values=None), COEFFICIENTS, is_gaussian=False).vf_loss
+    for index in range(M):
+        limit = float(COEFFICIENTS.vf_clip_range[index])
+        rows = by_definition(values[index], batch.old_values[index], batch.value_targets[index], limit)
+        close(found[index], rows.clamp(max=float(COEFFICIENTS.vf_clip_param[index])).mean())
+        assert (found[index] > no_range[index]) == math.isfinite(limit)
+
+
+@pytest.mark.parametrize("is_gaussian", [False, True])
+def test_a_member_without_a_range_of_values_learns_to_the_bit_as_if_no_other_had_one(is_gaussian: bool) -> None:
+    outputs, values, batch = make_case(4, with_kl=False, with_old_values=True)
+    if is_gaussian:
+        batch.actions = batch.actions[..., :2]
+    beside, alone = (
+        ppo.gradients(outputs, values, rows, COEFFICIENTS, is_gaussian=is_gaussian)
+        for rows in (batch, replace(batch, old_values=None))
+    )
+    assert torch.equal(beside[1][1], alone[1][1])
+    assert not torch.equal(beside[1], alone[1])
+    losses = [
+        ppo.loss(outputs, values, rows, COEFFICIENTS, is_gaussian=is_gaussian).vf_loss[1]
+        for rows in (batch, replace(batch, old_values=None))
+    ]
+    assert torch.equal(*losses)
+
+
 @pytest.mark.parametrize("is_gaussian", [False, True])
 @pytest.mark.parametrize("name", ["advantages", "value_targets"])
 def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name: str, is_gaussian: bool) -> None:
-    outputs, values, batch = make_case(4, with_kl=False)
+    outputs, values, batch = make_case(4, with_kl=False, with_old_values=True)
     if is_gaussian:
         batch.actions = batch.actions[..., :2]
     getattr(batch, name)[1, 7] = math.nan

@@ -106,6 +106,7 @@ class Both:
             replay_capacity=int(self.rng.integers(BATCH, 40)),
             prioritized_alpha=float(self.rng.random()),
             prioritized_beta=float(self.rng.random()),
+            prioritized_epsilon=float(10 ** self.rng.uniform(-7, 1)),
         )
         self.stacked.add_member(name, hyperparams)
         self.separate[name] = Separate(hyperparams)

@@ -175,6 +175,15 @@ def test_prioritized_draws_in_proportion(capacity: int) -> None:
     assert np.all(np.abs(counts - expected) < 5 * np.sqrt(expected) + 1)
 
 
+def test_epsilon_is_added_to_each_error() -> None:
+    replay = PrioritizedReplayBuffer(4, np.random.default_rng(0), alpha=1.0, beta=1.0, epsilon=2.0)
+    replay.add(rows(0, 4))
+    replay.set_priorities(np.arange(4), np.array([0.0, -2.0, 6.0, 14.0], dtype=np.float32))
+    (batch,) = replay.batches(1, 500)
+    weights = {int(reward): float(weight) for reward, weight in zip(batch.rewards, present(batch.weights), strict=True)}
+    assert weights == pytest.approx({0: 1.0, 1: 0.5, 2: 0.25, 3: 0.125})
+
+
 def test_importance_weights_undo_the_preference() -> None:
     replay = PrioritizedReplayBuffer(4, np.random.default_rng(0), alpha=1.0, beta=1.0)
     replay.add(rows(0, 4))

@@ -195,6 +195,18 @@ def test_what_other_libraries_lack_is_told() -> None:
         code = stable_baselines3_program(values, env_id="E", env_args={}, num_env_steps=2_000).code
         assert f"env = VecNormalize(env, {arguments})" in code
         assert "normalize_rewards is left out: RLlib has none." in rllib_program(values, env_id="E", env_args={}).notes
+    values = PPOHyperparams(vf_clip_range=0.25, normalize_advantages=False)
+    sb3 = stable_baselines3_program(values, env_id="E", env_args={}, num_env_steps=2_000)
+    assert "clip_range_vf=0.25," in sb3.code
+    assert "normalize_advantage=False," in sb3.code
+    assert sb3.notes == ("clip_range_vf counts the limited value's error alone, vf_clip_range the larger of two.",)
+    assert rllib_program(values, env_id="E", env_args={}).notes == (
+        "vf_clip_range is left out: RLlib has none.",
+        "normalize_advantages is left out: RLlib always standardises them.",
+    )
+    for epsilon, lacking in ((1e-6, ()), (1e-3, ("RLlib's DQN lacks prioritized_epsilon.",))):
+        prioritized = DQNHyperparams(replay="prioritized", prioritized_epsilon=epsilon)
+        assert rllib_program(prioritized, env_id="E", env_args={}).notes == lacking
     (rate,) = [line for line in program.code.splitlines() if "learning_rate" in line]
     schedule = eval(rate.strip().removeprefix("learning_rate=").removesuffix(","))
     assert [schedule(left) for left in (1.0, 0.875, 0.75, 0.0)] == pytest.approx([3e-4, 1.5e-4, 0.0, 0.0])

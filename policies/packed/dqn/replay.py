@@ -21,8 +21,6 @@ from policies.hyperparams import DQNHyperparams
 from policies.packed.shared import SharedByDQN
 from policies.sum_trees import SumTrees
 
-_MIN_PRIORITY = 1e-6
-
 Floats = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
@@ -146,7 +144,7 @@ class StackedReplay:
 
 
 class StackedPrioritizedReplay(StackedReplay):
-    """Draws in proportion to |TD error|^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
+    """Draws in proportion to (|TD error| + epsilon)^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
 
     def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
         super().__init__(shared, num_inputs)
@@ -155,6 +153,7 @@ class StackedPrioritizedReplay(StackedReplay):
         self._highest: NDArray[np.float64] = np.zeros(0)
         self._alpha: NDArray[np.float64] = np.zeros(0)
         self._beta: NDArray[np.float64] = np.zeros(0)
+        self._epsilon: NDArray[np.float64] = np.zeros(0)
 
     @override
     def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
@@ -164,6 +163,7 @@ class StackedPrioritizedReplay(StackedReplay):
         self._priorities.clear(slot)
         self._highest[slot] = 1.0
         self._alpha[slot], self._beta[slot] = hyperparams.prioritized_alpha, hyperparams.prioritized_beta
+        self._epsilon[slot] = hyperparams.prioritized_epsilon
 
     def _grow_trees(self) -> None:
         num_slots, capacity = self._rows.shape[:2]
@@ -171,7 +171,7 @@ class StackedPrioritizedReplay(StackedReplay):
         if num_slots == num_now and capacity <= self._priorities.num_leaves:
             return
         self._priorities = self._priorities.resized(num_slots, capacity)
-        for name in ("_highest", "_alpha", "_beta"):
+        for name in ("_highest", "_alpha", "_beta", "_epsilon"):
             values = np.zeros(num_slots)
             values[:num_now] = getattr(self, name)
             setattr(self, name, values)
@@ -197,7 +197,8 @@ class StackedPrioritizedReplay(StackedReplay):
 
     def set_priorities(self, slots: Indices, indices: Indices, td_errors: Floats) -> None:
         """Set the priorities of rows, (M, B), from their newest TD errors."""
-        priorities = (np.abs(td_errors).astype(np.float64) + _MIN_PRIORITY) ** self._alpha[slots, None]
+        sizes = np.abs(td_errors).astype(np.float64) + self._epsilon[slots, None]
+        priorities = sizes ** self._alpha[slots, None]
         priorities = np.where(np.isfinite(priorities), priorities, self._highest[slots, None])
         self._highest[slots] = np.maximum(self._highest[slots], priorities.max(axis=1, initial=0.0))
         self._priorities.set(self._first(slots) + indices, priorities)

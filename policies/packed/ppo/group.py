@@ -39,9 +39,11 @@ class Batch:
     outputs: Floats
     """The policy's outputs, (M, R, A)."""
     advantages: Floats
-    """Standardised advantages, (M, R)."""
+    """Advantages, standardised for members with `normalize_advantages`, (M, R)."""
     value_targets: Floats
     """Value targets, (M, R)."""
+    values: Floats | None = None
+    """The values V of the observations, (M, R); None: no member has a `vf_clip_range`."""
 
 
 class PPOGroup:
@@ -88,6 +90,7 @@ class PPOGroup:
         self._coefficients = ppo.Coefficients(
             clip_param=self._per_member(lambda item: item.clip_param),
             vf_clip_param=self._per_member(lambda item: math.inf if item.vf_clip_param is None else item.vf_clip_param),
+            vf_clip_range=self._per_member(lambda item: math.inf if item.vf_clip_range is None else item.vf_clip_range),
             vf_loss_coeff=self._per_member(lambda item: item.vf_loss_coeff),
             entropy_coeff=self._per_member(lambda item: item.entropy_coeff),
             kl_coeff=self._per_member(lambda _: 0.0),
@@ -115,6 +118,8 @@ class PPOGroup:
         num_updates = math.ceil(num_rows * shared.num_epochs / shared.minibatch_size)
         self._move_schedules()
         columns = self._columns(batch)
+        # No column: the width of the others may decide how products of them are rounded.
+        old_values = None if batch.values is None else torch.from_numpy(batch.values).view(-1).to(self._device)
         indices = torch.from_numpy(self._draw_rows(num_rows, num_updates * shared.minibatch_size)).to(self._device)
         self._optimizer.begin(num_updates)
         parts, norms = None, None
@@ -123,6 +128,7 @@ class PPOGroup:
             rows = columns.index_select(0, chosen.reshape(-1)).view(len(self.members), shared.minibatch_size, -1)
             outputs, values = self._forward(rows)
             minibatch = self._minibatch(rows)
+            minibatch.old_values = None if old_values is None else old_values[chosen]
             if number == num_updates - 1:
                 parts = ppo.loss(outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian)
             norms = self._update(outputs, values, minibatch)

@@ -1,7 +1,8 @@
 """Compute PPO's loss and gradients for many members at once: RLlib's loss, with each member's own coefficients.
 
 Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equations 7 and 9, and RLlib's
-`PPOTorchLearner.compute_loss_for_module` (2.60), which clips the squared value error and adds an adaptive KL penalty.
+`PPOTorchLearner.compute_loss_for_module` (2.60), which clips the squared value error and adds an adaptive KL penalty;
+the range of values is that of PPO2 in OpenAI's Baselines.
 
 Shapes: M members, B rows of a minibatch per member, A actions (or components of an action).
 """
@@ -25,6 +26,8 @@ class Coefficients:
     clip_param: Tensor
     vf_clip_param: Tensor
     """The limit of the squared value error; infinity: no clipping."""
+    vf_clip_range: Tensor
+    """The limit of a value's distance to `Minibatch.old_values`; infinity: none."""
     vf_loss_coeff: Tensor
     entropy_coeff: Tensor
     kl_coeff: Tensor
@@ -39,11 +42,13 @@ class Minibatch:
     logp: Tensor
     """Log probability of the action when it was drawn, (M, B)."""
     advantages: Tensor
-    """Standardised advantages, (M, B)."""
+    """Advantages as the loss takes them, (M, B)."""
     value_targets: Tensor
     """Value targets, (M, B)."""
     old_outputs: Tensor | None = None
     """The policy's outputs when the action was drawn, (M, B, outputs); None: no KL penalty."""
+    old_values: Tensor | None = None
+    """The values when the batch was sampled, (M, B); None: no member has a `vf_clip_range`."""
 
 
 @dataclass(eq=False)
@@ -98,9 +103,26 @@ def gradients(
 def _value_gradient(values: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tensor:
     errors = values - batch.value_targets
     factor = coefficients.vf_loss_coeff * (2 / values.shape[1])
-    if bool(coefficients.vf_clip_param.isinf().all()):
+    if batch.old_values is None and bool(coefficients.vf_clip_param.isinf().all()):
         return errors.mul_(factor)
-    return torch.where(errors**2 > coefficients.vf_clip_param, 0.0, errors).mul_(factor)
+    squares = _squared_errors(values, batch, coefficients)
+    is_flat = squares > coefficients.vf_clip_param
+    if batch.old_values is not None:
+        # Where the value at the end of its range is farther from the target, it counts, and does not move.
+        is_flat |= squares > errors**2
+    return torch.where(is_flat, 0.0, errors).mul_(factor)
+
+
+def _squared_errors(values: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tensor:
+    """Return the squared value errors that count, (M, B), before `vf_clip_param` limits them."""
+    squares = (values - batch.value_targets) ** 2
+    if batch.old_values is None:
+        return squares
+    moves, limit = values - batch.old_values, coefficients.vf_clip_range
+    at_end = (batch.old_values + torch.clamp(moves, -limit, limit) - batch.value_targets) ** 2
+    # Rows inside their range are left as they are, rather than rounded once more: so members without one are computed
+    # as if nobody beside them had one.
+    return torch.where(moves.abs() > limit, torch.maximum(squares, at_end), squares)
 
 
 def _by_autograd(
@@ -119,7 +141,7 @@ def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coeffi
     ratio = torch.exp(logp - batch.logp)
     limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param)
     surrogate = torch.min(batch.advantages * ratio, batch.advantages * limited)
-    vf_loss = torch.minimum((values - batch.value_targets) ** 2, coefficients.vf_clip_param)
+    vf_loss = torch.minimum(_squared_errors(values, batch, coefficients), coefficients.vf_clip_param)
     kl = torch.zeros_like(entropy)
     if batch.old_outputs is not None:
         kl = _kl(batch.old_outputs, outputs, is_gaussian=is_gaussian)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import Any, cast
 
@@ -237,12 +238,14 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         actions = fragment.actions[:, rows]
         if not self._is_gaussian:
             actions = one_hot(actions, self._num_actions)
+        limits_values = any(item.vf_clip_range is not None for item in hyperparams)
         return Batch(
             observations=seen,
             actions=by_member(actions),
             outputs=by_member(fragment.outputs[:, rows]),
-            advantages=standardise(by_member(advantages)),
+            advantages=_as_learnt(by_member(advantages), hyperparams),
             value_targets=by_member(targets),
+            values=by_member(values) if limits_values else None,
         )
 
     def _values(
@@ -278,3 +281,12 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
     def _evaluate(self, group: PPOGroup, observations: Floats) -> Floats:
         with torch.no_grad():
             return group.values(torch.from_numpy(with_ones(observations)).to(self._device)).cpu().numpy()
+
+
+def _as_learnt(advantages: Floats, hyperparams: Sequence[PPOHyperparams]) -> Floats:
+    """Standardise each member's advantages, (M, R), unless it is to learn from them as they are."""
+    found = standardise(advantages)
+    for index, item in enumerate(hyperparams):
+        if not item.normalize_advantages:
+            found[index] = advantages[index]
+    return found
