@@ -32,7 +32,7 @@ PACKS: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
         {"kl_coeff": 0.7, "kl_target": 1e-4},
         {"hidden_sizes": (6,), "kl_coeff": 0.0, "entropy_coeff": 0.02},
         {"hidden_sizes": (5,), "kl_coeff": 2.0, "kl_target": 0.5, "clip_param": 0.05, "grad_clip": 10.0,
-         "vf_clip_range": 0.05},
+         "vf_clip_range": 1e-3},
     ]),
     "silu, normalised, schedules": (
         "CartPole-v1", {"activation": "silu", "normalize_observations": True, "hidden_sizes": (12, 7)}, [
