@@ -225,6 +225,8 @@ def check_vf_clip_range() -> None:
     values = group.values(torch.from_numpy(with_ones(batch.observations)))
     # This group has the weights that sampled, not those that were moved since.
     np.testing.assert_allclose(present(batch.values), values.detach().numpy(), rtol=1e-5, atol=1e-6)
+    # The rows of packs with one env each do not lie in one piece.
+    updates(shared={"num_envs": 1}, vf_clip_range=0.01)
     # Nothing is kept where no member has a range.
     _, _, sampled = updates()
     assert sampled.groups[0][1].values is None

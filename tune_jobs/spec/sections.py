@@ -136,6 +136,11 @@ class SchedulerSpec(Section):
         0.25, description="pbt: share of mutations that draw a new value; the others move to a neighbouring one."
     )
 
+    @property
+    def waits_for_others(self) -> bool:
+        """Whether trials wait at numbers of env steps until others have come as far."""
+        return self.type in ("hyperband", "pbt")
+
 
 class ObjectiveSpec(Section):
     """What a setting is judged by; the best policy is chosen by its evaluations, whatever this says."""

@@ -119,7 +119,7 @@ class PPOGroup:
         self._move_schedules()
         columns = self._columns(batch)
         # No column: the width of the others may decide how products of them are rounded.
-        old_values = None if batch.values is None else torch.from_numpy(batch.values).view(-1).to(self._device)
+        old_values = None if batch.values is None else torch.from_numpy(batch.values).reshape(-1).to(self._device)
         indices = torch.from_numpy(self._draw_rows(num_rows, num_updates * shared.minibatch_size)).to(self._device)
         self._optimizer.begin(num_updates)
         parts, norms = None, None
