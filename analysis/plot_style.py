@@ -8,13 +8,14 @@ from __future__ import annotations
 import html
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.points import EMPTY, lacks
 from analysis.records import TrialRecord
 from analysis.tables import cell_value, point_names
 from analysis.wording import is_number
@@ -87,9 +88,14 @@ def escape(text: str) -> str:
 
 
 def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
-    """Return the searched hyperparameters that can be an axis: numbers with at least two values, lr first."""
+    """Return the searched hyperparameters that can be an axis: numbers with at least two values, lr first.
+
+    One that doesn't act in some trials is none, as these would have no place on it.
+    """
     names = []
     for name in point_names(trials):
+        if any(lacks(trial.point, name) for trial in trials):
+            continue
         values = {trial.point[name] for trial in trials if is_number(trial.point.get(name))}
         if len(values) > 1:
             names.append(name)
@@ -106,6 +112,10 @@ def group_names(trials: Sequence[TrialRecord], axis: str | None) -> list[str]:
     return names[:2]
 
 
+def _value(point: Mapping[str, Any], name: str) -> Any:
+    return EMPTY if lacks(point, name) else cell_value(point.get(name))
+
+
 def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[str, Style]:
     """Return a style for each trial id: colour by combination of values, marker by the first, line by the last.
 
@@ -113,12 +123,12 @@ def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[st
     """
     if not names:
         return {trial.trial_id: Style("", PALETTE[0], MARKERS[0], LINES[0]) for trial in trials}
-    keys = {t.trial_id: tuple(cell_value(t.point.get(name)) for name in names) for t in trials}
+    keys = {t.trial_id: tuple(_value(t.point, name) for name in names) for t in trials}
     first = list(dict.fromkeys(key[0] for key in keys.values()))
     last = list(dict.fromkeys(key[-1] for key in keys.values()))
     styles = {
         key: Style(
-            label=" · ".join(str(value) for value in key),
+            label=" · ".join(str(value) for value in key if value != EMPTY) or f"no {' and no '.join(names)}",
             color=PALETTE[number % len(PALETTE)],
             marker=MARKERS[first.index(key[0]) % len(MARKERS)],
             line=LINES[last.index(key[-1]) % len(LINES)],

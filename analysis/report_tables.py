@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from analysis.best_records import BestRecord
+from analysis.points import EMPTY, lacks
 from analysis.records import IterationRecord, TrialRecord
 from analysis.selection import rank_points
 from analysis.tables import groups_frame, point_names, steps_to_solve_frame, trials_frame
@@ -76,7 +77,8 @@ def trial_table(
     order = {trial_id: rank for rank, trial_id in enumerate(ranked)}
     winner = best.checkpoint.trial_id if best is not None else None
     columns = {"score": "score", "trial_id": "trial", "status": "status"}
-    columns |= {name: name for name in point_names(trials)}
+    names = point_names(trials)
+    columns |= {name: name for name in names}
     columns |= {"training_return": "training return"}
     if frame["collapsed"].any():
         columns["collapsed"] = COLLAPSED
@@ -84,9 +86,11 @@ def trial_table(
         columns["num_env_steps_to_solve"] = "env steps to solve"
     columns |= {"num_env_steps": "env steps", "core_seconds": "core-seconds", "seed": "seed"}
     columns |= {"stop_reason": "ended by"}
+    lacking = {trial.trial_id: [name for name in names if lacks(trial.point, name)] for trial in trials}
     rows = []
     for row in sorted(frame.to_dict("records"), key=lambda row: order.get(row["trial_id"], len(order))):
-        cells = [_cell(str(name), row[name]) for name in columns]
+        empty = lacking[row["trial_id"]]
+        cells = [_NOTHING if name in empty else _cell(str(name), row[name]) for name in columns]
         if row["trial_id"] == winner:
             cells[1] = cells[1]._replace(kind="winner")
         anchor = errors.get(str(row["trial_id"]))
@@ -110,7 +114,10 @@ def group_table(
     if goal is not None:
         columns |= {"num_solved": "solved", "min_num_env_steps_to_solve": "fewest env steps to solve"}
     columns |= {"best_score": "best score", "mean_score": "mean score"}
-    rows = [[_cell(str(name), row[name]) for name in columns] for row in frame.to_dict("records")]
+    lacking = _lacking(trials, names)
+    rows = [
+        [_cell(str(name), row[name], is_empty=name in lacking) for name in columns] for row in frame.to_dict("records")
+    ]
     return Table(list(columns.values()), rows)
 
 
@@ -125,13 +132,14 @@ def steps_table(
         return Table([], [])
     frame = steps_to_solve_frame(trials, results, threshold=goal)
     names = point_names(trials)
+    lacking = _lacking(trials, names)
     seeds = [str(name) for name in frame.columns if str(name).startswith("num_env_steps_seed_")]
     rows = []
     for row in frame[frame["num_solved"] > 0].head(MAX_STEPS_ROWS).to_dict("records"):
         each = ", ".join("not solved" if (cell := _cell("", row[name])).value is None else cell.text for name in seeds)
         rows.append(
             [
-                *(_cell(name, row[name]) for name in names),
+                *(_cell(name, row[name], is_empty=name in lacking) for name in names),
                 Cell(row["num_solved"], f"{row['num_solved']} of {row['num_seeds']}"),
                 _cell("median_num_env_steps", row["median_num_env_steps"]),
                 Cell(each, each, "wide"),
@@ -140,11 +148,19 @@ def steps_table(
     return Table([*names, "seeds that solve", "median env steps", "env steps of each seed"], rows)
 
 
-def _cell(name: str, value: Any) -> Cell:
+_NOTHING = Cell(None, EMPTY)
+
+
+def _lacking(trials: Sequence[TrialRecord], names: Sequence[str]) -> set[str]:
+    """Return the names of values that some trials don't have, as they don't act there."""
+    return {name for name in names if any(lacks(trial.point, name) for trial in trials)}
+
+
+def _cell(name: str, value: Any, *, is_empty: bool = False) -> Cell:
     import pandas as pd
 
     if pd.isna(value):
-        return Cell(None, NONE)
+        return _NOTHING if is_empty else Cell(None, NONE)
     if name == "collapsed":
         text = "yes" if value else "no"
         return Cell(text, text, "collapsed" if value else "")

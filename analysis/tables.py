@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.collapse import collapsed_trials
+from analysis.points import searched_names
 from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
 from analysis.statistics import median_steps
@@ -63,7 +64,24 @@ def describe_changes(trial: TrialRecord) -> str | None:
 
 def point_names(trials: Sequence[TrialRecord]) -> list[str]:
     """Return the names of the searched hyperparameters, in the order of the sweep file."""
-    return list(dict.fromkeys(name for trial in trials for name in trial.point))
+    return searched_names(trial.point for trial in trials)
+
+
+def types_with_gaps(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, str]:
+    """Return the types of those columns of whole numbers in which some rows have none.
+
+    Pandas would make them floats, which CSV has as 32.0.
+
+    Args:
+        rows: The rows of a table.
+        names: The columns to look at.
+    """
+    found = {}
+    for name in names:
+        kinds = {type(row[name]) for row in rows}
+        if kinds == {int, type(None)}:
+            found[name] = "Int64"
+    return found
 
 
 def env_steps_to(
@@ -164,7 +182,7 @@ def trials_frame(
     # Int64 (capital I) is pandas' integer that can be missing: env steps stay whole numbers in the CSV.
     counts = ["score_num_env_steps", "num_env_steps_to_solve", "num_env_steps_to_threshold"]
     types = {**dict.fromkeys(floats, "float64"), **dict.fromkeys(counts, "Int64"), "collapsed": "boolean"}
-    return frame.astype(types)
+    return frame.astype(types | types_with_gaps(rows, names))
 
 
 def iterations_frame(results: Mapping[str, Sequence[IterationRecord]]) -> pd.DataFrame:
@@ -266,7 +284,8 @@ def steps_to_solve_frame(
         )
     before = ["point_index", *names, "num_seeds", "num_solved", "median_num_env_steps"]
     frame = pd.DataFrame(rows, columns=[*before, *columns])
-    frame = frame.astype({"median_num_env_steps": "float64", **dict.fromkeys(columns, "Int64")})
+    types = {"median_num_env_steps": "float64", **dict.fromkeys(columns, "Int64")}
+    frame = frame.astype(types | types_with_gaps(rows, names))
     order = ["median_num_env_steps", "num_solved", "point_index"]
     return frame.sort_values(order, ascending=[True, False, True], na_position="last", ignore_index=True)
 

@@ -27,7 +27,15 @@ def number(value: Any) -> str:
         return str(value)
     if float(value).is_integer() and abs(value) < 1e15:
         return f"{int(value):,}"
-    return f"{value:.4g}"
+    return _rounded(value, 4)
+
+
+def _rounded(value: float, digits: int) -> str:
+    """Return a number with some significant digits, and more where it would seem to be 1: 0.99987 is not."""
+    text = f"{value:.{digits}g}"
+    if text != "1" or value >= 1:
+        return text
+    return f"{value:.{1 - math.floor(math.log10(1.0 - value))}f}".rstrip("0")
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:
@@ -106,7 +114,7 @@ def shown_part(place: str, name: str) -> str:
 def setting_text(value: Any) -> str:
     """Return a hyperparameter's text for a terminal, as in a sweep file: no separated thousands; 64x64 for lists."""
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return _rounded(value, 4)
     if isinstance(value, list | tuple):
         return "x".join(setting_text(item) for item in value)
     return PLAIN_NONE if value is None else str(value)
@@ -115,7 +123,7 @@ def setting_text(value: Any) -> str:
 def short_text(value: Any) -> str:
     """Return a hyperparameter's text where there is little room: three significant digits; 64x64 for lists."""
     if isinstance(value, float):
-        return f"{value:.3g}"
+        return _rounded(value, 3)
     return "x".join(map(short_text, value)) if isinstance(value, list | tuple) else setting_text(value)
 
 

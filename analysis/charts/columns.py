@@ -10,13 +10,14 @@ import numpy as np
 
 from analysis.charts.model import Axis, Column, Number, Trials
 from analysis.charts.subject import Subject
+from analysis.domains import LISTED_KINDS, NEAR_ONE, arguments_of, is_log_kind, kind_of
+from analysis.points import IDLE, value_of
 from analysis.wording import is_number, setting_text
 
 MAX_SHOWN = 500
 """How many trials are drawn one by one."""
 _NUM_BEST_SHOWN = 100
 _MAX_LISTED = 12
-_LISTED_KINDS = ("grid", "choice")
 _NOT_SET = "not set"
 
 
@@ -29,7 +30,7 @@ def trials_table(subject: Subject, names: Sequence[str]) -> Trials:
         score=Axis(subject.score_name),
         scores=scores,
         endings=tuple(subject.ending(trial) for trial in trials),
-        columns=tuple(column(name, [trial.point.get(name) for trial in trials], subject.space) for name in names),
+        columns=tuple(column(name, [value_of(trial.point, name) for trial in trials], subject.space) for name in names),
         shown=_shown(scores),
     )
 
@@ -39,18 +40,27 @@ def column(name: str, values: Sequence[Any], space: Mapping[str, Any]) -> Column
 
     Args:
         name: The hyperparameter.
-        values: Its value in each trial; None: it has none.
+        values: Its value in each trial; None: it has none; `IDLE`: it does not act, and has no place on the axis.
         space: The space of the sweep file; what it lacks is seen from the values.
     """
-    kind = _kind(space.get(name))
+    acting = [value for value in values if value is not IDLE]
+    if len(acting) < len(values):
+        found = column(name, acting, space) if acting else Column(Axis(name), ())
+        places = iter(found.values)
+        return Column(found.axis, tuple(None if value is IDLE else next(places) for value in values))
+    kind = kind_of(space.get(name))
     numbers = [float(value) for value in values if is_number(value) and math.isfinite(value)]
     is_numeric = len(numbers) == len([value for value in values if value is not None]) > 0
-    is_listed = kind in ("", *_LISTED_KINDS)
-    is_short = kind in _LISTED_KINDS and len(set(numbers)) <= _MAX_LISTED
+    is_listed = kind in ("", *LISTED_KINDS)
+    is_short = kind in LISTED_KINDS and len(set(numbers)) <= _MAX_LISTED
     if not is_numeric or is_short or (is_listed and None in values):
         return _categories(name, values, space)
+    if kind == NEAR_ONE and max(numbers) < 1:
+        return Column(
+            Axis(f"1 - {name}", "log"), tuple(None if value is None else round(1.0 - value, 15) for value in values)
+        )
     is_wide = min(numbers) > 0 and max(numbers) > 10 * min(numbers)
-    is_log = min(numbers) > 0 and ("log" in kind or (is_listed and is_wide))
+    is_log = min(numbers) > 0 and (is_log_kind(kind) or (is_listed and is_wide))
     return Column(Axis(name, "log" if is_log else "value"), tuple(values))
 
 
@@ -64,10 +74,6 @@ def place(column: Column, value: Number) -> float:
     return (value - low) / (high - low)
 
 
-def _kind(domain: Any) -> str:
-    return str(next(iter(domain))) if isinstance(domain, Mapping) and len(domain) == 1 else ""
-
-
 def _categories(name: str, values: Sequence[Any], space: Mapping[str, Any]) -> Column:
     tried = {_label(value): value for value in values}
     listed = [_label(value) for value in _listed(space.get(name))]
@@ -79,7 +85,7 @@ def _categories(name: str, values: Sequence[Any], space: Mapping[str, Any]) -> C
 
 
 def _listed(domain: Any) -> Sequence[Any]:
-    values = next(iter(domain.values())) if _kind(domain) in _LISTED_KINDS else ()
+    values = arguments_of(domain) if kind_of(domain) in LISTED_KINDS else ()
     return values if isinstance(values, list | tuple) else ()
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from analysis.plot_style import MAX_DRAWN
 
-Section = Literal["front", "mattered", "learning", "cost"]
+Section = Literal["mattered", "learning", "cost"]
 """The sections of the page that have charts."""
 Number = float | int | None
 Ending = Literal["whole", "cut", "unfinished", "failed"]
@@ -51,7 +51,7 @@ class Column:
         """The least and the greatest value, or the first and the last place."""
         if self.axis.kind == "category":
             return 0.0, len(self.axis.labels) - 1.0
-        known = [value for value in self.values if value is not None]
+        known = [value for value in self.values if value is not None] or [0.0]
         return float(min(known)), float(max(known))
 
 

@@ -9,6 +9,7 @@ from analysis.charts.learning import ENV_STEPS
 from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots
 from analysis.charts.subject import Subject
 from analysis.plot_style import PALETTE
+from analysis.points import value_of
 from analysis.records import TrialRecord
 
 _MAX_PALE = 80
@@ -58,9 +59,9 @@ def _plot(subject: Subject, name: str, trials: Sequence[TrialRecord], top: Seque
 def schedule(trial: TrialRecord, name: str) -> tuple[list[int], list[object]]:
     """Return the env steps at which a trial began to have each value of a hyperparameter, and those values.
 
-    The last value is given again at the trial's end.
+    Where it did not act, the value is `IDLE`. The last value is given again at the trial's end.
     """
     steps: list[int] = [0, *(change.num_env_steps for change in trial.changes)]
-    values = [*(change.before.get(name) for change in trial.changes), trial.point.get(name)]
+    values = [*(value_of(change.before, name) for change in trial.changes), value_of(trial.point, name)]
     end = max(trial.num_env_steps, steps[-1])
     return [*steps, end], [*values, values[-1]]

@@ -156,9 +156,11 @@ def _draw_parallel(trials: Trials) -> Figure:
     axes = figure.subplots()
     columns = [*trials.columns, Column(trials.score, trials.scores)]
     score = columns[-1]
-    drawn = [index for index in trials.shown if all(column.values[index] is not None for column in columns)]
+    drawn = [index for index in trials.shown if trials.scores[index] is not None]
     drawn.sort(key=lambda index: trials.scores[index] or 0.0)
-    lines = [[(at, place(column, column.values[index])) for at, column in enumerate(columns)] for index in drawn]
+    # A line passes by the axis of what does not act in its trial.
+    known = [[(at, each, each.values[index]) for at, each in enumerate(columns)] for index in drawn]
+    lines = [[(at, place(each, value)) for at, each, value in line if value is not None] for line in known]
     styles = ["-" if trials.endings[index] == "whole" else "--" for index in drawn]
     paints = [_ramp(place(score, score.values[index])) for index in drawn]
     axes.add_collection(LineCollection(lines, colors=paints, linestyles=styles, linewidths=0.8, alpha=0.6))

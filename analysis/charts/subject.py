@@ -11,9 +11,10 @@ from typing import Any, cast, get_args
 from analysis.charts.model import Ending
 from analysis.importance import WhatMattered
 from analysis.objectives import SettingScores, rank_settings, score_of
-from analysis.records import Cost, IterationRecord, Objective, SweepRecord, TrialRecord
+from analysis.points import value_text
+from analysis.records import IterationRecord, Objective, SweepRecord, TrialRecord
 from analysis.tables import point_names
-from analysis.wording import setting_text, short_text
+from analysis.wording import short_text
 
 _SCORES: dict[Objective, str] = {
     "final": "final score, mean return in the later half of training",
@@ -39,8 +40,10 @@ class Subject:
     @property
     def varied_names(self) -> list[str]:
         """The searched hyperparameters that have several values, the most important first."""
-        names = dict.fromkeys([*self.mattered.names, *point_names(self.begun)])
-        return [name for name in names if len({setting_text(trial.point.get(name)) for trial in self.begun}) > 1]
+        # Of layers that are judged one by one the first counts.
+        judged = (name if name in self.space else name.partition(".")[0] for name in self.mattered.names)
+        names = dict.fromkeys([*judged, *point_names(self.begun)])
+        return [name for name in names if len({value_text(trial.point, name) for trial in self.begun}) > 1]
 
     @property
     def order_of_names(self) -> str:
@@ -69,12 +72,6 @@ class Subject:
         if kind not in get_args(Objective) or (kind == "steps_to_threshold" and self._threshold is None):
             return "final"
         return cast("Objective", kind)
-
-    @property
-    def cost(self) -> Cost | None:
-        """What settings cost, if the sweep file asks for it."""
-        cost = self.sweep.section("objective").get("cost")
-        return cast("Cost", cost) if cost in get_args(Cost) else None
 
     @property
     def _threshold(self) -> float | None:

@@ -81,7 +81,7 @@ def _marks(trials: Trials) -> tuple[str, ...]:
 
 
 def _heat_map(trials: Trials, why_not: str) -> Chart:
-    top = trials.columns[:2]
+    top = _top_two(trials)
     title = "Mean score by " + (" and ".join(column.axis.name for column in top) if len(top) == 2 else "two")
     if not why_not and len(top) < 2:
         why_not = "A heat map takes two hyperparameters, and one was searched."
@@ -91,9 +91,14 @@ def _heat_map(trials: Trials, why_not: str) -> Chart:
         if ending == "whole" and all(column.values[index] is not None for column in top)
     ]
     if not why_not and len(whole) < _MIN_TRIALS:
-        why_not = "Fewer than two trials trained to their end, so there are no means to compare."
+        why_not = "Fewer than two trials in which both act trained to their end, so there are no means to compare."
     left_out = sum(ending in ("cut", "unfinished") for ending in trials.endings)
-    notes = (f"{counted(left_out, 'trial')} that did not train to the end left out.",) if left_out else ()
+    notes: tuple[str, ...] = ()
+    if left_out:
+        notes = (f"{counted(left_out, 'trial')} that did not train to the end left out.",)
+    num_idle = sum(any(column.values[index] is None for column in top) for index in range(len(trials.ids)))
+    if len(top) == 2 and num_idle:
+        notes += (f"{counted(num_idle, 'trial')} in which one of the two does not act left out.",)
     caption = "Mean score, and number, of the trials in each cell, by the first two hyperparameters of the panels."
     if why_not:
         return Chart("heat_map", "mattered", title, caption, None, why_not)
@@ -108,6 +113,16 @@ def _heat_map(trials: Trials, why_not: str) -> Chart:
         for (x_place, y_place), scores in sorted(members.items())
     )
     return Chart("heat_map", "mattered", title, caption, HeatMap(x, y, trials.score, cells), notes=notes)
+
+
+def _top_two(trials: Trials) -> Sequence[Column]:
+    """Return the most important hyperparameter, and the next one that acts in trials in which it does."""
+    for second in trials.columns[1:]:
+        first = trials.columns[0]
+        both = zip(first.values, second.values, strict=True)
+        if sum(None not in values for values in both) >= _MIN_TRIALS:
+            return first, second
+    return trials.columns[:2]
 
 
 def _binned(column: Column, indices: Sequence[int]) -> tuple[Axis, list[int]]:

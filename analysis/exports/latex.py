@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from analysis.exports.frames import SweepData, intervals_of, num_solved, ranked_settings
 from analysis.objectives import SettingScores
+from analysis.points import value_text
 from analysis.records import Objective
 from analysis.statistics import Estimate
 from analysis.tables import point_names
-from analysis.wording import setting_text
 
 NUM_LISTED = 10
 _MISSING = "--"
@@ -90,7 +90,7 @@ def _row(
     low_high = sorted(-end for end in ends) if in_steps else ends
     shown = [_shown(value, in_steps=in_steps) for value in low_high]
     cells = [
-        *(escaped(setting_text(item.point.get(name))) for name in names),
+        *(escaped(value_text(item.point, name)) for name in names),
         str(len(item.scores)),
         _shown(-item.mean if in_steps else item.mean, in_steps=in_steps),
         f"{shown[0]} to {shown[1]}" if shown else _MISSING,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from analysis.exports.frames import SweepData, ranked_settings
 from analysis.objectives import SettingScores
 from analysis.plot_style import ACCENT, GRID, PALETTE, drawable, escape, new_figure, steps_axis, style_axes
+from analysis.points import searched_names
 from analysis.statistics import seed_intervals
 from analysis.tables import cell_value
 from analysis.wording import counted, short_text
@@ -232,7 +233,9 @@ def _bands(
 
 def _labels(settings: Sequence[SettingScores]) -> list[str]:
     """Return what tells settings apart: the values that are not the same in all of them, or all values of a single."""
-    names = list(dict.fromkeys(name for item in settings for name in item.point))
+    names = searched_names(item.point for item in settings)
     differing = [name for name in names if len({repr(cell_value(item.point.get(name))) for item in settings}) > 1]
     shown = differing or names
-    return [", ".join(f"{name} {short_text(item.point.get(name))}" for name in shown) for item in settings]
+    return [
+        ", ".join(f"{name} {short_text(item.point[name])}" for name in shown if name in item.point) for item in settings
+    ]

@@ -69,7 +69,8 @@ def _rises(item: Searched, distance: Floats, rest: Floats) -> bool:
         distance: How far from the end each point is.
         rest: What the other hyperparameters leave of the outcome.
     """
-    first, second = (_BAND, 2.0 * _BAND) if item.is_numeric else np.unique(distance)[:2] + 1e-9
+    is_fine = item.is_numeric and item.kind != "power_of_two"
+    first, second = (_BAND, 2.0 * _BAND) if is_fine else np.unique(distance)[:2] + 1e-9
     outer, inner = rest[distance <= first], rest[(distance > first) & (distance <= second)]
     return bool(outer.size and inner.size and outer.mean() > inner.mean())
 
@@ -109,6 +110,7 @@ def _arguments(item: Searched, side: str, further: float) -> list[Any]:
     if item.is_listed:
         return [further, *item.arguments] if side == "low" else [*item.arguments, further]
     low, high, *rest = item.arguments
+    further = int(further) if item.is_whole else round(further, 15)
     return [further, high, *rest] if side == "low" else [low, further + item.upper_gap, *rest]
 
 
@@ -121,8 +123,13 @@ def _beyond(item: Searched, side: str) -> list[float]:
     if item.is_listed:
         listed = sorted(set(item.scaled()))
         step = float(listed[1] - listed[0] if side == "low" else listed[-1] - listed[-2])
-    beyond = _rounded(item.unscaled(low - step if side == "low" else high + step))
     end = item.ends[0 if side == "low" else 1]
+    if item.kind == "power_of_two":
+        return [value for factor in (4, 2) if (value := end / factor if side == "low" else end * factor) >= 1]
+    beyond = item.unscaled(low - step if side == "low" else high + step)
+    beyond = 1.0 - _rounded(1.0 - beyond) if item.is_near_one else _rounded(beyond)
+    if item.is_near_one and side == "high":
+        return [beyond] if end < beyond < 1.0 else []
     values = [beyond, *(limit for limit in (0.0, 1.0) if min(beyond, end) < limit < max(beyond, end))]
     if item.is_whole:
         values = [round(value) for value in values]

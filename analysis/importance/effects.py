@@ -57,7 +57,9 @@ def adjusted_effects(varied: Sequence[Searched], terms: Terms, scores: Sequence[
         parts = _parts(item)
         levels, masks = _levels(parts, outcome), [mask for _, _, mask in parts]
         why_not = [_why_not_comparable(item, level, mask, varied) for level, mask in zip(levels, masks, strict=True)]
-        means, half_widths = _adjusted(terms, fitted, index, np.column_stack(masks).astype(np.float64), unit)
+        # Points in which it does not act are a level of their own, of which nothing is said.
+        idle = [item.is_idle] if item.is_idle.any() else []
+        means, half_widths = _adjusted(terms, fitted, index, np.column_stack([*masks, *idle]).astype(np.float64), unit)
         effects.append(
             Effect(
                 item.name,
@@ -74,7 +76,7 @@ def adjusted_effects(varied: Sequence[Searched], terms: Terms, scores: Sequence[
                         centre + spread * (mean + half_width),
                     )
                     for level, why, mean, half_width in zip(
-                        levels, why_not, means.tolist(), half_widths.tolist(), strict=True
+                        levels, why_not, means.tolist(), half_widths.tolist(), strict=False
                     )
                 ),
                 next(filter(None, why_not), ""),
@@ -95,13 +97,17 @@ def _parts(item: Searched) -> list[Part]:
     if not item.is_numeric:
         keys, key_of = np.array(item.keys), dict(zip(map(repr, item.values), item.keys, strict=True))
         found = [
-            (NOT_SET if value is None else setting_text(value), value, keys == key_of[repr(value)])
+            (
+                NOT_SET if value is None else setting_text(value),
+                value,
+                (keys == key_of[repr(value)]) & ~item.is_idle,
+            )
             for value in item.listed
         ]
         if len(found) <= _MOST_LEVELS:
             return found
         kept = sorted(found, key=lambda part: -int(part[2].sum()))[: _MOST_LEVELS - 1]
-        rest = ~np.any([mask for _, _, mask in kept], axis=0)
+        rest = ~np.any([mask for _, _, mask in kept], axis=0) & ~item.is_idle
         return [*kept, ("others", None, rest)]
     scaled = item.scaled()
     low, high = item.scaled_ends
@@ -116,7 +122,8 @@ def _parts(item: Searched) -> list[Part]:
                 item.unscaled(end) for end in (*ends[index : index + 2], ends[index : index + 2].mean())
             )
             parts.append((f"{short_text(first)} to {short_text(last)}", middle, mask))
-    return [*parts, (NOT_SET, None, item.is_missing)] if item.is_missing.any() else parts
+    missing = item.is_missing & ~item.is_idle
+    return [*parts, (NOT_SET, None, missing)] if missing.any() else parts
 
 
 def _adjusted(terms: Terms, fitted: Fit, index: int, levels: Floats, outcome: Floats) -> tuple[Floats, Floats]:
@@ -136,23 +143,26 @@ def _adjusted(terms: Terms, fitted: Fit, index: int, levels: Floats, outcome: Fl
 def _why_not_comparable(item: Searched, level: Level, mask: Bools, varied: Sequence[Searched]) -> str:
     """Say which other hyperparameter has other values in a level than elsewhere; empty if none has."""
     for other in varied:
-        if other.name != item.name and not _overlap(other, mask):
+        # Where one of them does not act, the other's values make no difference that it could be taken for.
+        both = ~item.is_idle & ~other.is_idle
+        here, there = mask & both, ~mask & both
+        if other.name != item.name and here.any() and there.any() and not _overlap(other, here, there):
             return (
-                f"{item.name} {level.label} was tried with {other.name} {_values(other, mask)}, and other values of "
-                f"{item.name} with {_values(other, ~mask)}: which of the two made the difference can't be told."
+                f"{item.name} {level.label} was tried with {other.name} {_values(other, here)}, and other values of "
+                f"{item.name} with {_values(other, there)}: which of the two made the difference can't be told."
             )
     return ""
 
 
-def _overlap(other: Searched, mask: Bools) -> bool:
+def _overlap(other: Searched, here: Bools, there: Bools) -> bool:
     """Whether the values of another hyperparameter in a level, and those elsewhere, have enough in common."""
     missing = other.is_missing
-    if not other.is_numeric or missing[mask].all() or missing[~mask].all():
+    if not other.is_numeric or missing[here].all() or missing[there].all():
         keys = np.array(other.keys)
-        return bool(np.isin(keys[mask], keys[~mask]).mean() >= _LEAST_SHARE)
+        return bool(np.isin(keys[here], keys[there]).mean() >= _LEAST_SHARE)
     scaled = other.scaled()
-    here, there = scaled[mask & ~missing], scaled[~mask & ~missing]
-    return max(_inside(here, there), _inside(there, here)) >= _LEAST_SHARE
+    inner, outer = scaled[here & ~missing], scaled[there & ~missing]
+    return max(_inside(inner, outer), _inside(outer, inner)) >= _LEAST_SHARE
 
 
 def _inside(values: Floats, others: Floats) -> float:

@@ -10,6 +10,7 @@ from analysis.importance.answer import Interaction
 from analysis.importance.chance import added_chances
 from analysis.importance.model import Fit, Floats, Terms, centred, fit, joined
 
+_LEAST_PRODUCT = 1e-12
 _MOST_PAIRS = 5
 """How many pairs are given at most."""
 
@@ -31,6 +32,12 @@ def find_interactions(
     if not pairs or len(outcome) < 2 * terms.columns.shape[1]:
         return []
     columns = [_product(terms, *pair) for pair in pairs]
+    # One of the pair acts with one value of the other alone: there is nothing that both do together.
+    seen = [float((product**2).sum()) > _LEAST_PRODUCT * len(outcome) for product in columns]
+    pairs = [pair for pair, is_seen in zip(pairs, seen, strict=True) if is_seen]
+    columns = [product for product, is_seen in zip(columns, seen, strict=True) if is_seen]
+    if not pairs:
+        return []
     chances = added_chances(terms, fitted, columns, outcome, rng)
     found: list[Interaction] = []
     for pair, product, chance in sorted(zip(pairs, columns, chances, strict=True), key=lambda item: float(item[2])):

@@ -14,6 +14,7 @@ and Nonparametric Statistics".
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -88,7 +89,17 @@ def joined(columns: dict[str, Floats]) -> Terms:
 
 
 def columns_of(item: Searched) -> Floats:
-    """Return a hyperparameter's columns, shape (points, coefficients), each with mean zero."""
+    """Return a hyperparameter's columns, shape (points, coefficients), each with mean zero.
+
+    Those of points in which it does not act are zero, and the others have mean zero by themselves. So a hyperparameter
+    that acts with some values of another takes no part in what that one explains.
+    """
+    if item.acts is not None:
+        acts = ~item.is_idle
+        columns = columns_of(dataclasses.replace(item, values=item.acting_values, acts=None))
+        whole = np.zeros((len(acts), columns.shape[1]))
+        whole[acts] = columns
+        return whole
     if item.is_numeric:
         numbers, missing = item.scaled(), item.is_missing
         # Points without a number have a coefficient of their own, and no part in the parabola.

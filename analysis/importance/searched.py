@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.domains import LISTED_KINDS, NEAR_ONE, arguments_of, conditions_of, is_log_kind, kind_of
+from analysis.points import searched_names
 from analysis.wording import is_number
 
 Floats = NDArray[np.float64]
@@ -32,11 +34,13 @@ class Searched:
     """The arguments of the domain: its ends, or its values."""
     values: tuple[Any, ...]
     """One a point; None where a point has none."""
+    acts: tuple[bool, ...] | None = None
+    """In which points it acts; None: in all. Elsewhere it has no value, and no part in what is said of it."""
 
     @property
     def is_log(self) -> bool:
         """Whether equal ratios count as equal steps."""
-        if "log" in self.kind:
+        if is_log_kind(self.kind):
             return True
         # Of listed numbers, as 1e-4, 1e-3, 1e-2, nobody says on which scale they are.
         numbers = [value for value in self.values if is_number(value)]
@@ -53,8 +57,15 @@ class Searched:
         return not self.is_listed or len(set(numbers)) > MAX_LISTED_NUMBERS
 
     @property
+    def is_idle(self) -> NDArray[np.bool_]:
+        """In which points it does not act."""
+        if self.acts is None:
+            return np.zeros(len(self.values), dtype=np.bool_)
+        return ~np.array(self.acts, dtype=np.bool_)
+
+    @property
     def is_missing(self) -> NDArray[np.bool_]:
-        """Which points have no value."""
+        """Which points have no value, among them those in which it does not act."""
         return np.array([value is None for value in self.values], dtype=np.bool_)
 
     @cached_property
@@ -65,22 +76,33 @@ class Searched:
     @property
     def listed(self) -> tuple[Any, ...]:
         """The values that points have, each once: in the order of the sweep file, else as they come."""
-        tried = {_key(value): value for value in self.values}
+        tried = {_key(value): value for value in self.acting_values}
         order = [_key(value) for value in self.arguments if self.kind in ("grid", "choice")]
         return tuple(tried[key] for key in dict.fromkeys([*order, *tried]) if key in tried)
 
     @property
     def is_constant(self) -> bool:
-        """Whether all points have the same value."""
-        return len(set(self.keys)) < 2
+        """Whether all points in which it acts have the same value."""
+        return len(set(map(_key, self.acting_values))) < 2
+
+    @property
+    def acting_values(self) -> tuple[Any, ...]:
+        """The values of the points in which it acts."""
+        if self.acts is None:
+            return self.values
+        return tuple(value for value, acts in zip(self.values, self.acts, strict=True) if acts)
 
     def scaled(self, values: Sequence[Any] | None = None) -> Floats:
         """Return numbers on the scale that they were searched on; NaN for none."""
         array = np.array(self.values if values is None else values, dtype=np.float64)
+        if self.is_near_one:
+            return -np.log(1.0 - array)
         return np.log(array) if self.is_on_log_scale else array
 
     def unscaled(self, value: float) -> float:
         """Return a number from the scale that it was searched on."""
+        if self.is_near_one:
+            return 1.0 - math.exp(-value)
         number = math.exp(value) if self.is_on_log_scale else float(value)
         return round(number) if self.is_whole else number
 
@@ -116,6 +138,11 @@ class Searched:
         return all(isinstance(value, int) for value in self.values if value is not None)
 
     @property
+    def is_near_one(self) -> bool:
+        """Whether 1 - value is on a log scale, for which all its values must be below 1."""
+        return self.kind == NEAR_ONE and max(self.ends) < 1
+
+    @property
     def is_on_log_scale(self) -> bool:
         """Whether its scale is logarithmic, for which all its values must be greater than zero."""
         return self.is_log and min(self.ends) > 0
@@ -124,24 +151,45 @@ class Searched:
 def searched(space: Any, points: Sequence[Mapping[str, Any]]) -> list[Searched]:
     """Return the searched hyperparameters, in the order of the sweep file.
 
+    Layers that are searched one by one are their number and the size of each, `hidden_sizes.number`, `hidden_sizes.1`
+    and so on; a layer that a network lacks does not act.
+
     Args:
         space: The space of the resolved sweep file; what can't be understood in it is taken from the points.
         points: The values of each point.
     """
     domains = space if isinstance(space, Mapping) else {}
-    names = dict.fromkeys([*domains, *(name for point in points for name in point)])
-    return [_searched(str(name), domains.get(name), [point.get(name) for point in points]) for name in names]
+    names = dict.fromkeys([*domains, *searched_names(points)])
+    found = []
+    for name in names:
+        domain = domains.get(name)
+        found += _layers(name, domain, points) or [_searched(str(name), domain, points)]
+    return found
 
 
-def _searched(name: str, domain: Any, values: Sequence[Any]) -> Searched:
+def _layers(name: str, domain: Any, points: Sequence[Mapping[str, Any]]) -> list[Searched]:
+    given = arguments_of(domain) if kind_of(domain) == "layers" else None
+    lists = [point[name] for point in points if name in point]
+    if not isinstance(given, Mapping) or not lists or not all(isinstance(sizes, list | tuple) for sizes in lists):
+        return []
+    parts: list[dict[str, Any]] = []
+    for point in points:
+        sizes = point.get(name, ())
+        number = {f"{name}.number": len(sizes)} if sizes else {}
+        parts.append(number | {f"{name}.{index}": size for index, size in enumerate(sizes, start=1)})
+    domains = {part: given.get("sizes") for part in searched_names(parts)} | {f"{name}.number": None}
+    return [_searched(part, domains[part], parts, is_conditional=True) for part in searched_names(parts)]
+
+
+def _searched(name: str, domain: Any, points: Sequence[Mapping[str, Any]], *, is_conditional: bool = False) -> Searched:
     kind, arguments = "", ()
-    if isinstance(domain, Mapping) and len(domain) == 1:
-        ((found, given),) = domain.items()
-        listed = found in ("grid", "choice")
-        is_range = isinstance(given, list | tuple) and len(given) > 1 and all(is_number(end) for end in given[:2])
-        if isinstance(given, list | tuple) and (listed or is_range):
-            kind, arguments = str(found), tuple(given)
-    return Searched(name, kind, arguments, tuple(values))
+    given = arguments_of(domain)
+    is_range = isinstance(given, list | tuple) and len(given) > 1 and all(is_number(end) for end in given[:2])
+    if isinstance(given, list | tuple) and (kind_of(domain) in LISTED_KINDS or is_range):
+        kind, arguments = kind_of(domain), tuple(given)
+    # Without a condition nobody knows why a point lacks a value: that may make a difference by itself.
+    acts = tuple(name in point for point in points) if is_conditional or conditions_of(domain) else ()
+    return Searched(name, kind, arguments, tuple(point.get(name) for point in points), None if all(acts) else acts)
 
 
 def _key(value: Any) -> str:

@@ -14,6 +14,7 @@ from analysis.page.files import write_figure
 from analysis.page.scores import score_means
 from analysis.page.source import Source
 from analysis.plot_style import page_svg, to_svg_file
+from analysis.points import searched_names
 from analysis.selection import score_trial
 from analysis.strip_plot import seed_strips
 
@@ -127,7 +128,7 @@ def _of_seeds(source: Source) -> list[Picture]:
     if not strips or settings is None:
         return []
     is_return = settings.objective != "steps_to_threshold"
-    names = " · ".join(settings.best.point)
+    names = " · ".join(searched_names(item.point for item in settings.ranking))
     return [
         Picture(
             "how_sure",

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.page.scores import counts_env_steps, interval_of, score_means, score_text
 from analysis.page.source import Source
+from analysis.points import searched_names, setting_labels, value_text
 from analysis.records import IterationRecord, TrialRecord, finite_or_none
 from analysis.report_tables import Cell, Table, steps_table
 from analysis.statistics import tie_groups
 from analysis.strip_plot import Strip
 from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, point_names, steps_to_solve_frame
-from analysis.wording import NONE, number, short_text
+from analysis.wording import NONE, number
 from policies import random_streams
 
 _ONE_SEED = (
@@ -56,7 +57,7 @@ def strips(source: Source) -> list[Strip]:
     if settings is None or settings.num_settings < 2:
         return []
     sign = -1.0 if counts_env_steps(settings) else 1.0
-    labels = [" · ".join(short_text(value) for value in item.point.values()) for item in settings.ranking]
+    labels = setting_labels([item.point for item in settings.ranking])
     fit = max(map(len, labels)) <= _MAX_LABEL
     found = []
     for rank, (item, label) in enumerate(zip(settings.ranking, labels, strict=True), start=1):
@@ -75,7 +76,7 @@ def settings_table(source: Source) -> Table:
     settings = source.settings
     if settings is None or settings.num_settings < 2:
         return Table([], [])
-    names, letters = list(settings.best.point), _letters(source, settings)
+    names, letters = searched_names(item.point for item in settings.ranking), _letters(source, settings)
     several = settings.best.probability_best is not None
     headings = ["rank", *names, "seeds"]
     headings += ["solved"] if settings.threshold is not None else []
@@ -142,7 +143,7 @@ def _letters(source: Source, settings: SettingsRecord) -> dict[int, str]:
 
 def _value(item: SettingRecord, name: str) -> Cell:
     value = cell_value(item.point.get(name))
-    return Cell(value, number(value))
+    return Cell(value, value_text(item.point, name, lambda known: number(cell_value(known)), NONE))
 
 
 def _percent(probability: float) -> str:

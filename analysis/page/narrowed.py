@@ -7,11 +7,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from analysis.domains import CONDITION, LISTED_KINDS, NEAR_ONE, arguments_of, conditions_of, is_log_kind, kind_of
 from analysis.wording import is_number
 
 _MARGIN = 0.25
 """How far the new range goes beyond the values that did well, as a share of their own range."""
-_LISTED = ("grid", "choice")
 
 
 def narrowed_space(space: Mapping[str, Any], points: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -25,30 +25,65 @@ def narrowed_space(space: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
         space: The domains as a sweep file has them, by name: `{"lr": {"loguniform": [1e-5, 1e-2]}}`.
         points: The points that did well.
     """
-    return {
+    narrowed = {
         name: _narrowed(domain, [point[name] for point in points if name in point]) for name, domain in space.items()
     }
+    return _with_possible_conditions(narrowed)
 
 
 def _narrowed(domain: Any, values: Sequence[Any]) -> Any:
-    if not isinstance(domain, Mapping) or len(domain) != 1 or not values:
+    kind, ends = kind_of(domain), arguments_of(domain)
+    if not kind or not values or not isinstance(ends, list | tuple):
         return domain
-    kind, ends = next(iter(domain.items()))
-    if not isinstance(ends, list | tuple):
-        return domain
-    if kind in _LISTED:
+    if kind in LISTED_KINDS:
         # As text, as lists can't be in a set, and a tuple is the same value as a list.
         known = {json.dumps(value) for value in values}
         kept = [value for value in ends if json.dumps(value) in known]
-        return {kind: kept} if kept else domain
+        return {**domain, kind: kept or ends}
     if len(ends) < 2 or not all(is_number(value) and math.isfinite(value) for value in (*ends, *values)):
         return domain
-    return {kind: _range(kind, ends, values)}
+    return {**domain, kind: _range(kind, ends, values)}
+
+
+def _with_possible_conditions(space: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a space without conditions on values that it does not have any more, and without what could never act."""
+    found: dict[str, Any] = {}
+    for name, domain in space.items():
+        conditions = {
+            other: [value for value in _listed(given, space.get(other)) if _has(space.get(other), value)]
+            for other, given in conditions_of(domain).items()
+        }
+        if all(conditions.values()):
+            kept = {other: values[0] if len(values) == 1 else values for other, values in conditions.items()}
+            found[name] = {**domain, CONDITION: kept} if conditions else domain
+    # What depended on something that is gone is gone too.
+    return found if len(found) == len(space) else _with_possible_conditions(found)
+
+
+def _listed(given: Any, domain: Any) -> list[Any]:
+    return list(given) if isinstance(given, list | tuple) and not _has(domain, given) else [given]
+
+
+def _has(domain: Any, value: Any) -> bool:
+    """Whether a domain has a value, as far as a condition needs to know."""
+    kind, ends = kind_of(domain), arguments_of(domain)
+    if kind in LISTED_KINDS and isinstance(ends, list | tuple):
+        return json.dumps(value) in map(json.dumps, ends)
+    if not is_number(value) or not isinstance(ends, list | tuple) or len(ends) < 2 or not all(map(is_number, ends)):
+        return False
+    return bool(ends[0] <= value and (value < ends[1] if kind in ("randint", "lograndint") else value <= ends[1]))
 
 
 def _range(kind: str, ends: Sequence[float], values: Sequence[float]) -> list[float]:
     low, high, *step = ends
-    log = "log" in kind and low > 0 and min(values) > 0
+    if kind == "power_of_two":
+        least, most = max(low, min(values) // 2), min(high, max(values) * 2)
+        return [int(least), int(most)] if 0 < least < most else list(ends)
+    if kind == NEAR_ONE and max(*ends, *values) < 1:
+        distances = _range("loguniform", [1 - high, 1 - low], [1 - value for value in values])
+        least, most = (round(1 - distance, 15) for distance in reversed(distances))
+        return [max(low, least), min(high, most)]
+    log = is_log_kind(kind) and low > 0 and min(values) > 0
     first, last = (math.log(min(values)), math.log(max(values))) if log else (min(values), max(values))
     margin = _MARGIN * (last - first) if last > first else _MARGIN * (math.log(high / low) if log else high - low) / 2
     least, most = (math.exp(first - margin), math.exp(last + margin)) if log else (first - margin, last + margin)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from analysis.domains import arguments_of, conditions_of, kind_of
 from analysis.page.source import Source
 from analysis.records import SweepRecord
 from analysis.report_tables import Cell, Table
@@ -96,9 +97,15 @@ def _text(value: Any) -> str:
 
 def _domain(domain: Any) -> str:
     """Return a domain in words: "loguniform from 1e-05 to 0.01", "grid of 32, 64"."""
-    if not isinstance(domain, Mapping) or len(domain) != 1:
+    kind, ends = kind_of(domain), arguments_of(domain)
+    if not kind:
         return str(domain)
-    kind, ends = next(iter(domain.items()))
+    if conditions := conditions_of(domain):
+        return f"{_domain({kind: ends})}, when {_needed(conditions)}"
+    if kind == "layers" and isinstance(ends, Mapping):
+        numbers = ends.get("number")
+        number_text = " to ".join(map(_text, numbers)) if isinstance(numbers, list | tuple) else _text(numbers)
+        return f"{number_text} layers, the size of each {_domain(ends.get('sizes'))}"
     if not isinstance(ends, list | tuple):
         return f"{kind} {ends}"
     texts = [_text(value) for value in ends]
@@ -106,6 +113,14 @@ def _domain(domain: Any) -> str:
         return f"{kind} of {', '.join(texts)}"
     step = f" in steps of {texts[2]}" if len(texts) == 3 else ""
     return f"{kind} from {texts[0]} to {' '.join(texts[1:2])}{step}"
+
+
+def _needed(conditions: Mapping[str, Any]) -> str:
+    """Return conditions in words: "replay is prioritized or none, and n_step is 3"."""
+    return ", and ".join(
+        f"{name} is {' or '.join(map(_text, given)) if isinstance(given, list | tuple) else _text(given)}"
+        for name, given in conditions.items()
+    )
 
 
 def _machines(source: Source) -> list[tuple[str, str]]:

@@ -125,7 +125,8 @@
   function parallel(chart) {
     const columns = [...trials.columns, { axis: trials.score, values: trials.scores }];
     const ends = extent(trials.scores);
-    const drawn = trials.shown.filter((i) => columns.every((column) => column.values[i] !== null))
+    // A line passes by an axis of what does not act in its trial.
+    const drawn = trials.shown.filter((i) => trials.scores[i] !== null)
       .sort((one, two) => trials.scores[one] - trials.scores[two]);
     const option = (narrow) => ({
       parallel: { layout: narrow ? "vertical" : "horizontal", left: narrow ? 30 : 50, right: narrow ? 30 : 60,

@@ -64,7 +64,7 @@ def domains() -> str:
     references = re.findall(r"#/\$defs/(\w+)", json.dumps(definitions["Domain"]))
     rows: list[tuple[str, ...]] = []
     for name in dict.fromkeys(references):
-        ((kind, field),) = definitions[name]["properties"].items()
+        ((kind, field),) = ((key, field) for key, field in definitions[name]["properties"].items() if key != "when")
         rows.append((f"`{kind}`", field["description"], definitions[name]["description"]))
     return _table(("domain", "takes", "gives"), rows)
 

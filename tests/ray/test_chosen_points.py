@@ -12,7 +12,7 @@ from tests.narrowing import present
 from tune_jobs.ray_tune import searcher
 from tune_jobs.search.asking import Check
 from tune_jobs.search.proposal import propose_point
-from tune_jobs.spec.domains import draw_point
+from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.sweep_store import SweepStore

@@ -288,7 +288,7 @@ def test_points_are_chosen_when_trials_are_handed_to_packs(tmp_path: Path) -> No
     records = run_packs(store, slots=2)
     assert [record.status for record in records] == ["completed"] * 8
     assert all(record.has_point and record.hyperparams["lr"] == record.point["lr"] for record in records)
-    from tune_jobs.spec.domains import draw_point
+    from tune_jobs.spec.draws import draw_point
     from tune_jobs.spec.sweep_spec import SweepSpec
 
     spec = SweepSpec.model_validate(store.read_record().spec)

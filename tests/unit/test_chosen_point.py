@@ -208,7 +208,7 @@ def test_tpe_learns_from_a_point_inside_and_proposes_the_same_with_one_outside()
 
     from tune_jobs.search.history import known_points
     from tune_jobs.search.proposal import propose_point
-    from tune_jobs.spec.domains import draw_point
+    from tune_jobs.spec.draws import draw_point
 
     spec = tpe_spec(startup=8)
     records = [record(i, p := draw_point(spec.space, i, spec.seed), valley(p)) for i in range(8)]

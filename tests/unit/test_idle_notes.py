@@ -110,12 +110,41 @@ def test_a_sweep_that_is_there_goes_on_and_is_told() -> None:
 
 # -- searched, and idle in some points
 
+ONLY_THERE = "and it is searched only where it acts"
+WITH_LOSS = f" Give it when: {{use_kl_loss: true}}, {ONLY_THERE}."
+
+
+def test_what_has_a_condition_is_not_told_where_that_does_not_hold() -> None:
+    space = {**grid(use_kl_loss=[False, True]), "kl_target": {"grid": [0.01, 0.1], "when": {"use_kl_loss": True}}}
+    assert notes(**PPO, space=space) == []
+    # Where it holds, and it is idle all the same, that is told as ever.
+    space |= grid(kl_coeff=[0.0, 0.2])
+    (found,) = [note for note in notes(**PPO, space=space) if "kl_target" in note]
+    assert found == (
+        "space.kl_target can't act in 2 of 6 points (2, 4): kl_coeff is 0, and stays 0 as it is changed by factors. "
+        "Add kl_coeff: 0.2 to its when."
+    )
+
+
+def test_a_condition_that_leaves_only_points_where_it_is_idle_is_refused() -> None:
+    space = {**grid(use_kl_loss=[False, True]), "kl_target": {"grid": [0.01, 0.1], "when": {"use_kl_loss": False}}}
+    with pytest.raises(SpecError, match=r"kl_target is searched, but can't act in any point.*use_kl_loss is false"):
+        notes(**PPO, space=space)
+
+
+def test_a_value_fixed_for_where_it_is_not_searched_is_looked_at_once() -> None:
+    space = {**grid(optimizer=["adam", "rmsprop"]), "rmsprop_rho": {"grid": [0.9], "when": {"optimizer": "rmsprop"}}}
+    found = notes(**DQN, space=space, hyperparams={"rmsprop_rho": 0.5})
+    assert [note for note in found if "rmsprop_rho" in note] == []
+
 
 def test_what_acts_in_some_points_alone_is_told_with_these() -> None:
     space = grid(use_kl_loss=[False, True], kl_target=[0.01, 0.1])
-    assert notes(**PPO, space=space) == ["space.kl_target can't act in 2 of 4 points (0, 1): use_kl_loss is false."]
+    (found,) = notes(**PPO, space=space)
+    assert found == f"space.kl_target can't act in 2 of 4 points (0, 1): use_kl_loss is false.{WITH_LOSS}"
     many = grid(use_kl_loss=[False, True], kl_target=[0.01 * number for number in range(1, 11)])
-    assert notes(**PPO, space=many) == ["space.kl_target can't act in 10 of 20 points: use_kl_loss is false."]
+    (found,) = notes(**PPO, space=many)
+    assert found == f"space.kl_target can't act in 10 of 20 points: use_kl_loss is false.{WITH_LOSS}"
 
 
 def test_each_reason_has_its_points() -> None:
@@ -124,17 +153,18 @@ def test_each_reason_has_its_points() -> None:
     assert notes(**PPO, space=space) == [
         f"space.use_kl_loss can't act in 4 of 8 points (0, 1, 4, 5): {zero}.",
         "space.kl_coeff can't act in 4 of 8 points (0, 1, 2, 3): use_kl_loss is false.",
-        "space.kl_target can't act in 4 of 8 points (0, 1, 2, 3): use_kl_loss is false.",
-        f"space.kl_target can't act in 2 of 8 points (4, 5): {zero}.",
+        f"space.kl_target can't act in 4 of 8 points (0, 1, 2, 3): use_kl_loss is false.{WITH_LOSS}",
+        f"space.kl_target can't act in 2 of 8 points (4, 5): {zero}. Give it when: {{kl_coeff: 0.2}}, {ONLY_THERE}.",
     ]
 
 
 def test_the_search_of_one_optimizer_with_the_values_of_both_is_no_error() -> None:
     space = grid(optimizer=["adam", "rmsprop"], rmsprop_rho=[0.9, 0.99], adam_beta1=[0.8, 0.9])
     found = notes(**DQN, space=space)
+    idle = "space.{} can't act in 4 of 8 points ({}): optimizer is {}. Give it when: {{optimizer: {}}}, " + ONLY_THERE
     assert found == [
-        "space.rmsprop_rho can't act in 4 of 8 points (0, 1, 2, 3): optimizer is adam.",
-        "space.adam_beta1 can't act in 4 of 8 points (4, 5, 6, 7): optimizer is rmsprop.",
+        idle.format("rmsprop_rho", "0, 1, 2, 3", "adam", "rmsprop") + ".",
+        idle.format("adam_beta1", "4, 5, 6, 7", "rmsprop", "adam") + ".",
     ]
 
 
@@ -158,7 +188,7 @@ def test_a_few_draws_of_a_range_that_act_alike_are_not_worth_a_note() -> None:
 def test_mutations_may_change_what_others_depend_on() -> None:
     pbt = {"scheduler": "pbt", "num_samples": 1}
     (found,) = notes(**PPO, **pbt, space=grid(use_kl_loss=[False, True], kl_target=[0.01, 0.1]))
-    assert found.endswith("use_kl_loss is false. A mutation of use_kl_loss may change that.")
+    assert found.endswith(f"use_kl_loss is false. A mutation of use_kl_loss may change that.{WITH_LOSS}")
 
 
 def test_points_that_are_not_known_yet_may_act() -> None:

@@ -11,9 +11,9 @@ import pytest
 from spec_errors import MINIMAL
 
 from policies.errors import SpecError
-from tune_jobs.spec.domains import Uniform
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.plain_data import MAX_VALUES, to_plain
+from tune_jobs.spec.ranges import Uniform
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 

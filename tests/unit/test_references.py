@@ -18,6 +18,7 @@ from pydantic import BaseModel
 
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tune_jobs.cli.commands import cli
+from tune_jobs.spec.domains import DOMAIN_KINDS
 from tune_jobs.spec.file import json_schema
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -241,4 +242,4 @@ def test_the_schema_and_the_helps_name_fields_and_options_that_there_are(text: s
     fields = {name for model in [SweepSpec, *HYPERPARAMS_BY_ALGORITHM.values()] for name in model.model_fields}
     fields |= {name for inner in SECTIONS.values() for name in inner}
     words = set(re.findall(r"\b[a-z]+(?:_[a-z]+)+\b", text))
-    assert words <= fields | {"huber_loss", "rl_module", "he_uniform", "steps_to_threshold"}
+    assert words <= fields | set(DOMAIN_KINDS) | {"huber_loss", "rl_module", "he_uniform", "steps_to_threshold"}

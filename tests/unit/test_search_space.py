@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from tune_jobs.spec.domains import DOMAIN_KINDS, Domain, draw_points
+from tune_jobs.spec.domains import DOMAIN_KINDS, Domain
+from tune_jobs.spec.draws import draw_points
 
 ADAPTER = TypeAdapter(Domain)
 
@@ -117,6 +118,7 @@ def test_values_that_python_calls_equal_are_different_in_a_grid() -> None:
 def test_every_domain_survives_json() -> None:
     numbers = {"grid": [[32], "relu", None], "choice": [1, 2]}
     for kind in DOMAIN_KINDS:
+        numbers |= {"one_minus_loguniform": [0.9, 0.99], "layers": {"number": [1, 2], "sizes": [16, 32]}}
         parsed = domain(**{kind: numbers.get(kind, [2, 64, 2] if kind.startswith("q") else [2, 64])})
         assert ADAPTER.validate_json(parsed.model_dump_json()) == parsed
 

@@ -11,8 +11,9 @@ from spec_errors import MINIMAL, errors, write
 
 from policies.activations import ACTIVATIONS
 from policies.errors import SpecError
-from tune_jobs.spec.domains import Grid, Uniform
+from tune_jobs.spec.domains import Grid
 from tune_jobs.spec.file import find_preset, list_presets, load_spec, read_preset
+from tune_jobs.spec.ranges import Uniform
 from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name
 
 # -- what is read

@@ -18,7 +18,7 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.search.history import known_points
 from tune_jobs.search.proposal import propose_point
-from tune_jobs.spec.domains import draw_point
+from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 

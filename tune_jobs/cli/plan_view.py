@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from analysis.wording import bytes_text, counted, setting_text
+from analysis.points import searched_names, value_text
+from analysis.wording import bytes_text, counted
 from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
 
 if TYPE_CHECKING:
@@ -108,11 +109,10 @@ def _confirm_fact(race: Race | None) -> str:
 
 
 def _plan_table(plan: SweepPlan) -> Table:
-    # The first trial's point is known; a search method may choose the points of later ones when they start.
-    names = list(plan.trials[0].point)
+    names = searched_names(trial.point for trial in plan.trials)
     engines_differ = len(plan.engines) > 1
     table = make_table("trial", "seed", *names, *(["engine"] if engines_differ else []))
     for trial in plan.trials[:_MAX_TRIALS_SHOWN]:
-        values = [setting_text(trial.point[name]) if trial.has_point else "by tpe" for name in names]
+        values = [value_text(trial.point, name, none="by tpe") for name in names]
         table.add_row(trial.trial_id, str(trial.seed), *values, *([trial.engine] if engines_differ else []))
     return table

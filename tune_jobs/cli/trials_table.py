@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from analysis.points import searched_names, value_text
 from analysis.selection import score_trial
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
 from policies.errors import SpecError
@@ -211,13 +212,13 @@ def _plain(name: str) -> str:
 
 def _names_of_points(trials: Sequence[TrialRecord]) -> list[str]:
     """Return the searched hyperparameters, those that differ among these trials first."""
-    names = dict.fromkeys(name for trial in trials for name in trial.point)
-    values = {name: {setting_text(trial.point.get(name)) for trial in trials} for name in names}
+    names = searched_names(trial.point for trial in trials)
+    values = {name: {value_text(trial.point, name) for trial in trials} for name in names}
     return sorted(names, key=lambda name: len(values[name]) == 1)
 
 
 def _point_column(name: str) -> _Column:
-    return _Column(name, lambda trial: trial.point.get(name), lambda trial: setting_text(trial.point.get(name)))
+    return _Column(name, lambda trial: trial.point.get(name), lambda trial: value_text(trial.point, name))
 
 
 def _score_order(trial: TrialRecord) -> tuple[float, int] | None:

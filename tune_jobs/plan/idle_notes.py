@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import functools
 import itertools
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from analysis.points import lacks
 from policies.errors import SpecError
 from policies.hyperparams import DQNHyperparams, Hyperparams
 from policies.idle.find import NO_UPDATE, RULES, Limits, Rule, idle_rule
 from tune_jobs.plan.estimates import max_env_steps, max_iterations
-from tune_jobs.spec.domains import Domain, Listed, Range
+from tune_jobs.spec.conditions import Conditions
+from tune_jobs.spec.domains import Domain, Grid, Layers, Listed, Range
 
 if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
@@ -41,6 +44,8 @@ class _Points:
     values: tuple[Hyperparams | None, ...]
     """All hyperparameters of each point; None: the search method chooses them when the trial starts."""
     is_packed: tuple[bool, ...]
+    points: tuple[Mapping[str, Any] | None, ...]
+    """The searched values of each point: of what acts in it."""
 
     @functools.cached_property
     def known(self) -> list[tuple[int, Hyperparams, Limits]]:
@@ -66,6 +71,7 @@ def idle_notes(
     env: EnvInfo,
     values: Sequence[Hyperparams | None],
     is_packed: Sequence[bool],
+    points: Sequence[Mapping[str, Any] | None],
     *,
     may_refuse: bool = True,
 ) -> tuple[str, ...]:
@@ -76,19 +82,20 @@ def idle_notes(
         env: Its environment.
         values: All hyperparameters of each point; None: not known yet. At least one point is known.
         is_packed: Whether a pack trains each point's trials.
+        points: The searched values of each point, without what does not act in it; None: not known yet.
         may_refuse: Whether the sweep is new. One that exists already may continue, whatever it searches.
 
     Raises:
         SpecError: The sweep is new, and a search in it can't change anything.
     """
-    points = _Points(spec, env, tuple(values), tuple(is_packed))
-    names = [name for name in (*spec.space, *spec.hyperparams) if _is_looked_at(spec, name)]
+    known = _Points(spec, env, tuple(values), tuple(is_packed), tuple(points))
+    names = [name for name in dict.fromkeys([*spec.space, *spec.hyperparams]) if _is_looked_at(spec, name)]
     searched = {name: _values_of(spec.space[name]) for name in names if name in spec.space}
     never: dict[str, str] = {}
     for name in names:
-        own = searched.get(name, [getattr(points.known[0][1], name)])
+        own = searched.get(name, [getattr(known.known[0][1], name)])
         is_search = len(own) > 1
-        if (reason := _why_it_never_acts(points, name, own, is_search=is_search)) is not None:
+        if (reason := _why_it_never_acts(known, name, own, is_search=is_search)) is not None:
             never[name] = reason
     refused = {name: reason for name, reason in never.items() if len(searched.get(name, ())) > 1}
     if refused and may_refuse:
@@ -100,8 +107,8 @@ def idle_notes(
     notes = [f"{_place(spec, name)} can't act: {reason}." for name, reason in never.items()]
     for name in searched:
         if name not in never:
-            notes += _partial_notes(points, name)
-    return (*_no_update_notes(points), *notes)
+            notes += _partial_notes(known, name)
+    return (*_no_update_notes(known), *notes)
 
 
 def _listed(names: Mapping[str, Any]) -> str:
@@ -123,7 +130,8 @@ def _values_of(domain: Domain) -> list[Any]:
     """Return values that represent a domain; a rule changes at most once between the ends of a range."""
     if isinstance(domain, Listed):
         return list(domain.values)
-    assert isinstance(domain, Range)
+    if isinstance(domain, Layers):
+        return [value for _, value in domain.probes()]
     low, high = domain.bounds
     ends = [int(low), int(high)] if domain.is_whole else [low, high]
     return ends if low < high else ends[:1]
@@ -142,14 +150,20 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
         return None  # it is switched off
     spec = points.spec
     rules = [rule for rule in RULES[spec.algorithm][name] if is_search or not (rule.of_value or rule is NO_UPDATE)]
-    reads = {read for rule in rules for read in rule.reads} - {name}
-    others = {read: _values_of(spec.space[read]) for read in spec.space if read in reads}
+    reads = {read for rule in rules for read in rule.reads if read in spec.space}
+    related = {other: spec.space[other] for other in spec.space if other in _with_conditions_of(spec, reads | {name})}
+    others = {read: _values_of(domain) for read, domain in related.items() if read != name}
     if not rules or math.prod(map(len, others.values())) * len(own) > _MOST_COMBINATIONS:
         return None
-    base = points.known[0][1]
+    base, conditions = points.known[0][1], Conditions(related)
     why: dict[Rule, str] = {}
     for combination in itertools.product(*others.values()):
         given = dict(zip(others, combination, strict=True))
+        if conditions:
+            acting = conditions.acting(given | {name: own[0]})
+            if name in related and name not in acting:
+                continue
+            given = {other: given[other] if other in acting else spec.value_without(other) for other in given}
         found = [_first_rule(points, rules, base.model_copy(update={**given, name: value})) for value in own]
         if any(one is None for one in found):
             return None
@@ -158,7 +172,20 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
             return None
         for rule, reason in filter(None, found):
             why.setdefault(rule, reason)
-    return "; or ".join(why.values())
+    # Of a range the ends alone were tried, with which a condition may not hold.
+    return "; or ".join(why.values()) or None
+
+
+def _with_conditions_of(spec: SweepSpec, names: Iterable[str]) -> set[str]:
+    """Return names and all that their conditions depend on."""
+    found: set[str] = set()
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop()
+        if name in spec.space and name not in found:
+            found.add(name)
+            waiting += spec.space[name].when or {}
+    return found
 
 
 def _first_rule(points: _Points, rules: Sequence[Rule], values: Hyperparams) -> tuple[Rule, str] | None:
@@ -173,6 +200,8 @@ def _partial_notes(points: _Points, name: str) -> list[str]:
     """Return the notes on a searched hyperparameter that acts, or may act, in some points only."""
     spec, by_rule = points.spec, dict[Rule, tuple[str, list[int]]]()
     for index, found, limits in points.known:
+        if lacks(points.points[index] or {}, name):
+            continue
         if (rule := idle_rule(spec.algorithm, name, found, limits)) is not None:
             by_rule.setdefault(rule, (rule.reason(found, limits), []))[1].append(index)
     notes = []
@@ -186,15 +215,35 @@ def _partial_notes(points: _Points, name: str) -> list[str]:
                 continue
             notes.append(f"space.{name}: its values act alike in {_which(points, indexes)}: {reason}.")
         else:
-            notes.append(f"space.{name} can't act in {_which(points, indexes)}: {reason}.{_later(spec, name, rule)}")
+            notes.append(f"space.{name} can't act in {_which(points, indexes)}: {reason}.{_later(points, name, rule)}")
     return notes
 
 
-def _later(spec: SweepSpec, name: str, rule: Rule) -> str:
-    mutated = [other for other in rule.reads if other in spec.space and other != name]
-    if spec.scheduler.type != "pbt" or not mutated:
+def _later(points: _Points, name: str, rule: Rule) -> str:
+    """Return what may change that a searched hyperparameter is idle by a rule, and how to search only where it acts."""
+    spec = points.spec
+    others = [other for other in rule.reads if other in spec.space and other != name]
+    if not others:
         return ""
-    return f" A mutation of {', '.join(mutated)} may change that."
+    later = f" A mutation of {', '.join(others)} may change that." if spec.scheduler.type == "pbt" else ""
+    return later + (_condition(points, name, rule, others[0]) if len(others) == 1 else "")
+
+
+def _condition(points: _Points, name: str, rule: Rule, other: str) -> str:
+    """Return the condition to give a searched hyperparameter, which is idle with some values of another."""
+    spec, (_, base, limits) = points.spec, points.known[0]
+    domain = spec.space[other]
+    is_tried = spec.search.type == "random" and isinstance(spec.space[name], Grid)
+    depends_on_it = any(name in each.reads for each in RULES[spec.algorithm][other])
+    if depends_on_it or not isinstance(domain, Listed) or (is_tried and not isinstance(domain, Grid)):
+        return ""
+    acting = [value for value in domain.values if not rule.holds(base.model_copy(update={other: value}), limits)]
+    if not 0 < len(acting) < len(domain.values):
+        return ""
+    condition = f"{other}: {json.dumps(acting[0] if len(acting) == 1 else acting)}".replace('"', "")
+    if spec.space[name].when:
+        return f" Add {condition} to its when."
+    return f" Give it when: {{{condition}}}, and it is searched only where it acts."
 
 
 def _no_update_notes(points: _Points) -> list[str]:

@@ -12,7 +12,7 @@ from analysis.records import ChosenPointRecord, ReplicationRecord
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
-from tune_jobs.spec.domains import num_points
+from tune_jobs.spec.draws import num_points
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec.sweep_spec import SweepSpec
 

@@ -170,7 +170,8 @@ def make_plan(
     check_env_rules(spec, env, known)
     trials, engine_notes = _trials(spec, env, points, records, replications)
     are_packed = [_is_packed(trial) for trial in trials if trial.seed_index == 0]
-    idle = idle_notes(spec, env, [values for _, values in points], are_packed, may_refuse=not records)
+    searched = [point for point, _ in points]
+    idle = idle_notes(spec, env, [values for _, values in points], are_packed, searched, may_refuse=not records)
     sizes = _sizes(spec, points, known)
     to_run = _to_run(trials, records, retry_failed=retry_failed)
     members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))

@@ -18,7 +18,7 @@ class Question:
     """The next point is asked for."""
 
     space: Mapping[str, Domain]
-    """What is searched."""
+    """What is searched: lists and ranges, without conditions. Every point has a value of each (see `parts`)."""
     known: Sequence[KnownPoint]
     """The points that were tried before, in their order; what is planned but not begun is not among them."""
     index: int

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,8 +11,10 @@ from pydantic import ValidationError
 from analysis.records import ChosenPointRecord, TrialRecord
 from analysis.wording import is_number, short_text
 from policies.errors import SpecError, shortened
+from policies.hyperparams import as_sizes
 from policies.suggestions import did_you_mean
-from tune_jobs.spec.domains import Domain, Listed, Range
+from tune_jobs.spec.conditions import Conditions, needed_text
+from tune_jobs.spec.domains import Domain, Layers, Listed, Range
 from tune_jobs.spec.hyperparam_problems import in_one_form, value_problems
 from tune_jobs.spec.plain_data import to_plain
 from tune_jobs.spec.rules import check_takes_points
@@ -36,19 +37,38 @@ def checked_point(spec: SweepSpec, given: Mapping[str, Any]) -> dict[str, Any]:
     check_takes_points(spec)
     values: dict[str, Any] = to_plain(given, "point")
     problems = [_unknown(spec, name) for name in values if name not in spec.space]
-    if missing := [name for name in spec.space if name not in values]:
-        problems.append(f"it has no {' and no '.join(missing)}: give a value for each searched hyperparameter")
-    point = {}
+    point, wrong = {}, []
     for name, domain in spec.space.items():
         if name in values:
             if found := _problems(spec, name, domain, values[name]):
-                problems += found
+                wrong += found
             else:
                 point[name] = _written(spec, name, domain, values[name])
+    problems += [*_missing(spec.space, values | point), *wrong]
+    if not problems:
+        problems = _idle(spec.space, point)
     if problems:
         told = problems[0] if len(problems) == 1 else "\n  ".join([f"{len(problems)} problems:", *problems])
         raise SpecError(f"point: {told}", f"The sweep searches {domains_text(spec.space)}.")
     return point
+
+
+def _missing(space: Mapping[str, Domain], values: Mapping[str, Any]) -> list[str]:
+    # Where a value is missing that others depend on, it is not known whether those are missing too.
+    acting = Conditions(space).acting(values)
+    names = [name for name in space if name in acting and name not in values]
+    that_acts = " that acts" if any(domain.when for domain in space.values()) else ""
+    told = f"it has no {' and no '.join(names)}: give a value for each searched hyperparameter{that_acts}"
+    return [told] if names else []
+
+
+def _idle(space: Mapping[str, Domain], point: Mapping[str, Any]) -> list[str]:
+    acting = Conditions(space).acting(point)
+    return [
+        f"{name} doesn't act in this point, as it needs {needed_text(space, name)}: leave it out"
+        for name in point
+        if name not in acting
+    ]
 
 
 def _unknown(spec: SweepSpec, name: str) -> str:
@@ -70,6 +90,8 @@ def _problems(spec: SweepSpec, name: str, domain: Domain, value: Any) -> list[st
 def _written(spec: SweepSpec, name: str, domain: Domain, value: Any) -> Any:
     if isinstance(domain, Range):
         return int(value) if domain.is_whole else float(value)
+    if isinstance(domain, Layers):
+        return [int(size) for size in as_sizes(value)]
     assert isinstance(domain, Listed)
     meant = in_one_form(spec.algorithm, name, value)
     same = (listed for listed in domain.values if in_one_form(spec.algorithm, name, listed) == meant)
@@ -85,25 +107,14 @@ def trial_of_point(spec: SweepSpec, point: Mapping[str, Any], trials: Sequence[T
 
 def _meaning(spec: SweepSpec, point: Mapping[str, Any]) -> str | None:
     try:
-        return json.dumps({name: in_one_form(spec.algorithm, name, point[name]) for name in spec.space})
+        return json.dumps({name: in_one_form(spec.algorithm, name, value) for name, value in point.items()})
     except (KeyError, ValidationError):
         return None  # of a version that took other values
 
 
 def outside(space: Mapping[str, Domain], point: Mapping[str, Any]) -> list[str]:
     """Return the names of those values of a point that its domains can't give."""
-    return [name for name, domain in space.items() if not is_inside(domain, point[name])]
-
-
-def is_inside(domain: Listed | Range, value: Any) -> bool:
-    """Whether a domain can give a value."""
-    if isinstance(domain, Listed):
-        return json.dumps(value) in map(json.dumps, domain.values)
-    low, high = domain.bounds
-    if not (is_number(value) and low <= value <= high):
-        return False
-    q = domain.q or (1.0 if domain.is_whole else None)
-    return q is None or math.isclose(domain.at_factor(round(value / q)), value, abs_tol=1e-9 * q)
+    return [name for name, domain in space.items() if name in point and not domain.gives(point[name])]
 
 
 def outside_notes(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord]) -> tuple[str, ...]:
@@ -127,4 +138,5 @@ def domains_text(space: Mapping[str, Domain]) -> str:
 
 def domain_text(domain: Domain) -> str:
     """Return a domain as a sweep file has it, without brackets."""
-    return f"{domain.kind} {shortened(domain.model_dump(mode='json')[domain.kind])}"
+    text = f"{domain.kind} {shortened(domain.model_dump(mode='json')[domain.kind])}"
+    return f"{text} when {shortened(domain.when)}" if domain.when else text

@@ -21,9 +21,10 @@ def distribution_of(domain: Any) -> optuna.distributions.BaseDistribution:
     if isinstance(domain, Listed):
         return CategoricalDistribution(tuple(range(len(domain.values))))
     assert isinstance(domain, Range)
-    if domain.is_whole or domain.q is not None:
-        return IntDistribution(*domain.factors, log=domain.is_log)
-    return FloatDistribution(*domain.bounds, log=domain.is_log)
+    low, high = domain.codes
+    if domain.is_stepped:
+        return IntDistribution(int(low), int(high), log=domain.has_log_codes)
+    return FloatDistribution(low, high, log=domain.has_log_codes)
 
 
 def from_optuna(domain: Any, value: Any) -> Any:
@@ -31,7 +32,7 @@ def from_optuna(domain: Any, value: Any) -> Any:
     if isinstance(domain, Listed):
         return domain.values[value]
     assert isinstance(domain, Range)
-    return domain.at_factor(value) if domain.is_whole or domain.q is not None else float(value)
+    return domain.of_code(value)
 
 
 def to_optuna(domain: Any, value: Any) -> Any:
@@ -39,4 +40,4 @@ def to_optuna(domain: Any, value: Any) -> Any:
     if isinstance(domain, Listed):
         return domain.index_of(value)
     assert isinstance(domain, Range)
-    return round(value / (domain.q or 1)) if domain.is_whole or domain.q is not None else float(value)
+    return domain.code_of(value)

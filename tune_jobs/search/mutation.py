@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Domain, Listed, Range
+from tune_jobs.spec.ranges import PowerOfTwo
 
 FACTORS = (0.8, 1.2)
 """The factors for a number that isn't drawn anew; Jaderberg et al. use these two."""
@@ -23,16 +25,21 @@ def mutate(
 ) -> dict[str, Any]:
     """Return a point near another, possibly with some values drawn anew, within the space.
 
+    What did not act in the other point, and does in this one, is drawn anew.
+
     Args:
         point: The better trial's point.
         space: Domains by hyperparameter.
         rng: Draws everything.
         resample_probability: The probability, in [0, 1], that a value is drawn anew and not changed to a neighbour.
     """
-    return {
-        name: domain.sample(rng) if rng.random() < resample_probability else _neighbour(domain, point[name], rng)
+    mutated = {
+        name: domain.sample(rng)
+        if rng.random() < resample_probability or name not in point
+        else _neighbour(domain, point[name], rng)
         for name, domain in space.items()
     }
+    return Conditions(space).stripped(mutated)
 
 
 def _neighbour(domain: BaseModel, value: Any, rng: np.random.Generator) -> Any:
@@ -42,10 +49,12 @@ def _neighbour(domain: BaseModel, value: Any, rng: np.random.Generator) -> Any:
         index = domain.index_of(value) + (1 if up else -1)
         return domain.values[min(max(index, 0), len(domain.values) - 1)]
     assert isinstance(domain, Range)
+    low, high = domain.codes
+    if not domain.is_stepped:
+        return domain.of_code(min(max(domain.code_of(value) * FACTORS[up], low), high))
+    if isinstance(domain, PowerOfTwo):
+        return domain.of_code(min(max(domain.code_of(value) + (1 if up else -1), low), high))
     moved = value * FACTORS[up]
-    low, high = domain.bounds
-    if domain.q is None and not domain.is_whole:
-        return float(min(max(moved, low), high))
     first, last = domain.factors
     q = domain.q or 1.0
     # At least one step, because a small whole number would not change otherwise.

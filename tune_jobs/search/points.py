@@ -11,7 +11,8 @@ from analysis.numbering import with_chosen
 from analysis.records import ChosenPointRecord
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, as_sizes
-from tune_jobs.spec.domains import Domain, Listed, Range, draw_point, draw_points
+from tune_jobs.spec.domains import Domain, Layers, Listed, Range
+from tune_jobs.spec.draws import draw_point, draw_points
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _MAX_COMBINATIONS = 10_000
@@ -53,7 +54,7 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
     Raises:
         SpecError: There are too many combinations to check.
     """
-    ends = {name: _ends(domain) for name, domain in spec.space.items() if name in _DECIDE_SIZE}
+    ends = {name: _ends(spec, name) for name in spec.space if name in _DECIDE_SIZE}
     if "hidden_sizes" in ends:
         ends["hidden_sizes"] = [as_sizes(value) for value in ends["hidden_sizes"]]
     combinations = math.prod(map(len, ends.values()))
@@ -68,7 +69,18 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
     ]
 
 
-def _ends(domain: Domain) -> list[Any]:
+def _ends(spec: SweepSpec, name: str) -> list[Any]:
+    """Return values of a hyperparameter of which one makes the largest trial; also the one where it does not act."""
+    domain = spec.space[name]
+    if not domain.when:
+        return _ends_of(domain)
+    return [*_ends_of(domain), spec.value_without(name)]
+
+
+def _ends_of(domain: Domain) -> list[Any]:
+    if isinstance(domain, Layers):
+        # The most layers of the largest size; a small network never takes more.
+        return [max(domain.probes(), key=lambda probe: math.prod(probe[1]))[1]]
     if isinstance(domain, Range):
         return list(domain.bounds)
     assert isinstance(domain, Listed)

@@ -21,14 +21,16 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from analysis.records import TrialRecord
 from policies.errors import CannotRunError
 from tune_jobs.search.asking import Check, Method, Question
 from tune_jobs.search.history import KnownPoint, known_points
-from tune_jobs.spec.domains import Domain, draw_point
+from tune_jobs.search.parts import Parts
+from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 
@@ -125,4 +127,10 @@ def next_point(
     is_too_early = sum(not point.is_running for point in known) < num_startup_trials
     if method == "random" or is_too_early:
         return draw_point(space, index, seed)
-    return _METHODS[method].load()(Question(space, known, index, seed), check)
+    propose, parts = _METHODS[method].load(), Parts(space)
+    if parts.are_the_same:
+        return propose(Question(space, known, index, seed), check)
+    seen = [replace(item, point=parts.values_of(item.point)) for item in known]
+    return parts.point_of(
+        propose(Question(parts.space, seen, index, seed), lambda values: check(parts.point_of(values)))
+    )

@@ -13,7 +13,7 @@ from analysis.objectives import score_of
 from analysis.records import FINISHED, TrialRecord
 from analysis.tables import cell_value
 from policies.errors import CannotRunError, SpecError
-from tune_jobs.search.chosen_point import is_inside
+from tune_jobs.search.parts import Parts
 from tune_jobs.spec.domains import Listed, Range
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -26,8 +26,9 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
 
     A trial's value is what settings are judged by, `objective` in the sweep file, and higher is better. Its evaluations
     are intermediate values, by env steps. One that the sweep's scheduler ended is pruned; one that failed, or showed
-    nothing to be judged by, has failed. Lists, such as hidden sizes, are texts. Seeds, returns and the point that a
-    trial shares with others are user attributes.
+    nothing to be judged by, has failed. Lists, such as hidden sizes, are texts; layers that are searched one by one are
+    a number and a size of each. A trial lacks what does not act in it, as Optuna has it. Seeds, returns and the point
+    that a trial shares with others are user attributes.
 
     Args:
         spec: The sweep.
@@ -62,8 +63,11 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
     try:
         study = optuna.create_study(study_name=name, direction="maximize", storage=_storage(path))
         trials = [trial for trial in data.trials if trial.status in FINISHED and trial.has_point]
+        parts = Parts(spec.space)
+        points = [parts.known_values_of(trial.point) for trial in trials]
         distributions = {
-            key: _distribution(domain, [trial.point[key] for trial in trials]) for key, domain in spec.space.items()
+            key: _distribution(domain, [point[key] for point in points if key in point])
+            for key, domain in parts.space.items()
         }
         study.set_user_attr("objective", data.objective)
         for trial in sorted(trials, key=lambda item: item.index):
@@ -107,9 +111,11 @@ def _as_optunas(
         pruned = trial.status == "stopped"
         states = optuna.trial.TrialState
         told = {"state": states.PRUNED if pruned else states.COMPLETE, "value": score}
+    parts = Parts(spec.space)
+    values = parts.known_values_of(trial.point)
     return optuna.trial.create_trial(
-        params={key: _value(domain, trial.point[key]) for key, domain in spec.space.items()},
-        distributions=distributions,
+        params={key: _value(domain, values[key]) for key, domain in parts.space.items() if key in values},
+        distributions={key: distributions[key] for key in values},
         intermediate_values={
             item.num_env_steps: item.evaluation_return for item in iterations if item.evaluation_return is not None
         },
@@ -142,7 +148,7 @@ def _distribution(domain: Any, values: Sequence[Any]) -> optuna.distributions.Ba
     low, high = min([domain.bounds[0], *values]), max([domain.bounds[1], *values])
     is_log = domain.is_log and low > 0
     # A step and a logarithmic scale exclude each other in Optuna, and a step has to lead to each value.
-    q = None if is_log or any(not is_inside(domain, value) for value in values) else domain.q
+    q = None if is_log or any(not domain.gives(value) for value in values) else domain.q
     if domain.is_whole:
         return IntDistribution(int(low), int(high), log=is_log, step=int(q or 1))
     return FloatDistribution(low, high, log=is_log, step=q)

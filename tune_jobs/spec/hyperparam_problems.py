@@ -18,7 +18,7 @@ from policies.foreign_names import answer_for_others, answer_to
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.suggestions import did_you_mean
 from policies.wrong_values import details_of, dotted, explain
-from tune_jobs.spec.domains import Domain, Listed
+from tune_jobs.spec.domains import Domain, Listed, Range
 from tune_jobs.spec.list_forms import list_to_write, text_of_several
 from tune_jobs.spec.problems import SPEC_HINT, Problem
 
@@ -45,7 +45,7 @@ def hyperparam_problems(
     for name, value in hyperparams.items():
         if name in fields:
             problems += value_problems(algorithm, name, value, path=f"hyperparams.{name}")
-        if name in space:
+        if name in space and not space[name].when:  # with a condition, it is the value where that does not hold
             text = f"is fixed at {value!r} but also searched in space.{name}: take it out of one of them"
             problems.append(Problem(f"hyperparams.{name}", text))
     for name, domain in space.items():
@@ -101,7 +101,7 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
     for index, value in domain.probes():
         path = f"space.{name}.{domain.kind}"
         found = value_problems(algorithm, name, value, path=path if index is None else f"{path}[{index}]")
-        if found and index is None:
+        if found and index is None and isinstance(domain, Range):
             text = f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
             found = [Problem(path, text)]
         problems += found

@@ -11,8 +11,10 @@ from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from policies.suggestions import did_you_mean
 from policies.wrong_values import Detail, details_of, dotted, explain
+from tune_jobs.spec.condition_problems import condition_problems
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
+from tune_jobs.spec.layers import LayersFields
 from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
 from tune_jobs.spec.problems import Problem
 from tune_jobs.spec.sections import NAME_RULE, SweepFields
@@ -38,7 +40,10 @@ def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
             continue  # it is among the problems already; only its name is left to check
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     unknown = {name: None for name in space if name not in known} if isinstance(space, Mapping) else {}
-    problems = hyperparam_problems(algorithm, fixed if isinstance(fixed, Mapping) else {}, domains)
+    given = fixed if isinstance(fixed, Mapping) else {}
+    problems = hyperparam_problems(algorithm, given, domains)
+    wrong = [name for name in space if name not in domains] if isinstance(space, Mapping) else []
+    problems += condition_problems(algorithm, given, domains, are_grids_tried=False, unread=wrong)
     unseen = hyperparam_problems(algorithm, {name: None for name in unknown if name not in domains}, {})
     return problems + [Problem(path.replace("hyperparams.", "space.", 1), text) for path, text in unseen]
 
@@ -50,8 +55,6 @@ _FORMS = {
     "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random or tpe, or a mapping of its fields",
     "confirm": "give none, true, or a mapping of its fields (top, seeds, max_share)",
-    "objective": "give final, area, best or steps_to_threshold, a list of one of them and env_steps, or a mapping of "
-    "its fields (type, threshold, cost)",
     "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
 }
 """How to write fields that have several forms, or a form that no type describes."""
@@ -67,7 +70,7 @@ def _from_detail(detail: Detail) -> Problem:
         return Problem(path, f"is missing{f': give {options}' if options else ''}")
     if (written := _in_space(location, detail)) is not None:
         return Problem(path, written)
-    if path in _FORMS and detail["type"] != "value_error":
+    if path in _FORMS:
         return Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")
     if detail["type"] == "model_type":
         fields = ", ".join(_section(location).model_fields)
@@ -87,11 +90,12 @@ def _in_space(location: Sequence[int | str], detail: Detail) -> str | None:
 
 
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:
-    """Drop the second of pydantic's two names for the kind of a domain, as the union's member and as its field."""
-    parts: list[int | str] = []
-    for part in location:
-        if not (parts and part == parts[-1] and parts[0] == "space" and len(parts) == 3):
-            parts.append(part)
+    """Drop pydantic's names for the members of unions: of a domain's kind, and of the domain of layers' sizes."""
+    parts = list(location)
+    if parts[:1] == ["space"] and len(parts) > 3:
+        del parts[2]
+        if parts[2:4] == ["layers", "sizes"] and len(parts) > 5:
+            del parts[4]
     return parts
 
 
@@ -104,6 +108,8 @@ def _unknown_key(location: Sequence[int | str]) -> str:
 
 
 def _section(location: Sequence[int | str]) -> type[BaseModel]:
+    if location[:1] == ["space"]:
+        return LayersFields  # the only domain with fields
     model: Any = SweepFields
     for part in location:
         model = model.model_fields[str(part)].annotation

@@ -19,6 +19,7 @@ from pydantic import (
 
 from analysis.wording import counted
 from policies.errors import SpecError
+from tune_jobs.spec.condition_problems import condition_problems
 from tune_jobs.spec.engines import find_engine
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.messages import problems_of
@@ -46,7 +47,12 @@ class SweepSpec(SweepFields):
             spec = handler(data)
         except ValidationError as error:
             raise WrongSpecError.of("SweepSpec", problems_of(error, data)) from error
-        problems = hyperparam_problems(spec.algorithm, spec.hyperparams, spec.space) + _section_problems(spec)
+        of_conditions = condition_problems(
+            spec.algorithm, spec.hyperparams, spec.space, are_grids_tried=spec.search.type == "random"
+        )
+        problems = hyperparam_problems(spec.algorithm, spec.hyperparams, spec.space) + of_conditions
+        # Points are counted there, which takes conditions that are right.
+        problems += _section_problems(spec) if not of_conditions else []
         if problems:
             raise WrongSpecError.of("SweepSpec", problems)
         return spec

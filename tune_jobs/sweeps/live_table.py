@@ -10,6 +10,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from analysis.points import searched_names, value_text
 from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import Selection
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
@@ -140,7 +141,7 @@ def _trials(monitor: SweepMonitor, rows: Sequence[Row], width: int) -> Table:
     measured = [row.trial for row in rows]
     measured += itertools.islice(list(monitor.records.values()), _MAX_MEASURED)
     texts = [{name: short_text(value) for name, value in trial.point.items()} for trial in measured]
-    names = list(dict.fromkeys(name for values in texts for name in values))
+    names = searched_names(texts)
     names.sort(key=lambda name: len({values.get(name) for values in texts}) == 1)
     titles = ["rank", "trial", "score", "status", "env steps", *names, "training", "evaluation", "env steps/s"]
     most_steps = f"{monitor.progress().max_env_steps // max(1, len(monitor.records)):,}"
@@ -173,7 +174,7 @@ def _cells(row: Row, names: Sequence[str]) -> list[str]:
         return_text(row.score, none=PLAIN_NONE),
         trial.status,
         f"{trial.num_env_steps:,}",
-        *(short_text(point.get(name)) for name in names),
+        *(value_text(point, name, short_text) for name in names),
         return_text(trial.training_return, none=PLAIN_NONE),
         return_text(trial.evaluation_return, none=PLAIN_NONE),
         "" if speed is None else f"{speed:,.0f}",

@@ -6,9 +6,10 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING
 
 from analysis.notebook import BriefList, film_html, page_html, rows_html
+from analysis.points import searched_names, value_text
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
-from analysis.wording import PLAIN_NONE, return_text, setting_text
+from analysis.wording import PLAIN_NONE, return_text
 from policies.arguments import checked
 from policies.envs.modules import allowed_again
 
@@ -21,12 +22,12 @@ class Trials(BriefList[TrialRecord]):
     """The trials of a sweep, by index."""
 
     def _repr_html_(self) -> str:
-        names = list(dict.fromkeys(name for trial in self for name in trial.point))
+        names = searched_names(trial.point for trial in self)
         rows = []
         for trial in self:
             scored = score_trial(trial)
             score = return_text(None if scored is None else scored.score, none=PLAIN_NONE)
-            values = (setting_text(trial.point.get(name)) for name in names)
+            values = (value_text(trial.point, name) for name in names)
             rows.append([trial.trial_id, trial.status, score, f"{trial.num_env_steps:,}", *values])
         return rows_html(["trial", "status", "score", "env steps", *names], rows)
 

@@ -1,0 +1,144 @@
+"""What all domains have in common, and those that list their values; the others are in `ranges` and `layers`."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Generator
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+from typing_extensions import override
+
+
+def _refuse_coercion(value: Any) -> Any:
+    # Pydantic would read true as 1 and "5" as 5, but a quoted or misspelt value is better refused than guessed.
+    if isinstance(value, bool | str):
+        raise ValueError(f"{value!r} is not a number")  # noqa: TRY004 - pydantic reports ValueErrors only
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_refuse_coercion), Field(allow_inf_nan=False)]
+"""A finite float; strings and true/false are refused."""
+
+WholeNumber = Annotated[int, BeforeValidator(_refuse_coercion)]
+"""An int, or a float without a fraction such as 1e5; strings and true/false are refused."""
+
+
+class AnyDomain(BaseModel, ABC):
+    """The values of one hyperparameter; besides `when`, the only field of a subclass has the name of its kind."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: ClassVar[str]
+    is_random: ClassVar[bool] = True
+    is_whole: ClassVar[bool] = False
+
+    when: dict[str, Any] | None = Field(
+        None,
+        min_length=1,
+        description="Other searched hyperparameters, each with the value, or the list of values, that it must have for "
+        "this one to act.",
+    )
+
+    @override
+    def __iter__(self) -> Generator[tuple[str, Any], None, None]:
+        # Field by field, as it is written too: without a condition where it has none.
+        yield self.kind, getattr(self, self.kind)
+        if self.when is not None:
+            yield "when", self.when
+
+    @model_serializer(mode="wrap")
+    def _as_in_the_file(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Without a condition as it always was, for versions that know of none; with one, the kind comes first.
+        data: dict[str, Any] = write(self)
+        when = data.pop("when", None)
+        return data if when is None else data | {"when": when}
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value, as a plain Python object."""
+
+    @abstractmethod
+    def gives(self, value: Any) -> bool:
+        """Whether the domain can give a value."""
+
+    @abstractmethod
+    def probes(self) -> list[tuple[int | None, Any]]:
+        """Return values to validate, each with its index in the sweep file (None: it is not listed there).
+
+        If the hyperparameter accepts all of these, it accepts every value of the domain.
+        """
+
+
+class Listed(AnyDomain):
+    """A domain that lists its values."""
+
+    @property
+    def values(self) -> tuple[Any, ...]:
+        """The listed values, in the order of the file."""
+        values: tuple[Any, ...] = getattr(self, self.kind)
+        return values
+
+    @model_validator(mode="after")
+    def _has_distinct_values(self) -> Self:
+        if not self.values:
+            raise ValueError("is empty: list at least one value, or take it out of the space")
+        seen: list[str] = []
+        for value in self.values:
+            # Values of different types differ, though 1 == True == 1.0 in Python; inner lists are compared as text.
+            key = repr(value)
+            if key in seen:
+                raise ValueError(
+                    f"lists {value!r} twice: list it once (seeds_per_point repeats points with other seeds)"
+                )
+            seen.append(key)
+        return self
+
+    def index_of(self, value: Any) -> int:
+        """Return the index of a value in the list; types have to be equal, but a tuple equals a list.
+
+        Raises:
+            ValueError: The value isn't in the list.
+        """
+        return [json.dumps(known) for known in self.values].index(json.dumps(value))
+
+    @override
+    def gives(self, value: Any) -> bool:
+        return json.dumps(value) in map(json.dumps, self.values)
+
+    @override
+    def probes(self) -> list[tuple[int | None, Any]]:
+        return list(enumerate(self.values))
+
+
+class Grid(Listed):
+    """Every value is tried, in combination with every value of the other grids."""
+
+    kind: ClassVar[str] = "grid"
+    is_random: ClassVar[bool] = False
+    grid: tuple[Any, ...] = Field(description="Values to try, each with every value of the other grids.")
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value; only for callers that ignore that a grid is exhaustive."""
+        return self.values[int(rng.integers(len(self.values)))]
+
+
+class Choice(Listed):
+    """One of the values, all equally likely."""
+
+    kind: ClassVar[str] = "choice"
+    choice: tuple[Any, ...] = Field(description="Values to draw from, each as likely as the others.")
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Draw one value."""
+        return self.values[int(rng.integers(len(self.values)))]
