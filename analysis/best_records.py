@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import Field
 
 from analysis.notebook import facts_html
-from analysis.records import FORMAT_VERSION, CheckpointRecord, Count, Number, Objective, Record, TrialId
+from analysis.records import FORMAT_VERSION, CheckpointRecord, Cost, Count, Number, Objective, Record, TrialId
 
 
 class EvaluationRecord(Record):
@@ -61,6 +61,39 @@ class SettingRecord(Record):
     may_be_best: bool = Field(default=True, description="Whether the data can't tell it from the best.")
 
 
+class FrontPointRecord(Record):
+    """A setting on the front of score against cost."""
+
+    rank: Count = Field(description="Its place among the settings, by score; 1: the best.")
+    point_index: Count
+    point: dict[str, Any]
+    num_seeds: Count
+    score: Number = Field(description="Mean of the objective over its seeds, higher is better.")
+    expected: Number = Field(description="What it is expected to be over many seeds, by which the front is found.")
+    num_env_steps: Number = Field(description="Its cost: the mean env steps of a training with it.")
+    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: one seed a setting.")
+    upper: float | None = None
+
+
+class FrontRecord(Record):
+    """The Pareto front of score against cost over the settings of a sweep; see `analysis.front`."""
+
+    cost: Cost = "env_steps"
+    points: tuple[FrontPointRecord, ...] = Field(min_length=1, description="The settings on it, the cheapest first.")
+    num_on_front: Count = Field(description="All that are on it, not only those that are listed.")
+    undecided: tuple[FrontPointRecord, ...] = Field(
+        (), description="Others that the data can't tell from being on it, the cheapest ones."
+    )
+    num_undecided: Count | None = Field(None, description="How many these are; None: one seed a setting.")
+    cheapest_near: FrontPointRecord = Field(description="The cheapest setting near the best.")
+    near_share: Number = Field(description="The share of what the best gained that one near it loses at most.")
+    untrained: float | None = Field(None, description="The return that gains are counted from; None: it is not known.")
+    near_score: Number = Field(description="The least expected score that is near the best.")
+    may_be_best: bool | None = Field(
+        None, description="Whether the data can't tell `cheapest_near` from the best; None: one seed a setting."
+    )
+
+
 class SettingsRecord(Record):
     """The settings of a sweep, ranked: which to train with."""
 
@@ -69,6 +102,7 @@ class SettingsRecord(Record):
     num_settings: Count = Field(description="All that were trained, not only those that are listed.")
     num_may_be_best: Count = Field(description="How many of all the data can't tell from the best, itself included.")
     ranking: tuple[SettingRecord, ...] = Field(min_length=1, description="The leading ones, best first.")
+    front: FrontRecord | None = Field(None, description="Score against cost; None: the sweep doesn't ask for it.")
 
     @property
     def best(self) -> SettingRecord:

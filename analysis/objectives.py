@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.records import IterationRecord, Objective, TrialRecord
+from analysis.records import TRAINING_LENGTH, IterationRecord, Objective, TrialRecord
 from analysis.statistics import area_under_curve, moderated_means
 
 _LEAST_BETWEEN = 1e-3
@@ -40,11 +40,18 @@ class SettingScores:
     num_failed: int
     expected: float
     """What its mean over many seeds is expected to be, see `expected_means`; settings are ranked by this."""
+    env_steps: tuple[int, ...]
+    """What a training takes, one a seed, in the order of the scores; see `env_steps_of`."""
 
     @property
     def mean(self) -> float:
         """Mean over the seeds."""
         return math.fsum(self.scores) / len(self.scores)
+
+    @property
+    def cost(self) -> float:
+        """Mean env steps that a training takes."""
+        return sum(self.env_steps) / len(self.env_steps)
 
 
 def rank_settings(
@@ -95,6 +102,7 @@ def rank_settings(
             trial_ids=tuple(seed.trial_id for seed in seeds),
             num_failed=sum(seed.status == "failed" for seed in seeds),
             expected=value,
+            env_steps=tuple(env_steps_of(seed, num_env_steps) for seed in seeds),
         )
         for (index, seeds), value in zip(members.items(), expected, strict=True)
     ]
@@ -104,6 +112,33 @@ def rank_settings(
 def reached_goal(trial: TrialRecord) -> bool:
     """Whether a trial ended because it reached the return that its sweep stops at."""
     return (trial.stop_reason or "").startswith(_GOALS)
+
+
+def length_of(point: Mapping[str, Any], num_env_steps: int) -> int:
+    """Return the env steps that a point's trials have: its own if the length of training is searched, else all.
+
+    Args:
+        point: The searched values.
+        num_env_steps: The env steps that a trial of the sweep has at most.
+    """
+    own = point.get(TRAINING_LENGTH)
+    return min(own, num_env_steps) if isinstance(own, int) and own > 0 else num_env_steps
+
+
+def env_steps_of(trial: TrialRecord, num_env_steps: int) -> int:
+    """Return what a training as this trial's takes, in env steps, which is its cost.
+
+    One that ended by itself took what it takes, less where it reached its goal early. One that a scheduler ended, or
+    that failed, counts with the length that it was to have: its score is that of the whole length too, and to fail is
+    not cheap.
+
+    Args:
+        trial: A trial that has ended.
+        num_env_steps: The env steps that a trial of the sweep has at most.
+    """
+    if trial.status == "completed":
+        return trial.num_env_steps
+    return max(trial.num_env_steps, length_of(trial.point, num_env_steps))
 
 
 def score_of(
@@ -117,7 +152,7 @@ def score_of(
     """Return what a trial scored, see `trial_score`, over the env steps that it was to have.
 
     Those are its own where it ended by a number of episodes or iterations, or by time: it trained as long as it was to.
-    One that reached its goal, or that a scheduler ended, was to have `num_env_steps`.
+    One that reached its goal, or that a scheduler ended, was to have `num_env_steps`, or less where its point says so.
 
     Args:
         trial: The trial.
@@ -129,6 +164,8 @@ def score_of(
     Raises:
         ValueError: `steps_to_threshold` without a threshold.
     """
+    if objective != "steps_to_threshold":
+        num_env_steps = length_of(trial.point, num_env_steps)
     ended_itself = trial.status == "completed" and trial.stop_reason is not None and not reached_goal(trial)
     # What never reached the threshold counts as the same number of env steps, however long it tried.
     if ended_itself and trial.num_env_steps and objective != "steps_to_threshold":

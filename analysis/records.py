@@ -23,6 +23,10 @@ FORMAT_VERSION = 2
 
 Objective = Literal["final", "area", "best", "steps_to_threshold"]
 """What a setting is judged by; see `analysis.objectives`."""
+Cost = Literal["env_steps"]
+"""What a setting may cost besides; see `analysis.front`."""
+TRAINING_LENGTH = "stop.num_env_steps"
+"""The name in `space` and in points by which the length of training is searched (decision 44)."""
 TrialStatus = Literal["pending", "running", "paused", "completed", "failed", "stopped"]
 SweepState = Literal["created", "running", "interrupted", "completed"]
 """`created` means written, but not begun."""

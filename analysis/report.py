@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis import report_data, wording
 from analysis.best_records import BestRecord, SettingsRecord
-from analysis.page import all_trials, answer, cards, charts, cost, head, how_sure, mattered, next_steps, repeat
+from analysis.page import all_trials, answer, cards, charts, cost, front, head, how_sure, mattered, next_steps, repeat
 from analysis.page.bounded import bounded
 from analysis.page.figures import draw_figures
 from analysis.page.source import Source
@@ -84,6 +84,7 @@ def build_report(
         answer=answer.section(source),
         cards=cards.section(source, videos),
         how_sure=how_sure.section(source),
+        front=front.section(source),
         mattered=mattered.section(source),
         cost=cost.section(source),
         next_steps=next_steps.section(source),

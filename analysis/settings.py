@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.best_records import SettingRecord, SettingsRecord
+from analysis.front import front_of, untrained_return
 from analysis.objectives import SettingScores, rank_settings
-from analysis.records import IterationRecord, Objective, TrialRecord
+from analysis.records import Cost, IterationRecord, Objective, TrialRecord
 from analysis.statistics import probability_of_being_best, seed_intervals, tie_groups
 from analysis.tables import env_steps_to
 from policies import random_streams
@@ -26,6 +27,7 @@ def judge_settings(
     *,
     num_env_steps: int,
     threshold: float | None,
+    cost: Cost | None = None,
 ) -> SettingsRecord | None:
     """Rank the settings of a sweep; None if no trial has ended with anything to be judged by.
 
@@ -38,6 +40,7 @@ def judge_settings(
         objective: What they are judged by.
         num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
         threshold: The return that solves the env; None: it has none.
+        cost: What settings cost; None: the sweep doesn't ask for it.
 
     Raises:
         ValueError: In the cases of `objectives.rank_settings`.
@@ -65,6 +68,7 @@ def judge_settings(
             )
             for index, item in enumerate(ranking[:NUM_LISTED])
         ),
+        front=None if cost is None else front_of(ranking, untrained_return(results)),
     )
 
 

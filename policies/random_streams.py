@@ -22,6 +22,7 @@ from iteration i > 0 uses new numbers, because only packs save the state of thei
 | [seed, 0] | packs: what a member draws: actions, permutations, batches |
 | [seed, i] | engine rllib and random policies, and a pack's checkpoint restored as an Algorithm: all of the above |
 | [seed, i, 1] | packs: environments |
+| [seed, i, 2] | packs: what a member draws that went on from a copy of another's checkpoint |
 
 Random policies in evaluations draw from [the episode's seed]. Resampling in reports, and trial steps of environments
 that are measured, use a fixed seed. An environment's use of its seed is up to Gymnasium.
@@ -108,6 +109,14 @@ def seeds_after(trial_seed: int, iteration: int) -> tuple[int, int]:
 def member_env_seed_after(trial_seed: int, iteration: int) -> int:
     """Return the seed of the environments of a pack's member that continues after an iteration, with new episodes."""
     return _words([trial_seed, iteration, 1], 1)[0]
+
+
+def member_draws_after(trial_seed: int, iteration: int) -> np.random.Generator:
+    """Return the generator of a pack's member that goes on from another trial's checkpoint after an iteration.
+
+    The checkpoint holds the other's generator, by which the two would draw the same.
+    """
+    return np.random.default_rng(np.random.SeedSequence([trial_seed, iteration, 2]))
 
 
 # From an episode's seed.

@@ -53,6 +53,8 @@ SLOW = {
     "tests/ray/test_schedulers.py::test_every_scheduler_runs_to_the_end[hyperband]": "tests/ray/test_hyperband.py",
     "tests/ray/test_search.py::test_tpe_runs_as_many_trials_at_once_as_the_machine_allows_and_goes_on_when_extended":
         "tests/unit/test_pack_sizes.py, and tests/unit/test_tpe.py",
+    "tests/ray/test_search.py::test_a_population_that_is_stopped_goes_on_with_its_newest_values[rllib]":
+        "the same, packed",
     "tests/ray/test_repetitions.py::test_a_trial_comes_to_the_same_by_itself[rllib]": "the same, packed",
     "tests/ray/test_resumed_rewards.py::test_the_statistics_of_a_resumed_trial_are_of_all_its_env_steps[rllib]":
         "the same, packed",

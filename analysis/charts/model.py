@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from analysis.plot_style import MAX_DRAWN
 
-Section = Literal["mattered", "learning", "cost"]
+Section = Literal["front", "mattered", "learning", "cost"]
 """The sections of the page that have charts."""
 Number = float | int | None
 Ending = Literal["whole", "cut", "unfinished", "failed"]

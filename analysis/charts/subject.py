@@ -12,7 +12,7 @@ from analysis.charts.model import Ending
 from analysis.importance import WhatMattered
 from analysis.objectives import SettingScores, rank_settings, score_of
 from analysis.points import value_text
-from analysis.records import IterationRecord, Objective, SweepRecord, TrialRecord
+from analysis.records import Cost, IterationRecord, Objective, SweepRecord, TrialRecord
 from analysis.tables import point_names
 from analysis.wording import short_text
 
@@ -72,6 +72,12 @@ class Subject:
         if kind not in get_args(Objective) or (kind == "steps_to_threshold" and self._threshold is None):
             return "final"
         return cast("Objective", kind)
+
+    @property
+    def cost(self) -> Cost | None:
+        """What settings cost, if the sweep file asks for it."""
+        cost = self.sweep.section("objective").get("cost")
+        return cast("Cost", cost) if cost in get_args(Cost) else None
 
     @property
     def _threshold(self) -> float | None:

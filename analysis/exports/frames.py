@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from analysis.front import points_on_front
 from analysis.objectives import SettingScores, rank_settings, score_of
 from analysis.records import IterationRecord, Objective, TrialRecord
 from analysis.statistics import Estimate, iqm, probability_of_being_best, seed_intervals, tie_groups
@@ -109,14 +110,17 @@ def settings_frame(data: SweepData) -> pd.DataFrame:
 
     Columns: rank, point_index, one for each searched hyperparameter, num_seeds, num_failed, num_solved, mean, expected
     (by which they are ranked, see `objectives.expected_means`), iqm, lower, upper (the 95 % interval of the mean over
-    training seeds, see `statistics.seed_intervals`), probability_best, may_be_best, trial_ids. What needs two seeds of
-    some setting is missing where none has two. A population has no settings, and no rows.
+    training seeds, see `statistics.seed_intervals`), probability_best, may_be_best, num_env_steps (the mean of what a
+    training takes, see `objectives.env_steps_of`), on_front (of mean score against that, see `analysis.front`),
+    trial_ids. What needs two seeds of some setting is missing where none has two. A population has no settings, and no
+    rows.
     """
     import pandas as pd
 
     ranking = ranked_settings(data)
     intervals = intervals_of(ranking)
     chances, leaders = _certainty(ranking)
+    on_front = points_on_front(ranking)
     names = point_names(data.trials)
     rows = [
         {
@@ -133,21 +137,27 @@ def settings_frame(data: SweepData) -> pd.DataFrame:
             "upper": interval and interval.upper,
             "probability_best": chances.get(item.point_index),
             "may_be_best": None if leaders is None else item.point_index in leaders,
+            "num_env_steps": item.cost,
+            "on_front": item.point_index in on_front,
             "trial_ids": " ".join(item.trial_ids),
         }
         for rank, (item, interval) in enumerate(zip(ranking, intervals, strict=True), start=1)
     ]
     columns = ["rank", "point_index", *names, *_AFTER_POINT]
     frame = pd.DataFrame(rows, columns=columns)
-    floats = ["mean", "expected", "iqm", "lower", "upper", "probability_best"]
+    floats = ["mean", "expected", "iqm", "lower", "upper", "probability_best", "num_env_steps"]
     counts = dict.fromkeys(["rank", "point_index", "num_seeds", "num_failed"], "int64")
-    types = counts | dict.fromkeys(floats, "float64") | {"num_solved": "Int64", "may_be_best": "boolean"}
+    types = (
+        counts
+        | dict.fromkeys(floats, "float64")
+        | {"num_solved": "Int64", "may_be_best": "boolean", "on_front": "bool"}
+    )
     return frame.astype(types | types_with_gaps(rows, names))
 
 
 _AFTER_POINT = [
     "num_seeds", "num_failed", "num_solved", "mean", "expected", "iqm", "lower", "upper", "probability_best",
-    "may_be_best", "trial_ids",
+    "may_be_best", "num_env_steps", "on_front", "trial_ids",
 ]  # fmt: skip
 
 

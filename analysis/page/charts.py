@@ -49,7 +49,7 @@ def make(source: Source, folder: Path) -> Charts:
 
     subject = Subject(source.sweep, source.trials, source.results, source.goal, source.importance)
     charts = make_charts(subject)
-    by_section: dict[Section, list[PageChart]] = {"mattered": [], "learning": [], "cost": []}
+    by_section: dict[Section, list[PageChart]] = {"front": [], "mattered": [], "learning": [], "cost": []}
     for chart in charts:
         picture = None
         if chart.data is not None:

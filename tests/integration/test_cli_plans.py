@@ -75,8 +75,8 @@ def test_a_dry_run_as_json_holds_spec_and_plan(run: RunCommand) -> None:
 
 
 def test_a_dry_run_says_what_is_not_packed_and_why(run: RunCommand) -> None:
-    output = run("launch", "cartpole-ppo", "--dry-run", "--set", "scheduler=hyperband").stdout
-    assert "note: No trial is packed, RLlib trains them all: scheduler.type is hyperband" in output
+    output = run("launch", "cartpole-ppo", "--dry-run", "--set", "resources.num_env_runners=1").stdout
+    assert "note: No trial is packed, RLlib trains them all: resources.num_env_runners is 1" in output
     document = json.loads(run("launch", "cartpole-ppo", "--dry-run", "--json", "--set", "engine=rllib").stdout)
     planned = document["plan"]
     assert (planned["engines"], planned["packs"], planned["notes"]) == ({"rllib": 20}, None, [])
@@ -197,9 +197,9 @@ BAD_INPUT: dict[str, tuple[dict[str, Any], int, list[str]]] = {
     ),
     "engine": ({"set": "engine=packt"}, 2, ["engine: 'packt'", "Did you mean 'packed'?"]),
     "engine that cannot": (
-        {"set": "engine=packed", "more": ["--set", "scheduler=hyperband"]},
+        {"set": "engine=packed", "more": ["--set", "resources.num_env_runners=1"]},
         2,
-        ["engine: packed", "scheduler.type is hyperband"],
+        ["engine: packed", "resources.num_env_runners is 1"],
     ),
     "no file": ({"spec": "nothing.yaml"}, 2, ["'nothing.yaml'", "cartpole-ppo"]),
     "no yaml": ({"text": "env: [\n"}, 2, ["sweep.yaml, line 2"]),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from unittest import mock
@@ -86,13 +86,15 @@ def scripted_trainable(scripts: dict[str, dict[str, Any]], pause_s: float) -> ty
             if checkpoint is not None:
                 self.iterations[task.trial_id] = int((checkpoint / "state.txt").read_text())
 
-        def train_iteration(self) -> dict[str, IterationStats | Exception]:
+        def train_iteration(self, held: Collection[str] = ()) -> dict[str, IterationStats | Exception]:
             import os
             import time
 
             time.sleep(pause_s)
             results: dict[str, IterationStats | Exception] = {}
             for trial_id, task in self.tasks.items():
+                if trial_id in held:
+                    continue
                 self.iterations[trial_id] += 1
                 iteration, script = self.iterations[trial_id], scripts.get(trial_id, {})
                 while "after" in script and not (Path(task.sweep_place) / script["after"]).exists():

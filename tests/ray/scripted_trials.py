@@ -6,7 +6,7 @@ from typing import Any
 
 from ray import tune
 
-from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
+from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
 from tune_jobs.spec.sections import SchedulerSpec
 
 STEPS = 100
@@ -59,7 +59,7 @@ def run_scripted(
         tune_config=tune.TuneConfig(
             scheduler=build_tune_scheduler(scheduler, max_env_steps),
             # One at a time, or who is compared with whom would depend on which process starts first.
-            max_concurrent_trials=None if waits_for_others(scheduler) else 1,
+            max_concurrent_trials=None if scheduler.waits_for_others else 1,
             reuse_actors=True,
             trial_name_creator=lambda trial: trial.config["trial_id"],
             trial_dirname_creator=lambda trial: trial.config["trial_id"],

@@ -12,7 +12,7 @@ from scripted_packs import make_sweep
 from analysis.records import CheckpointRecord
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.ray_tune.early_stopping import build_scheduler
-from tune_jobs.ray_tune.pack_scheduler import PackDriver
+from tune_jobs.ray_tune.pack_driver import PackDriver
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Assignment
@@ -115,7 +115,7 @@ def test_what_a_process_is_told_goes_before_what_it_could_read() -> None:
     pack._owner = SimpleNamespace(held=contextlib.nullcontext)
     pack._files = SimpleNamespace(read=lambda: Assignment(("t0000",)))
     pack._reader = SimpleNamespace(read=lambda trial_id: trial_id)
-    loop: Any = SimpleNamespace(trial_ids=(), add=lambda task, _: added.append(task))
+    loop: Any = SimpleNamespace(trial_ids=(), add=lambda task, _: added.append(task), hold=lambda _: None)
     pack._arrange(loop)
     pack.assign(Assignment(("t0001",)))
     pack._arrange(loop)

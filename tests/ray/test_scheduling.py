@@ -162,8 +162,8 @@ def test_without_a_scheduler_everyone_goes_on_to_the_end() -> None:
 
 
 @pytest.mark.parametrize("kind", ["pbt", "hyperband"])
-def test_what_pauses_trials_is_none_for_packs(kind: SchedulerType) -> None:
-    with pytest.raises(ValueError, match=f"with {kind}, which packs"):
+def test_what_lets_trials_wait_is_made_elsewhere(kind: SchedulerType) -> None:
+    with pytest.raises(ValueError, match=f"wait for each other with {kind}"):
         build_scheduler(SchedulerSpec(type=kind), MAX_ENV_STEPS)
 
 

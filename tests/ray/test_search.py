@@ -57,10 +57,14 @@ def assert_history_acts(store: SweepStore, trials: Sequence[TrialRecord]) -> Non
             assert training["hyperparams"]["lr"] == pytest.approx(trial.point_at(checkpoint.iteration)["lr"])
 
 
-@pytest.fixture(scope="module")
-def population(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> SweepResult:
+@pytest.fixture(scope="module", params=["packed", "rllib"])
+def population(
+    request: pytest.FixtureRequest, ray_session: None, tmp_path_factory: pytest.TempPathFactory
+) -> SweepResult:
     """A finished sweep; no test may change it."""
-    return launch(tmp_path_factory.mktemp("storage"), **PBT)
+    result = launch(tmp_path_factory.mktemp("storage"), engine=request.param, **PBT)
+    assert {trial.engine for trial in result.trials} == {request.param}
+    return result
 
 
 def test_a_mutated_learning_rate_is_the_one_in_the_trials_optimizer(population: SweepResult) -> None:
@@ -100,7 +104,10 @@ def test_worse_trials_go_on_from_better_ones(population: SweepResult) -> None:
             assert max(scores) > present(own[change.iteration].evaluation_return)
 
 
-def test_a_population_that_is_stopped_goes_on_with_its_newest_values(ray_session: None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("engine", ["packed", "rllib"])
+def test_a_population_that_is_stopped_goes_on_with_its_newest_values(
+    ray_session: None, tmp_path: Path, engine: str
+) -> None:
     store = SweepStore(tmp_path / "mine")
 
     def changes() -> list[ChangeRecord]:
@@ -114,7 +121,7 @@ def test_a_population_that_is_stopped_goes_on_with_its_newest_values(ray_session
 
     thread = threading.Thread(target=stop)
     thread.start()
-    result = launch(tmp_path, **PBT)
+    result = launch(tmp_path, engine=engine, **PBT)
     thread.join()
     assert result.interrupted
     before = {trial.trial_id: trial.changes for trial in result.trials}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, cast
@@ -41,10 +41,12 @@ class FakePackEngine:
         engine.build(task, checkpoint)
         self.members[task.trial_id] = engine
 
-    def train_iteration(self) -> dict[str, IterationStats | Exception]:
+    def train_iteration(self, held: Collection[str] = ()) -> dict[str, IterationStats | Exception]:
         self.num_iterations += 1
         results: dict[str, IterationStats | Exception] = {}
         for trial_id, engine in self.members.items():
+            if trial_id in held:
+                continue
             try:
                 results[trial_id] = engine.train_iteration()
             except Exception as error:  # noqa: BLE001
@@ -93,6 +95,7 @@ class Pack:
         self.engine = FakePackEngine(make)
         self.evaluator = FakeEvaluator(scores)
         self.batches: list[int] = []
+        self.waits: list[float] = []
         self.loop = PackLoop(
             self.engine,
             cast("Evaluator", self.evaluator),
@@ -100,6 +103,7 @@ class Pack:
             stop_requested=lambda: self.stop,
             max_retries=max_retries,
             clock=clock or FakeClock(),
+            wait=self.waits.append,
             under=under,
             **({} if watch is None else {"watch": watch}),
         )

@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -333,7 +333,7 @@ def test_what_concerns_no_single_member_is_raised_and_what_was_done_is_on_disk(t
     pack = Pack(tmp_path, evaluation={"every_iterations": 99}).add("t0000", "t0001")
     train = pack.engine.train_iteration
 
-    def out_of_memory() -> dict[str, IterationStats | Exception]:
+    def out_of_memory(held: Collection[str] = ()) -> dict[str, IterationStats | Exception]:
         if pack.engine.num_iterations == 3:
             raise MemoryError("the stack does not fit")
         return train()

@@ -8,7 +8,7 @@ import pytest
 from pack_plans import DQN, LR, TPE, fake_reasons, plan
 from spec_errors import MINIMAL, errors
 
-from analysis.records import ReplicationRecord
+from analysis.records import ReplicationRecord, TrialRecord
 from policies.errors import EnvError, SpecError
 from policies.guard import guarded
 from policies.hyperparams import Algorithm, make_hyperparams
@@ -39,8 +39,25 @@ def unseedable_env(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- which engine
 
 
+MEETING: list[dict[str, Any]] = [{"scheduler": "pbt"}, {"scheduler": "hyperband"}]
+"""Sweeps whose trials wait for each other."""
+
+
+@pytest.mark.parametrize("fields", MEETING)
+def test_trials_that_are_added_to_a_population_have_the_engine_of_those_they_are_compared_with(
+    fields: dict[str, Any],
+) -> None:
+    record = TrialRecord(trial_id="t0000", index=0, point_index=0, seed=1, point={"lr": 1e-3}, has_point=True)
+    for engine in ("rllib", "packed"):
+        made = plan(records=[record.model_copy(update={"engine": engine})], **fields)
+        assert {trial.engine for trial in made.trials} == {engine}
+    # One by one they are compared by what they reach, on whichever engine.
+    other = plan(records=[record.model_copy(update={"engine": "rllib"})], scheduler="asha")
+    assert other.engines == {"rllib": 1, "packed": 9}
+
+
 def test_what_can_be_packed_is_packed() -> None:
-    for fields in ({}, DQN, {"env": "Pendulum-v1"}, {"scheduler": "asha"}, {"scheduler": "median"}, TPE):
+    for fields in ({}, DQN, {"env": "Pendulum-v1"}, {"scheduler": "asha"}, {"scheduler": "median"}, TPE, *MEETING):
         made = plan(**fields)
         assert {trial.engine for trial in made.trials} == {"packed"}
         assert made.notes == ()
@@ -49,8 +66,6 @@ def test_what_can_be_packed_is_packed() -> None:
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"scheduler": "pbt"}, "scheduler.type is pbt, whose trials continue from copies of each other"),
-        ({"scheduler": "hyperband"}, "scheduler.type is hyperband, which pauses trials until others have come as far"),
         ({"resources": {"num_env_runners": 1}}, "resources.num_env_runners is 1, and packs have no env runners"),
         (IMAGES, "env.pixels is true, and packs have no convolutions"),
         ({"rl_module": "my_nets:Net"}, "rl_module is my_nets:Net, and packs have no networks but their own"),

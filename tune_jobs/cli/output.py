@@ -176,6 +176,7 @@ def show_best(best: BestRecord, *, as_json: bool) -> None:
     console = make_console()
     _print_best(console, best)
     _print_candidates(console, best)
+    _print_front(console, best.settings)
 
 
 def _print_best(console: Console, best: BestRecord) -> None:
@@ -227,6 +228,7 @@ def _setting_facts(settings: SettingsRecord | None) -> dict[str, str]:
     if settings is None or settings.num_settings < 2:
         return {}
     from analysis.answers import certainty, setting_score
+    from analysis.front_words import cheapest_near_text
 
     best = settings.best
     point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
@@ -235,7 +237,27 @@ def _setting_facts(settings: SettingsRecord | None) -> dict[str, str]:
         f"{', ...' if len(best.trial_ids) > 3 else ''})",
         "scored": setting_score(settings),
         "how sure": certainty(settings),
+        **({"cheapest near": near} if (near := cheapest_near_text(settings)) else {}),
     }
+
+
+def _print_front(console: Console, settings: SettingsRecord | None) -> None:
+    """Print the settings on the front of score against cost, where the sweep asks for it."""
+    if settings is None or settings.front is None or settings.num_settings < 2:
+        return
+    from rich.text import Text
+
+    from analysis.front_words import front_rows, interval_text, near_text, undecided_text
+
+    console.print()
+    names = list(settings.best.point)
+    table = make_table("env steps", "score", "95 % interval", "rank", *names, "seeds", "on the front")
+    for item, told in front_rows(settings.front):
+        values = (setting_text(item.point.get(name)) for name in names)
+        cells = [f"{item.num_env_steps:,.0f}", return_text(item.score), interval_text(item, PLAIN_NONE), str(item.rank)]
+        table.add_row(*map(Text, (*cells, *values, str(item.num_seeds), told)))
+    console.print(table)
+    console.print(f"{near_text(settings.front)} {undecided_text(settings.front)}", style="dim")
 
 
 def show_evaluation(policy: EvaluationRecord, random: EvaluationRecord, *, as_json: bool) -> None:

@@ -137,7 +137,7 @@ def choose_engines(
         CheckpointError: A trial's record names an unknown engine.
     """
     able = engines_for(spec.algorithm)
-    wished = tuple(engine for engine in able if engine.name == spec.engine)
+    wished = _of_population(spec, recorded) or tuple(engine for engine in able if engine.name == spec.engine)
     seeding = _Seeding(spec)
     engines: list[str] = []
     refused: dict[tuple[str, str, str], list[str]] = {}
@@ -163,6 +163,17 @@ def choose_engines(
             )
     notes = (_note(trained, title, why, ids, len(trials)) for (trained, title, why), ids in refused.items())
     return EngineChoice(tuple(engines), tuple(notes))
+
+
+def _of_population(spec: SweepSpec, recorded: Mapping[str, str]) -> tuple[Engine, ...]:
+    """Return the engine of the trials that exist, if those that are added have to be compared with them.
+
+    A sweep's packs are run before its single trials, so that trials of two engines would be two populations.
+    """
+    if not spec.scheduler.waits_for_others:
+        return ()
+    known = {engine_on_record(name, spec.algorithm).name: None for name in recorded.values()}
+    return tuple(engine_on_record(name, spec.algorithm) for name in known)
 
 
 class _Seeding:

@@ -4,7 +4,8 @@ A trial reports about once a second so that the live table is current, but only 
 compared: the others repeat an old score at a new number of steps.
 
 ASHA and median stopping look at one trial at a time: `RayRule` asks them, both for packs and for single trials. With
-HyperBand (`tune_jobs.ray_tune.hyperband`) trials wait for each other, so packs cannot use it.
+HyperBand (`tune_jobs.ray_tune.hyperband`) and in populations (`tune_jobs.ray_tune.population`) trials wait for each
+other; in packs they do so by `tune_jobs.ray_tune.meetings`.
 """
 
 from __future__ import annotations
@@ -90,15 +91,6 @@ def grace_env_steps(spec: SchedulerSpec, max_env_steps: int) -> int:
     return spec.grace_env_steps if spec.grace_env_steps is not None else max(1, max_env_steps // 20)
 
 
-def waits_for_others(spec: SchedulerSpec) -> bool:
-    """Whether the scheduler pauses trials until others have reached the same number of env steps.
-
-    Tune counts paused trials as running: with `max_concurrent_trials`, the others would never start, and the scheduler
-    would compare only those few.
-    """
-    return spec.type in ("hyperband", "pbt")
-
-
 def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
     """Return the scheduler of a sweep whose trials do not wait for each other.
 
@@ -118,7 +110,7 @@ def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
         return RayRule(MedianStoppingRule(grace_period=grace, **common), grace)
     if spec.type == "none":
         return EveryoneGoesOn()
-    raise ValueError(f"Trials wait for each other with {spec.type}, which packs cannot do.")
+    raise ValueError(f"Trials wait for each other with {spec.type}, which is no scheduler of this kind.")
 
 
 def build_tune_scheduler(spec: SchedulerSpec, max_env_steps: int) -> TrialScheduler:

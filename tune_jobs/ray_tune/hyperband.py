@@ -135,6 +135,11 @@ class HyperBand:
         """Whether a trial waits for other trials."""
         return trial_id in self._bracket_of[trial_id].waiting
 
+    def next_milestone(self, trial_id: str) -> int | None:
+        """Return the env steps at which a trial is compared next; None: it goes on to its end."""
+        bracket = self._bracket_of[trial_id]
+        return bracket.milestone * self._grace_env_steps if bracket.num_halvings else None
+
     def in_turn(self) -> Iterator[str]:
         """Yield the trials that have not ended, in the order in which they get a place."""
         for band in self._bands:

@@ -126,7 +126,8 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         spec = reader.spec
         self._first = self._ahead.submit(self._read)
         allow_modules(reader.sweep.allowed_modules)
-        self._is_scheduled = spec.scheduler.type != "none"
+        # A population is compared where its members wait, and at no other evaluation.
+        self._is_scheduled = spec.scheduler.type not in ("none", "pbt")
         self._engine = self.make_engine()
         with watchdog(spec.iteration_timeout_s, self._file):
             self._evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, reader.sweep.evaluation_seeds)
@@ -141,7 +142,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         )
 
     def _arrange(self, loop: PackLoop) -> None:
-        """Add and remove members so that they are those assigned.
+        """Add and remove members so that they are those assigned, and open those again that go on from a copy.
 
         Raises:
             OwnershipLostError: Another process runs this pack by now, and reads the same assignment.
@@ -152,11 +153,15 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         for trial_id in loop.trial_ids:
             if trial_id not in assignment.trial_ids:
                 loop.end(trial_id)
+        changed = [name for name in loop.trial_ids if assignment.num_changes.get(name, 0) > loop.num_changes(name)]
         new = [trial_id for trial_id in assignment.trial_ids if trial_id not in loop.trial_ids]
-        if new:
-            tasks = known or self._tasks(new)
+        if new or changed:
+            tasks = known or self._tasks([*changed, *new])
+            for trial_id in changed:
+                loop.reopen(tasks[trial_id])
             for trial_id in new:
                 loop.add(tasks[trial_id], assignment.num_failures.get(trial_id, 0))
+        loop.hold(assignment.hold_at)
 
     def _read(self) -> tuple[Assignment, dict[str, TrialTask]]:
         """Read the first assignment, and what its trials are."""

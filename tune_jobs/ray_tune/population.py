@@ -11,7 +11,7 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -82,12 +82,29 @@ class Population:
 
     def reached(self, standing: Standing, others: Others) -> Decision | CopyFrom:
         """Compare a trial with the others when its interval is over, and copy a better one if it is among the worst."""
-        member, steps = self._members[standing.trial_id], standing.num_env_steps
-        if not standing.evaluated or steps - member.due_from < self._spec.perturb_every_env_steps:
+        if not standing.evaluated or standing.num_env_steps < self.due_at(standing.trial_id):
             return Decision.GO_ON
-        member.num_env_steps = member.due_from = steps
-        member.score = standing.score
+        return self.compared([standing], others)[standing.trial_id]
+
+    def due_at(self, trial_id: str) -> int:
+        """Return the env steps from which a trial is compared, at its next evaluation."""
+        return self._members[trial_id].due_from + self._spec.perturb_every_env_steps
+
+    def compared(self, standings: Sequence[Standing], others: Others) -> dict[str, Decision | CopyFrom]:
+        """Compare trials whose interval is over with each other, and with what the others had at their last comparison.
+
+        Args:
+            standings: Of these trials, in the order in which they are decided about.
+            others: What is known of the others.
+        """
+        for standing in standings:
+            member = self._members[standing.trial_id]
+            member.num_env_steps = member.due_from = standing.num_env_steps
+            member.score = standing.score
         worst, best = self._quantiles(others)
+        return {standing.trial_id: self._decision(standing, worst, best) for standing in standings}
+
+    def _decision(self, standing: Standing, worst: Sequence[str], best: Sequence[str]) -> Decision | CopyFrom:
         better = [other for other in best if _score(self._members[other]) > standing.score]
         if standing.trial_id not in worst or not better:
             return Decision.SAVE
@@ -126,6 +143,35 @@ def _score(member: _Compared) -> float:
 
 def _is_scored(member: _Compared) -> bool:
     return member.score is not None and not math.isnan(member.score)
+
+
+def take_over(spec: SweepSpec, store: Sweep, record: TrialRecord, decision: CopyFrom, change: Change) -> None:
+    """Let a trial continue from a copy of a better one's latest checkpoint, with other values, when it is opened next.
+
+    Args:
+        spec: The sweep.
+        store: The sweep's files.
+        record: The trial, with the iterations and env steps that it has done; no process trains it now.
+        decision: From which one, and with which values.
+        change: Changes the trial's record, on disk too.
+
+    Raises:
+        CheckpointError: The better one has no checkpoint, or a damaged one.
+    """
+    source, target = store.trial(decision.trial_id), store.trial(record.trial_id)
+    copied = copy_latest_checkpoint(source, target, record.num_iterations)
+    entry = ChangeRecord(
+        iteration=record.num_iterations,
+        num_env_steps=record.num_env_steps,
+        source_trial_id=decision.trial_id,
+        source_iteration=copied.iteration,
+        before=record.point,
+        after=decision.point,
+        time=time.time(),
+    )
+    hyperparams = point_hyperparams(spec, decision.point, record.point_index).model_dump(mode="json")
+    # This makes the copy take effect; see tune_jobs.store.copies.
+    change(record.trial_id, lambda known: with_change(known, entry, hyperparams))
 
 
 class PopulationScheduler(TuneScheduler):
@@ -187,24 +233,13 @@ class PopulationScheduler(TuneScheduler):
             CheckpointError: The better one has no checkpoint, or a damaged one.
         """
         pointer = self._pointer(decision.trial_id)
-        record = self._read(name_of(trial))
         # The record is that of the previous report, because Tune asks its scheduler first.
-        iteration, num_env_steps = result["progress"].report.num_iterations, result["num_env_steps"]
-        copied = copy_latest_checkpoint(
-            self._store.trial(decision.trial_id), self._store.trial(record.trial_id), iteration
-        )
-        entry = ChangeRecord(
-            iteration=iteration,
-            num_env_steps=num_env_steps,
-            source_trial_id=decision.trial_id,
-            source_iteration=copied.iteration,
-            before=record.point,
-            after=decision.point,
-            time=time.time(),
-        )
-        hyperparams = point_hyperparams(self._spec, decision.point, record.point_index).model_dump(mode="json")
-        # This makes the copy take effect; see tune_jobs.store.copies.
-        self._change(record.trial_id, lambda known: with_change(known, entry, hyperparams))
+        reached = {
+            "num_iterations": result["progress"].report.num_iterations,
+            "num_env_steps": result["num_env_steps"],
+        }
+        record = self._read(name_of(trial)).model_copy(update=reached)
+        take_over(self._spec, self._store, record, decision, self._change)
         controller.pause_trial(trial, should_checkpoint=False)
         trial.run_metadata.checkpoint_manager._latest_checkpoint_result = pointer  # noqa: SLF001
 

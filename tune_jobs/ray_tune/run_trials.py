@@ -24,12 +24,13 @@ from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import current
 from tune_jobs.process.ran_with import versions
-from tune_jobs.ray_tune.early_stopping import build_tune_scheduler, waits_for_others
+from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import going_on
 from tune_jobs.ray_tune.lean import lean_run
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
-from tune_jobs.ray_tune.pack_scheduler import PackDriver, PackScheduler
+from tune_jobs.ray_tune.pack_driver import PackDriver
+from tune_jobs.ray_tune.pack_scheduler import PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import PopulationScheduler
 from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, ray_died
@@ -183,7 +184,7 @@ class _Run:
         """Run trials in packs; for Tune, each pack is one trial."""
         plan = self._job.packs
         assert plan is not None
-        # A scheduler that makes trials wait is never used with packs; single trials are compared with the packed ones.
+        # Single trials are compared with the packed ones.
         assert isinstance(self._scheduler, TuneScheduler)
         choose = None if self._chooser is None else self._chooser.prepare
         rule = self._scheduler.scheduler
@@ -222,7 +223,8 @@ class _Run:
         events = TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
         resources = _resources(spec, job)
         self.waits.resources = resources.required_resources
-        at_once = None if waits_for_others(spec.scheduler) else job.max_concurrent
+        # Tune counts paused trials as running: the others would never start, and only those few would be compared.
+        at_once = None if spec.scheduler.waits_for_others else job.max_concurrent
         searcher: Searcher | SearchAlgorithm
         if self._chooser is not None:
             searcher = PointSearcher(trial_ids, self._chooser)

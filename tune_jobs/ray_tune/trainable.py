@@ -117,6 +117,7 @@ class TaskReader:
             failure_penalty=spec.env.failure_penalty,
             rl_module=spec.rl_module,
             changes=trial.changes,
+            in_step=spec.scheduler.waits_for_others and trial.seed_index < spec.seeds_per_point,
             engine=engine_on_record(trial.engine, spec.algorithm).name,
         )
 

@@ -9,7 +9,7 @@ from ray.tune.experiment import Trial
 
 from tune_jobs.ray_tune.failures import describe_failure, was_lost
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
-from tune_jobs.ray_tune.pack_scheduler import PackDriver
+from tune_jobs.ray_tune.pack_driver import PackDriver
 from tune_jobs.ray_tune.processes import RayWatch
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.progress import Progress

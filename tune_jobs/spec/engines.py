@@ -83,8 +83,6 @@ ENGINES: tuple[Engine, ...] = (
             "rl_module": "and packs have no networks but their own",
             "convolutions": "and packs have no convolutions",
             "env_runners": "and packs have no env runners",
-            "copies": "whose trials continue from copies of each other",
-            "pauses": "which pauses trials until others have come as far",
             "unseeded": "",
         },
         old_state="packed",

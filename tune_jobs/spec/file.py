@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from pydantic import TypeAdapter
 
-from analysis.records import SweepRecord
+from analysis.records import Cost, SweepRecord
 from policies.arguments import checked
 from policies.errors import CheckpointError, SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
@@ -26,7 +26,7 @@ from tune_jobs.store.names import SWEEP_RECORD
 
 # The most bytes of a file, for the most characters that are read, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
-_SECTIONS_OF_TEXT = {"about": "title", "env": "id", "scheduler": "type", "search": "type"}
+_SECTIONS_OF_TEXT = {"about": "title", "env": "id", "objective": "type", "scheduler": "type", "search": "type"}
 """Sections that may be written as one string, and the field that it stands for."""
 
 
@@ -179,6 +179,11 @@ def json_schema() -> dict[str, Any]:
         "anyOf": [{"const": "none"}, {"type": "boolean"}, {"$ref": properties["confirm"]["$ref"]}],
         "description": properties["confirm"]["description"],
     }
+    texts, mapping = properties["objective"]["anyOf"]
+    texts["enum"] = ["return", *texts["enum"]]
+    names = {"type": "string", "enum": [*texts["enum"], *get_args(Cost)]}
+    pair = {"type": "array", "items": names, "minItems": 2, "maxItems": 2, "uniqueItems": True}
+    properties["objective"]["anyOf"] = [texts, pair, mapping]
     for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
         # A section whose lines are all commented out is null.
         told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}

@@ -55,6 +55,8 @@ _FORMS = {
     "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random or tpe, or a mapping of its fields",
     "confirm": "give none, true, or a mapping of its fields (top, seeds, max_share)",
+    "objective": "give final, area, best or steps_to_threshold, a list of one of them and env_steps, or a mapping of "
+    "its fields (type, threshold, cost)",
     "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
 }
 """How to write fields that have several forms, or a form that no type describes."""
@@ -70,7 +72,7 @@ def _from_detail(detail: Detail) -> Problem:
         return Problem(path, f"is missing{f': give {options}' if options else ''}")
     if (written := _in_space(location, detail)) is not None:
         return Problem(path, written)
-    if path in _FORMS:
+    if path in _FORMS and detail["type"] != "value_error":
         return Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")
     if detail["type"] == "model_type":
         fields = ", ".join(_section(location).model_fields)

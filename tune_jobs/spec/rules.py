@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from analysis.records import TRAINING_LENGTH
 from policies.errors import SpecError
 from policies.hyperparams import (
     HYPERPARAMS_BY_ALGORITHM,
@@ -52,7 +53,19 @@ def search_problems(spec: SweepFields) -> Found:
     elif spec.scheduler.perturb_every_env_steps is not None:
         text = f"is only for pbt, but scheduler.type is {spec.scheduler.type}: leave it out, or set the type to pbt"
         found.append(("scheduler.perturb_every_env_steps", text))
-    return found
+    return found + _cost_problems(spec)
+
+
+def _cost_problems(spec: SweepFields) -> Found:
+    if spec.objective.cost is None:
+        return []
+    if spec.objective.type == "steps_to_threshold":
+        text = "cannot be used with steps_to_threshold, which counts env steps itself: use final, area or best"
+        return [("objective.cost", text)]
+    if spec.scheduler.type == "pbt":
+        text = "cannot be used with pbt (scheduler.type), whose trials are no settings that could be set against a cost"
+        return [("objective.cost", text)]
+    return []
 
 
 _USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
@@ -75,6 +88,25 @@ def idle_settings(spec: SweepFields) -> list[str]:
         for name, types in fields.items():
             if given.type not in types and getattr(given, name) != type(given).model_fields[name].default:
                 notes.append(f"{section}.{name} can't act: {section}.type is {given.type}, not {' or '.join(types)}.")
+    return notes + _cost_notes(spec)
+
+
+def _cost_notes(spec: SweepFields) -> list[str]:
+    """Return the notes on a cost that says little, or that the search method does not look at."""
+    if spec.objective.cost is None:
+        return []
+    notes = []
+    if TRAINING_LENGTH not in spec.space and spec.stop.training_return is None and spec.stop.evaluation_return is None:
+        notes.append(
+            "objective asks for env_steps, but all trainings are to be as long: search their length, as in space: "
+            f"{{{TRAINING_LENGTH}: {{choice: [20_000, 50_000]}}}}, or end them at a goal (stop.training_return, "
+            "stop.evaluation_return)."
+        )
+    if spec.search.type != "random":
+        notes.append(
+            f"search.type {spec.search.type} proposes points by their scores alone; env_steps count when settings are "
+            "compared."
+        )
     return notes
 
 

@@ -5,7 +5,7 @@ Rules for several fields together are in `tune_jobs.spec.rules`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -15,7 +15,8 @@ from pydantic import (
     field_serializer,
 )
 
-from analysis.records import Objective
+from analysis.records import Cost, Objective
+from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from tune_jobs.spec.domain_kinds import Number, WholeNumber
 from tune_jobs.spec.domains import Domain
@@ -24,6 +25,8 @@ from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
 SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
+_RETURN = {"return": "final"}
+"""What `objective` may be called besides: the return that training comes to."""
 NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
 _LARGEST_REWARD = 3.4e38
 """The largest number of 32 bits; training computes in 32 bits, where anything larger is infinite."""
@@ -134,6 +137,11 @@ class SchedulerSpec(Section):
         0.25, description="pbt: share of mutations that draw a new value; the others move to a neighbouring one."
     )
 
+    @property
+    def waits_for_others(self) -> bool:
+        """Whether trials wait at numbers of env steps until others have come as far."""
+        return self.type in ("hyperband", "pbt")
+
 
 class ObjectiveSpec(Section):
     """What a setting is judged by; the best policy is chosen by its evaluations, whatever this says."""
@@ -145,6 +153,11 @@ class ObjectiveSpec(Section):
         "first evaluation that reaches the threshold.",
     )
     threshold: Number | None = Field(None, description="steps_to_threshold: the return to reach; null: the env's own.")
+    cost: Cost | None = Field(
+        None,
+        description="env_steps: the score is set against the env steps that a training takes, as their Pareto front; "
+        "null: it is not.",
+    )
 
 
 class ConfirmSpec(Section):
@@ -193,6 +206,32 @@ def _from_text(key: str) -> BeforeValidator:
         return {key: value} if isinstance(value, str) else value
 
     return BeforeValidator(expand)
+
+
+def _two_objectives(value: Any) -> Any:
+    """Let `objective` be written as a score, or as a score and its cost: `[return, env_steps]`."""
+    if isinstance(value, str):
+        return {"type": _RETURN.get(value, value)}
+    if not isinstance(value, list | tuple):
+        return value
+    names = [_RETURN.get(name, name) if isinstance(name, str) else name for name in value]
+    costs = [name for name in names if name in get_args(Cost)]
+    scores = [name for name in names if name not in costs]
+    write = "write a score and its cost, such as [return, env_steps]"
+    if len(costs) == 1 and len(scores) == 1 and isinstance(scores[0], str):
+        return {"type": scores[0], "cost": costs[0]}
+    if len(names) == 1:
+        why = "is a cost alone" if costs else "is one objective, and no list"
+        alone = f"; for a score alone write {value[0]}" if not costs and isinstance(value[0], str) else ""
+        raise ValueError(f"{shortened(list(value))} {why}: {write}{alone}")
+    if not names:
+        raise ValueError(f"[] names nothing: {write}")
+    if len(names) > 2:
+        raise ValueError(f"{shortened(list(value))} has {len(names)} objectives: {write}")
+    if names[0] == names[1]:
+        same = "" if value[0] == value[1] else f" ({value[0]} and {value[1]} are the same)"
+        raise ValueError(f"{shortened(list(value))} names one objective twice{same}: {write}")
+    raise ValueError(f"{shortened(list(value))} has no cost, of which there is env_steps: {write}")
 
 
 def _from_a_word(value: Any) -> Any:
@@ -246,8 +285,10 @@ class SweepFields(Section):
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
     )
     evaluation: EvaluationSpec = Field(default_factory=EvaluationSpec, description="Greedy evaluation.")
-    objective: Annotated[ObjectiveSpec, _from_text("type")] = Field(
-        default_factory=ObjectiveSpec, description="What a setting is judged by: its type, or a mapping."
+    objective: Annotated[ObjectiveSpec, BeforeValidator(_two_objectives)] = Field(
+        default_factory=ObjectiveSpec,
+        description="What a setting is judged by: its type, [type, env_steps] for the front of score against cost, or "
+        "a mapping. In a list, return is final.",
     )
     confirm: Annotated[ConfirmSpec, BeforeValidator(_from_a_word)] = Field(
         default_factory=ConfirmSpec,

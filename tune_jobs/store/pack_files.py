@@ -14,7 +14,7 @@ from tune_jobs.store import names
 from tune_jobs.store.logs import begin_log, log_tail
 from tune_jobs.store.ownership import Owner
 from tune_jobs.store.pack_contract import Assignment
-from tune_jobs.store.places import check_pack_id, check_trial_id, within
+from tune_jobs.store.places import check_pack_id, within
 from tune_jobs.store.trial_contract import Ownership
 
 __all__ = ["Assignment", "PackFiles"]
@@ -65,8 +65,7 @@ class PackFiles:
 
     def write(self, assignment: Assignment, *, soon: bool = False) -> None:  # noqa: ARG002 (it is at once)
         """Replace the assignment."""
-        data = {"trial_ids": list(assignment.trial_ids), "num_failures": dict(assignment.num_failures)}
-        write_atomic(self.assignment_path, json.dumps(data) + "\n")
+        write_atomic(self.assignment_path, json.dumps(assignment.as_json()) + "\n")
 
     def read(self) -> Assignment:
         """Read the assignment.
@@ -75,10 +74,7 @@ class PackFiles:
             CheckpointError: It does not exist, or cannot be read.
         """
         try:
-            data = json.loads(read_regular(self.assignment_path))
-            trial_ids = tuple(check_trial_id(trial_id) for trial_id in data["trial_ids"])
-            failures = {check_trial_id(trial_id): int(number) for trial_id, number in data["num_failures"].items()}
-            return Assignment(trial_ids, failures)
+            return Assignment.from_json(json.loads(read_regular(self.assignment_path)))
         except (OSError, NotFoundError, *MALFORMED) as error:
             raise CheckpointError(
                 f"{self.assignment_path} does not say which trials pack {self.pack_id} trains: {repr(error)[:400]}.",

@@ -104,9 +104,10 @@ def _check(store: Sweep, trial: TrialRecord, spec: SweepSpec, recorded: Sequence
     name = f"{store.name}/{trial.trial_id}"
     if spec.scheduler.type == "pbt":
         raise SpecError(
-            f"{name} is of a population: it continued from checkpoints of other trials, and when depended on which was "
-            "faster, so it can't be repeated by itself.",
-            "Launch the sweep again, with resources that run one process at a time, to repeat a population.",
+            f"{name} is of a population: it continued from checkpoints of other trials, so it can't be repeated by "
+            "itself.",
+            "Launch the sweep again to repeat the population: in packs it comes to the same; on engine rllib only with "
+            "resources that run one process at a time.",
         )
     if not trial.has_point or not recorded:
         why = f": it failed before ({error_summary(trial.error)})" if trial.status == "failed" else ""

@@ -33,7 +33,10 @@ def judged(
     if spec.scheduler.type == "pbt":
         return None
     goal = goal_of(spec, threshold)
-    return judge_settings(trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal)
+    return judge_settings(
+        trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal,
+        cost=spec.objective.cost,
+    )  # fmt: skip
 
 
 def ranked(

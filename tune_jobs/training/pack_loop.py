@@ -15,22 +15,23 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any
 
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import Policy
-from policies.envs.tallies import Reached, end_tally, tally_of
+from policies.envs.tallies import Reached, tally_of
 from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
-from policies.portable.file import PortablePolicy
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
-from tune_jobs.training.protocol import IterationStats, PackEngine, TrialTask
+from tune_jobs.training.pack_member import MemberEngine, TrialInPack
+from tune_jobs.training.protocol import PackEngine, TrialTask
 from tune_jobs.training.trial_steps import TrialSteps
 
 _NUM_WRITERS = 8
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.002, 0.1
+"""How long a pack that has nothing to train waits before it asks again: twice as long each time."""
 
 EvaluateMany = Callable[[Evaluator, Sequence[Policy]], Sequence[Episodes | Exception]]
 """The type of `policies.packed.evaluation.evaluate_many`: it returns each policy's greedy episodes, or its error."""
@@ -50,87 +51,8 @@ class MemberReport:
     """Whether it is retried from its latest checkpoint: at once, or when the sweep is resumed if it had to leave."""
     lost: bool = False
     """Whether another process has taken it over; it has not failed, and nothing more about it is known here."""
-
-
-class _MemberEngine:
-    """A member of a pack, as an engine that holds one trial; the pack trains it, and this does what is its alone.
-
-    Args:
-        pack: The engine that trains the member.
-        trial_id: The member's id.
-        lock: Held while the pack's engine saves, because several threads write checkpoints.
-    """
-
-    def __init__(self, pack: PackEngine, trial_id: str, lock: threading.Lock) -> None:
-        self._pack = pack
-        self._trial_id = trial_id
-        self._lock = lock
-        self._policy: PortablePolicy | None = None
-        self.is_built = False
-
-    def build(self, task: TrialTask, checkpoint: Path | None) -> None:
-        self._pack.add(task, checkpoint)
-        self.is_built = True
-
-    def policy(self) -> PortablePolicy:
-        # The policy that is evaluated is the one that is saved.
-        if self._policy is None:
-            self._policy = self._pack.policy(self._trial_id)
-        return self._policy
-
-    def trained(self) -> None:
-        self._policy = None
-
-    def save(self, folder: Path) -> None:
-        with self._lock:
-            self._pack.save(self._trial_id, folder)
-
-    def close(self) -> None:
-        if self.is_built:
-            self._pack.remove(self._trial_id)
-            self.is_built = False
-
-
-class _TrialInPack:
-    """A trial of the pack; every attempt has an engine and a loop of its own."""
-
-    def __init__(self, task: TrialTask, num_failures: int) -> None:
-        self.task = task
-        self.num_failures = num_failures
-        self.loop: TrialSteps | None = None
-        self.engine: _MemberEngine | None = None
-        self.unreported: Progress | None = None
-        self.may_save = False
-        """Whether the end of this iteration may write a checkpoint."""
-
-    @property
-    def trial(self) -> TrialSteps:
-        """The trial's loop, after it was opened."""
-        assert self.loop is not None
-        return self.loop
-
-    def take(self, stats: IterationStats) -> bool:
-        """Take the results of an iteration, and return whether the trial has to be evaluated."""
-        assert self.engine is not None
-        self.engine.trained()
-        is_due = self.trial.take(stats)
-        is_checkpoint = (self.trial.iteration + 1) % self.task.checkpoints.every_iterations == 0
-        if is_checkpoint:
-            # Only this thread reads the pack's weights; other threads only write what it has read.
-            self.engine.policy()
-        self.may_save = is_due or is_checkpoint
-        return is_due
-
-    def close(self) -> None:
-        """Free the trial; its results are written."""
-        try:
-            if self.loop is not None:
-                self.loop.flush()
-        finally:
-            end_tally(self.task.trial_id)
-            if self.engine is not None:
-                self.engine.close()
-            self.loop = self.engine = self.unreported = None
+    waits: bool = False
+    """Whether it is saved, and waits at its progress for other trials."""
 
 
 class PackLoop:
@@ -144,6 +66,7 @@ class PackLoop:
         max_retries: How often a member that fails is retried.
         watch: Takes a time limit in seconds and returns a context manager, entered around everything that may hang.
         clock: A monotonic clock, in seconds.
+        wait: Waits for so many seconds, where every member waits for trials of other packs.
         under: The ownership of the pack; its members are taken only while it holds.
     """
 
@@ -157,6 +80,7 @@ class PackLoop:
         max_retries: int,
         watch: Callable[[float], AbstractContextManager[Any]] = contextlib.nullcontext,
         clock: Callable[[], float] = time.perf_counter,
+        wait: Callable[[float], object] = time.sleep,
         under: Ownership | None = None,
     ) -> None:
         self._engine = engine
@@ -167,7 +91,9 @@ class PackLoop:
         self._max_retries = max_retries
         self._watch = watch
         self._clock = clock
-        self._members: dict[str, _TrialInPack] = {}
+        self._wait = wait
+        self._waits_s = _FIRST_WAIT_S
+        self._members: dict[str, TrialInPack] = {}
         self._reports: list[MemberReport] = []
         self._lock = threading.Lock()
         # Saving mostly waits for the disk, so several members save at once.
@@ -185,13 +111,37 @@ class PackLoop:
             task: The trial.
             num_failures: How often it has failed before.
         """
-        self._members[task.trial_id] = _TrialInPack(task, num_failures)
+        self._members[task.trial_id] = TrialInPack(task, num_failures)
+
+    def hold(self, hold_at: Mapping[str, int]) -> None:
+        """Set from which env steps on each member saves and waits, at its next evaluation; the others never wait.
+
+        A member that waits is not trained, and goes on when its number is raised.
+        """
+        for trial_id, member in self._members.items():
+            member.hold(hold_at.get(trial_id))
+
+    def num_changes(self, trial_id: str) -> int:
+        """Return how many changes of a member are known here; see `TrialTask.changes`."""
+        return len(self._members[trial_id].task.changes)
+
+    def reopen(self, task: TrialTask) -> None:
+        """Open a member again, as its record has changed: it goes on with other values, from another's checkpoint."""
+        before = self._members[task.trial_id]
+        self._members[task.trial_id] = member = TrialInPack(task, before.num_failures)
+        member.hold(before.hold_at)
+        if before.loop is not None:
+            before.close()
 
     def end(self, trial_id: str) -> None:
-        """Save a member and remove it; it is reported as stopped."""
+        """Save a member and remove it; it is reported as stopped. One that waits is saved, and nothing is reported."""
         member = self._members[trial_id]
-        if member.loop is None:
+        if member.loop is None or member.waits:
             del self._members[trial_id]
+            if member.loop is not None:
+                # It may be trained by another pack already.
+                with contextlib.suppress(OwnershipLostError):
+                    member.close()
         else:
             leave = {member: lambda: member.trial.leave("stopped")}
             self._attempt(leave, saves=False, leaves=True)
@@ -203,6 +153,8 @@ class PackLoop:
 
     def advance(self, max_s: float, *, until_evaluated: bool) -> list[MemberReport]:
         """Train until there is something to decide, or for `max_s` seconds.
+
+        It returns as soon as a member has come to where it waits. Where nothing is left to train, it waits a moment.
 
         Args:
             max_s: Seconds; at least one iteration is made.
@@ -217,10 +169,13 @@ class PackLoop:
         deadline = self._clock() + max_s
         # With so few members left, other trials could use the slots of those that ended.
         few = 3 * len(self._members) // 4
+        self._idle()
         try:
             while self._members:
                 was_evaluated = self._one_iteration()
                 if (until_evaluated and was_evaluated) or len(self._members) <= few or self._clock() >= deadline:
+                    break
+                if any(report.waits for report in self._reports) or all(member.waits for member in self._all):
                     break
         finally:
             self._attempt({member: member.trial.flush for member in self._all if member.loop}, saves=False)
@@ -231,22 +186,33 @@ class PackLoop:
         reports, self._reports = self._reports, []
         return reports
 
+    def _idle(self) -> None:
+        """Wait a moment if there is nothing to train, and longer each time."""
+        if any(not member.waits for member in self._all):
+            self._waits_s = _FIRST_WAIT_S
+            return
+        self._wait(self._waits_s)
+        self._waits_s = min(2 * self._waits_s, _LONGEST_WAIT_S)
+
     def _one_iteration(self) -> bool:
-        """Train all members once and evaluate those that are due; return whether there were any members."""
+        """Train all members once and evaluate those that are due; return whether any was."""
         while new := [member for member in self._members.values() if member.loop is None]:
             self._open(new)
         if not self._members:
             return False
-        due: list[_TrialInPack] = []
+        due: list[TrialInPack] = []
         with self._watch(max(member.task.iteration_timeout_s for member in self._members.values())):
             stop = self._stop_requested()
             acts = {member: functools.partial(member.trial.before_iteration, stop=stop) for member in self._all}
             self._attempt(acts, saves=stop, leaves=stop)
             if not self._members:
                 return False
-            results = self._engine.train_iteration()
-            evaluations: dict[_TrialInPack, Episodes | Exception | None] = {}
-            for member in self._all:
+            trained = [member for member in self._all if not member.waits]
+            if not trained:
+                return False
+            results = self._engine.train_iteration({member.task.trial_id for member in self._all if member.waits})
+            evaluations: dict[TrialInPack, Episodes | Exception | None] = {}
+            for member in trained:
                 stats = results[member.task.trial_id]
                 if isinstance(stats, Exception):
                     self._failed(member, stats)
@@ -261,10 +227,10 @@ class PackLoop:
         return bool(due)
 
     @property
-    def _all(self) -> list[_TrialInPack]:
+    def _all(self) -> list[TrialInPack]:
         return list(self._members.values())
 
-    def _conclude(self, evaluations: Mapping[_TrialInPack, Episodes | Exception | None]) -> None:
+    def _conclude(self, evaluations: Mapping[TrialInPack, Episodes | Exception | None]) -> None:
         acts = {}
         for member, evaluation in evaluations.items():
             if isinstance(evaluation, Exception) and not isinstance(evaluation, NonFiniteWeightsError):
@@ -274,7 +240,7 @@ class PackLoop:
         self._attempt(acts, saves=any(member.may_save for member in acts))
 
     def _attempt(
-        self, acts: Mapping[_TrialInPack, Callable[[], Progress | None]], *, saves: bool, leaves: bool = False
+        self, acts: Mapping[TrialInPack, Callable[[], Progress | None]], *, saves: bool, leaves: bool = False
     ) -> None:
         """Do something for each of some members; an error is a failure of that member only.
 
@@ -290,7 +256,7 @@ class PackLoop:
             elif outcome is not None:
                 self._told(member, outcome)
 
-    def _told(self, member: _TrialInPack, progress: Progress) -> None:
+    def _told(self, member: TrialInPack, progress: Progress) -> None:
         if progress.status == "running" and not progress.evaluated:
             member.unreported = progress
             return
@@ -301,18 +267,20 @@ class PackLoop:
                 self._failed(member, error)
                 return
         member.unreported = None
-        self._reports.append(MemberReport(member.task.trial_id, member.trial.told(progress)))
+        waits = progress.status == "running" and member.waits
+        self._reports.append(MemberReport(member.task.trial_id, member.trial.told(progress), waits=waits))
         if progress.status != "running":
             self._let_go(member)
 
-    def _let_go(self, member: _TrialInPack) -> None:
+    def _let_go(self, member: TrialInPack) -> None:
         member.close()
         del self._members[member.task.trial_id]
 
-    def _open(self, new: Sequence[_TrialInPack]) -> None:
+    def _open(self, new: Sequence[TrialInPack]) -> None:
         for member in new:
-            member.engine = _MemberEngine(self._engine, member.task.trial_id, self._lock)
+            member.engine = MemberEngine(self._engine, member.task.trial_id, self._lock)
             member.loop = TrialSteps(member.task, member.engine, self._evaluator, self._clock, self._under)
+            member.loop.hold_at = member.hold_at
         with self._watch(max(member.task.iteration_timeout_s for member in new)):
             # Side by side, as the store may be far away; they are built one after the other, in their order.
             taken = list(self._writers.map(_outcome, [member.trial.take_over for member in new]))
@@ -322,10 +290,13 @@ class PackLoop:
                     raise outcome  # noqa: TRY301 (told as what `build` raises)
                 with self._watch(member.task.iteration_timeout_s):
                     member.trial.build()
+                if member.waits:
+                    # Its process died while it waited.
+                    self._told(member, member.trial.where())
             except Exception as error:  # noqa: BLE001 (it must not end the others)
                 self._failed(member, error)
 
-    def _failed(self, member: _TrialInPack, error: Exception, *, leaves: bool = False) -> None:
+    def _failed(self, member: TrialInPack, error: Exception, *, leaves: bool = False) -> None:
         """Report a failure; the member is opened again if it may be retried and need not leave."""
         if _is_lost(member, error):
             _log(member.task, "another process trains this trial by now, so this process stops training it")
@@ -347,7 +318,7 @@ class PackLoop:
             member.close()
 
 
-def _is_lost(member: _TrialInPack, error: Exception) -> bool:
+def _is_lost(member: TrialInPack, error: Exception) -> bool:
     """Whether an error says, or may be caused by, that another process has taken the member over."""
     if isinstance(error, OwnershipLostError):
         return True

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Hashable
+from collections.abc import Collection, Hashable, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 
 from policies import random_streams
-from policies.errors import CheckpointError
 from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.envs.make import choose_kind, make_packed_envs, measure_step
 from policies.packed.envs.vector import EnvKind
@@ -19,11 +19,11 @@ from policies.packed.make import make_stack
 from policies.packed.member import AnyMember
 from policies.packed.portable_member import portable_policy
 from policies.packed.stack import AnyStack
-from policies.packed.state import STATE_FOLDER, check_shapes, load_member, save_member
+from policies.packed.state import STATE_FOLDER, save_member
 from policies.portable.file import PortablePolicy
 from tune_jobs.plan.engine_choice import pack_key
-from tune_jobs.store.names import TRIAL_RECORD
 from tune_jobs.training.devices import device_for
+from tune_jobs.training.packed_restore import restored_member
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
 
@@ -53,6 +53,9 @@ class PackedEngine:
         self._num_turns = num_turns
         self._stacks: dict[Hashable, AnyStack] = {}
         self._tasks: dict[str, tuple[TrialTask, Hashable]] = {}
+        self._before: dict[str, tuple[int, int]] = {}
+        """Env steps and iterations of a trial that its member does not count; negative if it counts another's."""
+        self._num_stacks = itertools.count()
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Add a trial, fresh or exactly as a checkpoint folder holds it."""
@@ -65,11 +68,13 @@ class PackedEngine:
         try:
             space, action_space = stack.envs.observation_space, stack.envs.action_space
             member = new_member(task.trial_id, hyperparams, task.seed, space, action_space)
-            env_seed = task.seed
+            env_seed, before = task.seed, (0, 0)
             if checkpoint is not None:
-                member = _restored(member, checkpoint)
+                member = restored_member(member, checkpoint, task)
+                if task.changes:
+                    before = (task.num_env_steps - member.num_env_steps, task.num_iterations - member.num_iterations)
                 # Other seeds than at the trial's start, because its environments begin new episodes.
-                env_seed = random_streams.member_env_seed_after(task.seed, member.num_iterations)
+                env_seed = random_streams.member_env_seed_after(task.seed, before[1] + member.num_iterations)
             member.failure_penalty = task.failure_penalty
             stack.add(member, env_seed)
         except BaseException:
@@ -78,6 +83,7 @@ class PackedEngine:
             raise
         self._stacks[key] = stack
         self._tasks[task.trial_id] = (task, key)
+        self._before[task.trial_id] = before
 
     def _place(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Hashable:
         """Return the key of the stack for a new member: the one of its kind with the fewest members."""
@@ -88,7 +94,21 @@ class PackedEngine:
             stack = self._stacks.get(key)
             return 0 if stack is None else len(stack.members)
 
-        return min(((*kind, turn) for turn in range(num_turns)), key=num_members)
+        if not task.in_step:
+            return min(((*kind, turn) for turn in range(num_turns)), key=num_members)
+        # They come to a comparison in the same iteration, so that none of them waits there alone.
+        done = (task.num_env_steps, task.num_iterations)
+        same = [
+            key
+            for key, stack in self._stacks.items()
+            if cast("tuple[Any, ...]", key)[:-1] == kind and self._done(stack.members[0]) == done
+        ]
+        return min(same, key=num_members) if len(same) >= num_turns else (*kind, next(self._num_stacks))
+
+    def _done(self, member: AnyMember) -> tuple[int, int]:
+        """Return the env steps and the iterations that a member's trial has done."""
+        env_steps, iterations = self._before[member.member_id]
+        return env_steps + member.num_env_steps, iterations + member.num_iterations
 
     def _make_stack(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> AnyStack:
         kind = self._env_kind or choose_kind(measure_step(task.env_id, task.env_args), spare_cpus=0).kind
@@ -102,16 +122,43 @@ class PackedEngine:
         )
         return make_stack(hyperparams, envs, device)
 
-    def train_iteration(self) -> dict[str, IterationStats | Exception]:
-        """Train every member for one iteration; the stacks take turns."""
+    def train_iteration(self, held: Collection[str] = ()) -> dict[str, IterationStats | Exception]:
+        """Train every member for one iteration, but those that are held; the stacks take turns."""
         results: dict[str, IterationStats | Exception] = {}
-        for stack in self._stacks.values():
+        stacks = self._apart(held) if held else list(self._stacks.values())
+        for stack in stacks:
             stack.begin_iteration()
-        for stack in self._stacks.values():
+        for stack in stacks:
             for trial_id, stats in stack.finish_iteration().items():
                 error = stack.envs.errors.get(trial_id)
-                results[trial_id] = error or IterationStats(stats.num_env_steps, stats.episodes, stats.learner)
+                num_env_steps = self._before[trial_id][0] + stats.num_env_steps
+                results[trial_id] = error or IterationStats(num_env_steps, stats.episodes, stats.learner)
         return results
+
+    def _apart(self, held: Collection[str]) -> list[AnyStack]:
+        """Return the stacks to train, after the held members among theirs got a stack of their own."""
+        found = []
+        for key, stack in list(self._stacks.items()):
+            waiting = [member.member_id for member in stack.members if member.member_id in held]
+            if len(waiting) == len(stack.members):
+                continue
+            found.append(stack)
+            if waiting:
+                self._move(waiting, key)
+        return found
+
+    def _move(self, trial_ids: Sequence[str], key: Hashable) -> None:
+        """Move members to a new stack, where they begin new episodes, as after a restore."""
+        new = (*cast("tuple[Any, ...]", key)[:-1], next(self._num_stacks))
+        for trial_id in trial_ids:
+            task, _ = self._tasks[trial_id]
+            member = self._stacks[key].remove(trial_id)
+            if new not in self._stacks:
+                self._stacks[new] = self._make_stack(
+                    task, member.hyperparams, self._device or device_for(task.num_gpus)
+                )
+            self._stacks[new].add(member, random_streams.member_env_seed_after(task.seed, self._done(member)[1]))
+            self._tasks[trial_id] = (task, new)
 
     def policy(self, trial_id: str) -> PortablePolicy:
         """Return the current greedy policy of a member."""
@@ -121,7 +168,7 @@ class PackedEngine:
             "trial_id": trial_id,
             "seed": task.seed,
             "hyperparams": task.hyperparams,
-            "iteration": member.num_iterations,
+            "iteration": self._done(member)[1],
         }
         return portable_policy(
             member,
@@ -142,6 +189,7 @@ class PackedEngine:
         _, stack = self._member_of(trial_id)
         stack.remove(trial_id)
         _, key = self._tasks.pop(trial_id)
+        del self._before[trial_id]
         if not stack.members:
             stack.envs.close()
             del self._stacks[key]
@@ -152,25 +200,8 @@ class PackedEngine:
             stack.envs.close()
         self._stacks.clear()
         self._tasks.clear()
+        self._before.clear()
 
     def _member_of(self, trial_id: str) -> tuple[TrialTask, AnyStack]:
         task, key = self._tasks[trial_id]
         return task, self._stacks[key]
-
-
-def _restored(fresh: AnyMember, checkpoint: Path) -> AnyMember:
-    """Return the member of a checkpoint, if it has the same network as a fresh one."""
-    folder = checkpoint / STATE_FOLDER
-    if not folder.is_dir():
-        raise CheckpointError(
-            f"Checkpoint {checkpoint} has no folder {STATE_FOLDER!r}: the packed engine did not write it.",
-            "Resume the trial with the engine it began on.",
-        )
-    member = load_member(folder, fresh.member_id)
-    if member.hyperparams != fresh.hyperparams or member.seed != fresh.seed:
-        raise CheckpointError(
-            f"Checkpoint {checkpoint} has other hyperparameters or another seed than trial {fresh.member_id}.",
-            f"Restore {TRIAL_RECORD}, or use another checkpoint of the trial.",
-        )
-    check_shapes(member, fresh.weights)
-    return member

@@ -7,6 +7,7 @@ of them together (`tune_jobs.training.pack_loop`). This module imports no ray, s
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -46,6 +47,9 @@ class TrialTask:
     """Env steps of the trial when it is built; its checkpoint may be a copy with the count of another trial."""
     num_iterations: int = 0
     """Iterations of the trial when it is built."""
+    in_step: bool = False
+    """Whether it waits for other trials at numbers of env steps; in a pack it then shares a stack with such members
+    alone as are always as far as it is."""
     engine: str = ""
     """The engine's name for the manifests of checkpoints; empty: they name none."""
 
@@ -109,12 +113,15 @@ class PackEngine(Protocol):
         """
         ...
 
-    def train_iteration(self) -> dict[str, IterationStats | Exception]:
-        """Train every member for one iteration.
+    def train_iteration(self, held: Collection[str] = ()) -> dict[str, IterationStats | Exception]:
+        """Train the members for one iteration.
+
+        Args:
+            held: Members that wait for other trials and are not trained.
 
         Returns:
-            For every member, by trial id, the results of the iteration or the error of the member. A member that failed
-            stays until it is removed; the others have been trained.
+            For every other member, by trial id, the results of the iteration or the error of the member. A member that
+            failed stays until it is removed; the others have been trained.
         """
         ...
 

@@ -33,6 +33,7 @@ from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.recovery import take_up_checkpoints, take_up_copy, take_up_results
 from tune_jobs.training.protocol import IterationStats, TrialEngine, TrialTask
+from tune_jobs.training.stop_rules import stop_reason
 
 TRAINING_RETURN_EPISODES = 100
 
@@ -83,11 +84,24 @@ class TrialSteps:
         self._built_from: Path | None = None
         self._started = 0.0
         self._started_at: float | None = None
+        self._evaluated_at = -1
+        self.hold_at: int | None = None
+        """Env steps from which it saves and waits for other trials, at its next evaluation; None: it never waits."""
 
     @property
     def iteration(self) -> int:
         """The number of iterations done."""
         return self._last.iteration
+
+    @property
+    def waits(self) -> bool:
+        """Whether it was evaluated where it has to wait, and is saved; until `hold_at` is raised it is not trained."""
+        reached = self.hold_at is not None and self._evaluated_at == self._last.num_env_steps >= self.hold_at
+        return reached and not self._is_copy
+
+    def where(self) -> Progress:
+        """Return where a trial stands that was opened where it waits."""
+        return self._progress("running", evaluated=True)
 
     def check_owned(self) -> None:
         """Raise an error if another process has taken the trial, which may have caused an error here.
@@ -176,6 +190,7 @@ class TrialSteps:
                 self._window.extend(record.episode_returns)
             if record.evaluation_return is not None:
                 self._evaluation_return = record.evaluation_return
+                self._evaluated_at = record.num_env_steps
             self._last = record
             # With an invalid time, the stop rule `time_s` would never end the trial, or end it at once.
             if 0 <= record.time_s < math.inf:
@@ -205,6 +220,7 @@ class TrialSteps:
             )
             if start.evaluation_return is not None:
                 self._evaluation_return = start.evaluation_return
+                self._evaluated_at = start.num_env_steps
 
     def pause(self) -> None:
         """Save a checkpoint of this iteration, so that the trial can continue elsewhere."""
@@ -262,12 +278,18 @@ class TrialSteps:
         self._unwritten.append(self._last)
         self._untold.append(self._last)
         self._tally.set(_reached(self._last))
+        if evaluation is not None:
+            self._evaluated_at = record.num_env_steps
         if (
             self._improves(record.evaluation_return)
             or reason is not None
+            or self.waits
             or record.iteration % self.task.checkpoints.every_iterations == 0
         ):
             self._checkpoint(record.evaluation_return)
+        if self.waits:
+            # Others may go on from this checkpoint as soon as it is told.
+            self._store.settle()
         status: TrialStatus = "running" if reason is None else "completed"
         return self._progress(status, evaluated=evaluation is not None, reason=reason)
 
@@ -301,23 +323,8 @@ class TrialSteps:
         )
 
     def _stop_reason(self, record: IterationRecord, evaluation_return: float | None) -> str | None:
-        stop = self.task.stop
-        # With fewer than 100 episodes, a lucky start would count as solved.
-        if len(self._window) == TRAINING_RETURN_EPISODES and _reaches(record.training_return, stop.training_return):
-            return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
-        if _reaches(evaluation_return, stop.evaluation_return):
-            return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
-        caps = {
-            "num_episodes": (record.num_episodes, stop.num_episodes),
-            "num_env_steps": (record.num_env_steps, stop.num_env_steps),
-            "num_iterations": (record.iteration, stop.num_iterations),
-        }
-        for name, (count, cap) in caps.items():
-            if cap is not None and count >= cap:
-                return f"{name} {count} >= {cap}"
-        if record.time_s >= stop.time_s:
-            return f"time_s {record.time_s:.0f} >= {stop.time_s:g}"
-        return None
+        is_full = len(self._window) == TRAINING_RETURN_EPISODES
+        return stop_reason(self.task.stop, record, evaluation_return, is_full=is_full)
 
     def _improves(self, score: float | None) -> bool:
         best = self._best.evaluation_return if self._best is not None else None
@@ -391,7 +398,3 @@ def _learning_settings(hyperparams: dict[str, Any]) -> str:
 
 def _reached(record: IterationRecord) -> Reached:
     return Reached(record.iteration, record.num_env_steps, record.num_episodes, record.time_s)
-
-
-def _reaches(value: float | None, target: float | None) -> bool:
-    return value is not None and target is not None and value >= target

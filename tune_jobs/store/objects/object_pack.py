@@ -17,7 +17,7 @@ from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.owners import ObjectOwner
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.pack_contract import Assignment
-from tune_jobs.store.places import check_pack_id, check_trial_id
+from tune_jobs.store.places import check_pack_id
 from tune_jobs.store.trial_contract import Ownership
 
 _READ_EVERY_S = 0.25
@@ -61,7 +61,7 @@ class ObjectPack:
 
     def write(self, assignment: Assignment, *, soon: bool = False) -> None:
         """Replace the assignment."""
-        data = {"trial_ids": list(assignment.trial_ids), "num_failures": dict(assignment.num_failures)}
+        data = assignment.as_json()
         if data == self._written:
             # A driver writes it after every report; if it is not the pack's any more, it hears so elsewhere.
             return
@@ -103,10 +103,7 @@ class ObjectPack:
         name = self._parts.bucket.name_of(f"{self._prefix}.json")
         try:
             found = self._parts.bucket.get(f"{self._prefix}.json")
-            data = json.loads(found.data if found is not None else b"")
-            trial_ids = tuple(check_trial_id(trial_id) for trial_id in data["trial_ids"])
-            failures = {check_trial_id(trial_id): int(number) for trial_id, number in data["num_failures"].items()}
-            return Assignment(trial_ids, failures)
+            return Assignment.from_json(json.loads(found.data if found is not None else b""))
         except (NotFoundError, *MALFORMED) as error:
             raise CheckpointError(
                 f"{name} does not say which trials pack {self.pack_id} trains: {repr(error)[:400]}.",

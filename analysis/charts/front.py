@@ -1,0 +1,76 @@
+"""The chart of score against cost, with its Pareto front; only of a sweep that asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots, drawable
+from analysis.charts.subject import Subject
+from analysis.front import front_of, untrained_return
+from analysis.objectives import SettingScores
+
+_MAX_DRAWN = 2_000
+_LEAST_RATIO = 30.0
+"""From where on costs are drawn to a logarithmic scale: the greatest of the least."""
+
+
+def make_charts(subject: Subject) -> list[Chart]:
+    """Return the chart, if the sweep sets scores against a cost and has settings to compare."""
+    ranking = [] if subject.is_population or subject.cost is None else subject.settings
+    front = front_of(ranking, untrained_return(subject.results))
+    if front is None or len(ranking) < 2:
+        return []
+    by_point = {item.point_index: item for item in ranking}
+    on_front = [by_point[item.point_index] for item in front.points]
+    may_be = [by_point[item.point_index] for item in front.undecided]
+    known = {item.point_index for item in (*on_front, *may_be)}
+    others = [item for item in ranking if item.point_index not in known]
+    picks = np.linspace(0, len(others) - 1, min(len(others), _MAX_DRAWN)).round().astype(int).tolist()
+    notes = [f"{_MAX_DRAWN:,} of {len(others):,} other settings are drawn."] if len(others) > _MAX_DRAWN else []
+    lines = [_dots(subject, "other settings", "muted", [others[pick] for pick in picks])]
+    lines += [_dots(subject, "may be on the front", "series-1", may_be, look="hollow")]
+    lines += [_front(subject, on_front, [item.cost for item in ranking])]
+    lines += [_dots(subject, "on the front", "series-0", on_front)]
+    near = by_point[front.cheapest_near.point_index]
+    lines += [_dots(subject, "the best", "accent", [ranking[0]])]
+    if near is not ranking[0]:
+        lines += [_dots(subject, "the cheapest near it", "series-2", [near])]
+    costs = [item.cost for item in ranking]
+    is_wide = min(costs) > 0 and max(costs) / min(costs) >= _LEAST_RATIO
+    x = (
+        Axis("env steps of a training, mean over seeds", "log")
+        if is_wide
+        else Axis("env steps of a training, mean over seeds", low=0)
+    )
+    plot = Plot(x, Axis(subject.score_name), tuple(line for line in lines if line.x), goal=_goal(subject))
+    title = "Score against cost, and the front"
+    caption = "Each dot is a setting, by its expected mean over seeds; no setting lies above the line."
+    return [Chart("score_against_cost", "front", title, caption, Plots((plot,)), notes=tuple(notes))]
+
+
+def _goal(subject: Subject) -> Number:
+    return drawable(subject.goal)
+
+
+def _front(subject: Subject, on_front: Sequence[SettingScores], costs: Sequence[float]) -> Line:
+    """Return what is to be had for each cost, as steps, drawn on to the greatest cost."""
+    x: list[Number] = [item.cost for item in on_front]
+    y: list[Number] = [drawable(item.expected) for item in on_front]
+    texts = [_text(subject, item) for item in on_front]
+    return Line(
+        "the front", "series-0", (*x, max(costs)), (*y, y[-1]), is_stepped=True, texts=(*texts, "the dearest setting")
+    )
+
+
+def _dots(subject: Subject, name: str, color: str, settings: Sequence[SettingScores], look: str = "dots") -> Line:
+    return Line(
+        name, color,
+        tuple(item.cost for item in settings), tuple(drawable(item.expected) for item in settings),
+        look="hollow" if look == "hollow" else "dots", texts=tuple(_text(subject, item) for item in settings),
+    )  # fmt: skip
+
+
+def _text(subject: Subject, item: SettingScores) -> str:
+    return subject.setting_name(item)

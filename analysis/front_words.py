@@ -1,0 +1,83 @@
+"""Say in words what the front of score against cost shows, and its rows, for the command line and the report."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from analysis.best_records import FrontPointRecord, FrontRecord, SettingsRecord
+from analysis.wording import counted, number, return_text, setting_text
+
+ON_FRONT, MAY_BE = "yes", "may be"
+NEAREST = "yes, the cheapest near the best"
+
+
+class FrontRow(NamedTuple):
+    """A setting that is, or may be, on the front."""
+
+    item: FrontPointRecord
+    on_front: str
+    """Whether it is on the front, in words."""
+
+    @property
+    def is_on_front(self) -> bool:
+        """Whether it is, by the expected means."""
+        return self.on_front != MAY_BE
+
+
+def front_rows(front: FrontRecord) -> list[FrontRow]:
+    """Return the listed settings, the cheapest first."""
+    near = front.cheapest_near.point_index
+    found = [FrontRow(item, NEAREST if item.point_index == near else ON_FRONT) for item in front.points]
+    found += [FrontRow(item, MAY_BE) for item in front.undecided]
+    return sorted(found, key=lambda row: (row.item.num_env_steps, row.item.rank))
+
+
+def interval_text(item: FrontPointRecord, none: str) -> str:
+    """Return the 95 % interval of a setting's score over training seeds."""
+    if item.lower is None or item.upper is None:
+        return none
+    return f"{return_text(item.lower)} to {return_text(item.upper)}"
+
+
+def cheapest_near_text(settings: SettingsRecord) -> str:
+    """Name the cheapest setting near the best one, and say how much it saves; empty: the sweep doesn't ask for it."""
+    front = settings.front
+    if front is None:
+        return ""
+    near, best = front.cheapest_near, settings.best
+    if near.point_index == best.point_index:
+        return "the best setting itself: no cheaper one is near it"
+    point = ", ".join(f"{name} {setting_text(value)}" for name, value in near.point.items())
+    whole = front.points[-1].num_env_steps if front.num_on_front == len(front.points) else None
+    share = f", {100 * near.num_env_steps / whole:.0f} % of the best one's" if whole else ""
+    text = f"{point}: {return_text(near.score)} for {env_steps_text(near)} a training{share}"
+    if front.may_be_best is None:
+        return text
+    return f"{text}; the data {'cannot' if front.may_be_best else 'can'} tell it from the best"
+
+
+def near_text(front: FrontRecord) -> str:
+    """Say what is near the best one."""
+    if front.untrained is None:
+        return "No episode was whole before training, so only what scores as the best does is near it."
+    return (
+        f"Near the best is a setting that loses at most {100 * front.near_share:.0f} % of what the best one gained on "
+        f"the untrained policies' {return_text(front.untrained)}: one that scores {return_text(front.near_score)} or "
+        "more."
+    )
+
+
+def undecided_text(front: FrontRecord) -> str:
+    """Say how sure it is who is on the front."""
+    if front.num_undecided is None:
+        return "Each setting has one seed: nothing says how sure it is who is on the front."
+    if not front.num_undecided:
+        return "The data tell all other settings from those on the front."
+    text = f"{counted(front.num_undecided, 'other setting')} can't be told from being on the front"
+    listed = len(front.undecided)
+    return f"{text}{f'; the {listed} cheapest are listed' if listed < front.num_undecided else ''}."
+
+
+def env_steps_text(item: FrontPointRecord) -> str:
+    """Return a setting's cost."""
+    return f"{number(round(item.num_env_steps))} env steps"

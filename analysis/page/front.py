@@ -1,0 +1,60 @@
+"""Score against cost: the settings on their Pareto front, and the cheapest one near the best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from analysis.front_words import cheapest_near_text, front_rows, interval_text, near_text, undecided_text
+from analysis.page.scores import score_means
+from analysis.page.source import Source
+from analysis.report_tables import Cell, Table
+from analysis.tables import cell_value
+from analysis.wording import NONE, number, return_text
+
+_ABOUT = (
+    "On the front are the settings than which no other is as cheap and better, or as good and cheaper, by expected "
+    "means over seeds. The cost is the mean env steps of a training: less than its length where it reached its goal, "
+    "and the whole length where a scheduler ended it or it failed."
+)
+
+
+@dataclass(frozen=True)
+class Front:
+    """What the section shows."""
+
+    cheapest_near: str
+    """The cheapest setting near the best; empty: the sweep doesn't ask for cost, and there is no section."""
+    about: list[str]
+    table: Table
+
+
+def section(source: Source) -> Front:
+    """Return what the section shows."""
+    settings = source.settings
+    if settings is None or settings.front is None or settings.num_settings < 2:
+        return Front("", [], Table([], []))
+    front = settings.front
+    several = front.num_undecided is not None
+    names = list(settings.best.point)
+    headings = ["env steps", f"score {score_means(settings)}", *(["95 % interval over training seeds"] * several)]
+    headings += ["rank by score", *names, "seeds", "on the front"]
+    rows = []
+    for row in front_rows(front):
+        item, told = row
+        interval = interval_text(item, NONE)
+        cells = [
+            Cell(item.num_env_steps, number(round(item.num_env_steps))),
+            Cell(item.score, return_text(item.score)),
+            *([Cell(interval, interval)] * several),
+            Cell(item.rank, str(item.rank)),
+        ]
+        for name in names:
+            value = cell_value(item.point.get(name))
+            cells.append(Cell(value, number(value)))
+        rows.append(
+            [*cells, Cell(item.num_seeds, str(item.num_seeds)), Cell(told, told, "" if row.is_on_front else "pending")]
+        )
+    about = [_ABOUT, near_text(front), undecided_text(front)]
+    if front.num_on_front > len(front.points):
+        about.append(f"The {len(front.points)} cheapest of {front.num_on_front:,} on the front are listed.")
+    return Front(cheapest_near_text(settings), about, Table(headings, rows))

@@ -1,0 +1,414 @@
+"""Populations and HyperBand in packs: who waits for whom, who goes on from whom, and what is left of it on disk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from meeting_packs import Packs
+
+from analysis.records import ChangeRecord, TrialRecord
+from policies.errors import CheckpointError
+from tune_jobs.ray_tune.hyperband import HyperBand
+from tune_jobs.ray_tune.population import Population
+from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+
+pytestmark = pytest.mark.ray
+
+PBT: dict[str, Any] = {"type": "pbt", "perturb_every_env_steps": 400, "quantile_fraction": 0.25}
+"""With evaluations every 200 env steps, to 1,000: compared at 400 and 800."""
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_synced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of checkpoints; none of these processes is really killed."""
+    monkeypatch.setattr("os.fsync", lambda _: None)
+
+
+def random_scores(seed: int, num_levels: int = 6) -> Callable[[str, int], float]:
+    """Scores with ties, the same for each trial and iteration."""
+
+    def score(trial_id: str, iteration: int) -> float:
+        return float(np.random.default_rng([seed, int(trial_id[1:]), iteration]).integers(num_levels))
+
+    return score
+
+
+# -- when, and who
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_it_depends_on_no_timing_and_not_on_the_number_of_packs_or_places(tmp_path: Path, seed: int) -> None:
+    found = []
+    for number, (num_packs, slots) in enumerate([(1, 64), (2, 64), (3, 2), (2, 1)]):
+        packs = Packs(
+            tmp_path / str(number), 8, random_scores(seed), PBT, seed=10 * seed + number, num_packs=num_packs,
+            slots=slots,
+        ).run()  # fmt: skip
+        assert {record.status for record in packs.records()} == {"completed"}
+        assert {record.num_env_steps for record in packs.records()} == {1_000}
+        found.append((packs.changes(), packs.curves(), sorted(packs.trained())))
+    assert all(one == found[0] for one in found)
+    assert sum(map(len, found[0][0].values())) >= 2
+
+
+def test_all_are_compared_by_what_they_have_at_the_same_env_steps(tmp_path: Path) -> None:
+    # At 400 env steps the first is the worst, at 800 the last; nobody is compared by an older score.
+    scores = {4: [0, 5, 6, 7], 8: [4, 5, 6, 1]}
+    packs = Packs(tmp_path, 4, lambda trial_id, at: float(scores.get(at, [9] * 4)[int(trial_id[1:])]), PBT).run()
+    changes = packs.changes()
+    assert [(name, one.iteration, one.source_trial_id) for name, found in changes.items() for one in found] == [
+        ("t0000", 4, "t0003"),
+        ("t0003", 8, "t0002"),
+    ]
+
+
+def test_a_copy_goes_on_from_what_the_better_one_has_saved_there_and_trains_with_the_new_values(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT, num_packs=1).run()
+    changes = packs.changes()["t0000"]
+    assert [(one.iteration, one.num_env_steps, one.source_trial_id) for one in changes] == [
+        (4, 400, "t0003"), (8, 800, "t0003"),
+    ]  # fmt: skip
+    assert [one for one in packs.begun() if one[0] == "t0000"] == [
+        ("t0000", "t0000@0"), ("t0000", "t0003@4"), ("t0000", "t0003@8"),
+    ]  # fmt: skip
+    rates = {iteration: lr for name, iteration, lr in packs.trained() if name == "t0000"}
+    first, second = (change.after["lr"] for change in changes)
+    assert rates == {at: 1e-3 if at <= 4 else first if at <= 8 else second for at in range(1, 11)}
+    assert packs.store.trial("t0000").read_record().hyperparams["lr"] == second
+    # Nobody else was opened a second time: who waits goes on where it is.
+    assert sorted(name for name, _ in packs.begun()) == ["t0000"] * 3 + ["t0001", "t0002", "t0003"]
+    assert not (packs.store.folder / "trials" / "t0000" / "copied").exists()
+
+
+def test_a_pack_of_slower_members_is_waited_for_and_trains_meanwhile(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT)
+    for _ in range(20):
+        packs.step("p00")
+    # The others have not begun; without them nobody is compared.
+    assert {at for _, at, _ in packs.processes["p00"].engine.trained} == {1, 2, 3, 4}
+    assert packs.changes() == {f"t000{index}": [] for index in range(4)}
+    assert {record.status for record in packs.records()} == {"running"}
+    packs.run()
+    assert len(packs.changes()["t0000"]) == 2
+
+
+# -- as on engine rllib
+
+
+class FakedTune:
+    """Tune's controller, to which the trials of a population report."""
+
+    def __init__(self, names: list[str]) -> None:
+        manager = SimpleNamespace(checkpoint_config=SimpleNamespace(num_to_keep=None), _latest_checkpoint_result=None)
+        self.trials = [
+            SimpleNamespace(
+                config={"trial_id": name}, status="RUNNING", is_finished=lambda: False,
+                run_metadata=SimpleNamespace(checkpoint_manager=manager),
+            )
+            for name in names
+        ]  # fmt: skip
+
+    def get_trials(self) -> list[SimpleNamespace]:
+        return self.trials
+
+    get_live_trials = get_trials
+
+    def pause_trial(self, trial: SimpleNamespace, should_checkpoint: bool) -> None:
+        pass
+
+    def _schedule_trial_save(self, trial: SimpleNamespace, result: dict[str, Any]) -> SimpleNamespace:
+        return SimpleNamespace(checkpoint="pointer", metrics={})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_same_scores_give_the_same_changes_as_on_engine_rllib(tmp_path: Path, seed: int) -> None:
+    """Each trial has been at 400 env steps with the score that it has at 800 too, so that all scores are known."""
+    from tune_jobs.ray_tune.population import PopulationScheduler
+
+    score = random_scores(seed)
+
+    def steady(trial_id: str, iteration: int) -> float:
+        return score(trial_id, 0)
+
+    def resumed(folder: Path) -> Packs:
+        packs = Packs(folder, 8, steady, PBT, seed=seed)
+        for record in packs.records():
+            known = {"num_iterations": 4, "num_env_steps": 400, "evaluation_return": steady(record.trial_id, 4)}
+            packs.store.trial(record.trial_id).write_record(record.model_copy(update=known))
+        packs.begin()
+        return packs
+
+    def copied(source: SimpleNamespace, target: SimpleNamespace, iteration: int) -> SimpleNamespace:
+        return SimpleNamespace(iteration=iteration)
+
+    packs, single = resumed(tmp_path / "packs"), resumed(tmp_path / "single")
+    scheduler = PopulationScheduler(single.spec, single.store, single.keeper.record, single.keeper.change)
+    tune: Any = FakedTune([record.trial_id for record in single.records()])
+    for trial in tune.trials:
+        scheduler.on_trial_add(tune, trial)
+    # Every trial has saved where it is compared.
+    scheduler._saved = {trial.config["trial_id"]: SimpleNamespace(checkpoint="pointer") for trial in tune.trials}
+    with mock.patch("tune_jobs.ray_tune.population.copy_latest_checkpoint", copied):
+        for trial in tune.trials:
+            told = {
+                "num_env_steps": 800, "score": steady(trial.config["trial_id"], 8), "evaluated": True,
+                "progress": SimpleNamespace(report=SimpleNamespace(num_iterations=8)),
+            }  # fmt: skip
+            scheduler.on_trial_result(tune, trial, told)
+        packs.run(until=lambda: any(packs.changes().values()))
+    theirs, ours = single.changes(), packs.changes()
+    assert sum(map(len, theirs.values())) in (0, 1, 2)
+    assert ours == theirs
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_comparing_all_at_once_decides_as_one_by_one_where_all_scores_are_known(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    names = [f"t{index:04d}" for index in range(int(rng.integers(2, 20)))]
+    spec: Any = SimpleNamespace(
+        perturb_every_env_steps=400, seed=seed, space={},
+        scheduler=SimpleNamespace(quantile_fraction=float(rng.choice([0.1, 0.25, 0.5])), resample_probability=0.2),
+    )  # fmt: skip
+    scores = {name: float(rng.integers(5)) for name in names}
+    records = {
+        name: TrialRecord(
+            trial_id=name, index=index, point_index=index, seed=0, point={}, num_env_steps=400,
+            evaluation_return=scores[name],
+        )
+        for index, name in enumerate(names)
+    }  # fmt: skip
+    standings = [Standing(name, 800, scores[name], evaluated=True) for name in names]
+    others: Any = SimpleNamespace(ended=lambda: ())
+    decided = []
+    with mock.patch.object(Population, "_mutated", lambda self, point, rng: {"drawn": rng.random()}):
+        for at_once in (True, False):
+            population = Population(spec, records.__getitem__)
+            for name in names:
+                population.begins(name)
+            if at_once:
+                decided.append(population.compared(standings, others))
+            else:
+                decided.append({one.trial_id: population.reached(one, others) for one in standings})
+    assert decided[0] == decided[1]
+    assert seed > 2 or any(isinstance(one, CopyFrom) for one in decided[0].values())
+
+
+# -- what goes wrong
+
+
+class KilledError(BaseException):
+    """The driver is killed here."""
+
+
+def kill(*args: Any, **kwargs: Any) -> None:
+    raise KilledError
+
+
+def test_a_driver_killed_between_a_copy_and_its_record_leaves_the_trial_as_it_was(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT)
+    with mock.patch.object(packs.keeper, "change", kill), pytest.raises(KilledError):
+        packs.run()
+    assert (packs.store.folder / "trials" / "t0000" / "copied" / "000004").is_dir()
+    packs.keeper.close()
+    assert packs.store.trial("t0000").read_record().changes == ()
+    packs.begin()
+    packs.run()
+    # It went on from its own checkpoint, with the values that it had; a copy came at the next comparison.
+    assert [one for one in packs.begun() if one[0] == "t0000"] == [("t0000", "t0000@4"), ("t0000", "t0003@8")]
+    assert [lr for name, at, lr in packs.trained() if name == "t0000" and at <= 8] == [1e-3] * 4
+    assert {record.status for record in packs.records()} == {"completed"}
+
+
+def test_a_driver_killed_after_the_record_goes_on_with_the_copy_and_its_values(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT)
+    keep = packs.keeper.change
+
+    def then_kill(*args: Any) -> None:
+        keep(*args)
+        raise KilledError
+
+    with mock.patch.object(packs.keeper, "change", then_kill), pytest.raises(KilledError):
+        packs.run()
+    (change,) = packs.store.trial("t0000").read_record().changes
+    packs.begin()
+    packs.run()
+    assert packs.begun()[0] == ("t0000", "t0003@4")
+    assert packs.changes()["t0000"][0] == change.model_copy(update={"time": 0.0})
+    assert [lr for name, at, lr in packs.trained() if name == "t0000" and at <= 8] == [change.after["lr"]] * 4
+
+
+def test_a_checkpoint_that_cannot_be_copied_leaves_the_trial_as_it_is(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT)
+    damaged = mock.Mock(side_effect=CheckpointError("It is damaged."))
+    with mock.patch("tune_jobs.ray_tune.population.copy_latest_checkpoint", damaged):
+        packs.run()
+    assert damaged.call_count == 2
+    assert packs.changes()["t0000"] == []
+    assert {record.status for record in packs.records()} == {"completed"}
+    assert "t0000 goes on as it is: It is damaged." in caplog.text
+
+
+def test_a_member_that_fails_is_waited_for_no_longer_and_nobody_goes_on_from_it(tmp_path: Path) -> None:
+    def script(trial_id: str, iteration: int) -> None:
+        if trial_id == "t0003" and iteration == 4:
+            raise ZeroDivisionError
+
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT, script=script, max_retries=0).run()
+    assert [record.status for record in packs.records()] == ["completed"] * 3 + ["failed"]
+    assert [one.source_trial_id for one in packs.changes()["t0000"]] == ["t0002"] * 2
+
+
+def test_a_member_that_is_retried_is_waited_for_and_nothing_else_changes(tmp_path: Path) -> None:
+    failed = list[int]()
+
+    def script(trial_id: str, iteration: int) -> None:
+        if trial_id == "t0003" and iteration == 4 and not failed:
+            failed.append(1)
+            raise ZeroDivisionError
+
+    score = random_scores(3)
+    packs = Packs(tmp_path / "failing", 6, score, PBT, script=script, max_retries=1).run()
+    assert packs.changes() == Packs(tmp_path / "whole", 6, score, PBT).run().changes()
+    assert packs.keeper.record("t0003").num_failures == 1
+
+
+def test_scores_that_are_no_numbers_are_the_worst_and_are_not_copied(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: math.nan if trial_id == "t0003" else 1.0, PBT).run()
+    assert {name: len(found) for name, found in packs.changes().items()} == {
+        "t0000": 0, "t0001": 0, "t0002": 0, "t0003": 2,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_pack_that_dies_while_its_members_wait_is_waited_for_again(tmp_path: Path, seed: int) -> None:
+    score = random_scores(seed)
+    packs = Packs(tmp_path / "dying", 4, score, PBT, seed=seed, max_retries=3)
+    for _ in range(10):
+        packs.step("p00")
+    packs.driver.died("p00", "killed")
+    packs.starts("p00")
+    packs.run()
+    assert packs.changes() == Packs(tmp_path / "whole", 4, score, PBT).run().changes()
+    # From where they waited, not from before.
+    assert {("t0000", "t0000@4"), ("t0001", "t0001@4")} <= set(packs.begun())
+    assert sorted(at for name, at, _ in packs.trained() if name == "t0000") == list(range(1, 11))
+
+
+def test_a_member_that_has_to_go_on_alone_gets_a_pack_while_the_others_wait(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), PBT, max_retries=3)
+    for _ in range(2):
+        packs.driver.died("p00", "killed")
+        packs.starts("p00")
+    packs.run()
+    assert {record.status for record in packs.records()} == {"completed"}
+    assert len(packs.changes()["t0000"]) == 2
+
+
+def test_the_last_one_of_a_population_goes_on_by_itself(tmp_path: Path) -> None:
+    def script(trial_id: str, iteration: int) -> None:
+        if trial_id != "t0001" and iteration == 3:
+            raise ZeroDivisionError
+
+    packs = Packs(tmp_path, 3, lambda trial_id, _: 1.0, PBT, script=script, max_retries=0).run()
+    assert [record.status for record in packs.records()] == ["failed", "completed", "failed"]
+    assert packs.keeper.record("t0001").num_env_steps == 1_000
+
+
+def test_stop_rules_act_on_a_copied_member_by_its_own_counts(tmp_path: Path) -> None:
+    # From 800 env steps on, what t0000 reaches with the copied weights ends it.
+    packs = Packs(
+        tmp_path, 4, lambda name, at: 99.0 if (name, at) == ("t0000", 10) else float(name[1:]), PBT,
+        stop={"num_env_steps": 1_600, "evaluation_return": 50.0},
+    ).run()  # fmt: skip
+    ended = {record.trial_id: (record.num_env_steps, record.stop_reason) for record in packs.records()}
+    assert ended["t0000"] == (1_000, "evaluation_return 99 >= 50")
+    assert ended["t0001"] == (1_600, "num_env_steps 1600 >= 1600")
+
+
+def test_a_stop_request_pauses_those_that_wait_and_those_that_gave_their_place_away(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 6, lambda trial_id, _: float(trial_id[1:]), PBT, num_packs=2, slots=2)
+    packs.run(until=lambda: any(record.status == "paused" for record in packs.records()))
+    packs.store.request_stop()
+    packs.run()
+    assert {record.status for record in packs.records()} <= {"paused", "pending"}
+    packs.store.clear_stop_request()
+    packs.begin()
+    packs.run()
+    assert {record.status for record in packs.records()} == {"completed"}
+
+
+def times(changes: dict[str, list[ChangeRecord]]) -> list[int]:
+    return sorted({one.num_env_steps for found in changes.values() for one in found})
+
+
+def test_where_evaluations_are_rarer_than_comparisons_the_next_evaluation_counts(tmp_path: Path) -> None:
+    scheduler = {**PBT, "perturb_every_env_steps": 250}
+    packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), scheduler).run()
+    assert times(packs.changes()) == [400, 800]
+
+
+# -- HyperBand
+
+BAND: dict[str, Any] = {"type": "hyperband", "grace_env_steps": 200, "reduction_factor": 2.0}
+
+
+def by_itself(packs: Packs, num_trials: int, seed: int) -> dict[str, tuple[str, int]]:
+    """Where HyperBand ends each trial if all have a place, and one after the other comes to its next evaluation."""
+    band = packs._scheduler()
+    assert isinstance(band, HyperBand)
+    rng = np.random.default_rng(seed)
+    names = [f"t{index:04d}" for index in range(num_trials)]
+    steps, over = dict.fromkeys(names, 0), dict[str, str]()
+    for name in names:
+        band.begins(name)
+    while running := [name for name in names if name not in over and not band.waits(name)]:
+        name = str(rng.choice(running))
+        steps[name] += 200
+        if steps[name] == 1_000:
+            over[name] = "completed"
+            band.gone(name)
+        else:
+            score = packs.score(name, steps[name] // 100)
+            score = WORST_SCORE if math.isnan(score) else score
+            if band.reached(Standing(name, steps[name], score, evaluated=True), NobodyWaits()) is Decision.STOP:
+                over[name] = "stopped"
+                band.gone(name)
+        over |= dict.fromkeys(band.take_ended(), "stopped")
+    assert over.keys() == set(names)
+    return {name: (over[name], steps[name]) for name in names}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_hyperband_ends_the_same_trials_at_the_same_env_steps_in_packs(tmp_path: Path, seed: int) -> None:
+    score = random_scores(seed, 100)
+    for number, (num_packs, slots) in enumerate([(1, 64), (2, 2)]):
+        packs = Packs(
+            tmp_path / str(number), 9, lambda name, at: math.nan if name == "t0004" else score(name, at), BAND,
+            seed=seed, num_packs=num_packs, slots=slots,
+        )  # fmt: skip
+        expected = by_itself(packs, 9, seed)
+        packs.run()
+        found = {record.trial_id: (record.status, record.num_env_steps) for record in packs.records()}
+        assert found == expected
+    assert 2 <= sum(status == "completed" for status, _ in found.values()) <= 7
+    # Nobody begins anew: who waited goes on where it was, in whichever pack.
+    assert len(packs.trained()) == sum(steps // 100 for _, steps in found.values())
+
+
+def test_a_member_that_fails_does_not_hold_up_its_bracket(tmp_path: Path) -> None:
+    def script(trial_id: str, iteration: int) -> None:
+        if trial_id == "t0000" and iteration == 2:
+            raise ZeroDivisionError
+
+    packs = Packs(tmp_path, 6, random_scores(1), BAND, script=script, max_retries=0).run()
+    assert packs.keeper.record("t0000").status == "failed"
+    assert {record.status for record in packs.records()} == {"failed", "completed", "stopped"}

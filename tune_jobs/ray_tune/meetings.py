@@ -1,0 +1,175 @@
+"""Let members of packs wait for each other where their scheduler compares them, in whichever packs they are.
+
+From `due_at` on, a member is saved at its next evaluation and is trained no further: it *arrives*. When all arrive that
+it is to be compared with, the outcomes say what becomes of each. Nothing here depends on which of them was faster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Protocol
+
+from tune_jobs.ray_tune.hyperband import HyperBand
+from tune_jobs.ray_tune.population import Population
+from tune_jobs.ray_tune.scheduling import CopyFrom, Decision, NobodyWaits, Scheduler, Standing
+
+Outcome = Decision | CopyFrom
+
+
+class Meeting(Scheduler, Protocol):
+    """A scheduler for members of packs that wait for each other. All trials begin before any other call."""
+
+    def due_at(self, trial_id: str) -> int | None:
+        """Return the env steps from which a trial waits, at its next evaluation; None: it waits no more."""
+        ...
+
+    def arrives(self, standing: Standing) -> None:
+        """Take a trial that is saved and waits; it may be told again."""
+        ...
+
+    def leaves(self, trial_id: str) -> None:
+        """Note that a trial does not wait any more, as its process has ended: it will arrive again."""
+        ...
+
+    def gone(self, trial_id: str) -> None:
+        """Take a trial out that has ended, in whatever way; nobody waits for it any longer."""
+        ...
+
+    def take_outcomes(self) -> dict[str, Outcome]:
+        """Return what becomes of those that waited, each once: it goes on, ends, or goes on from another's copy."""
+        ...
+
+
+def meeting_of(scheduler: Scheduler) -> Meeting | None:
+    """Return the meeting of a scheduler whose trials wait for each other in packs; None: its trials don't."""
+    if isinstance(scheduler, Population):
+        return PopulationMeeting(scheduler)
+    if isinstance(scheduler, HyperBand):
+        return HyperBandMeeting(scheduler)
+    return None
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """The other trials of a population that is compared as a whole; implements `Others`."""
+
+    names: Collection[str]
+
+    def wait(self) -> bool:
+        """Return False: whoever waits for a place gets that of one that has arrived."""
+        return False
+
+    def ended(self) -> Collection[str]:
+        """Return the trials that have ended in this run."""
+        return self.names
+
+
+class PopulationMeeting:
+    """All trials of a population that have not ended are compared at once, when the last of them has arrived.
+
+    They are compared in the order in which they began. With Ray Tune's trials, each is compared as soon as it gets
+    there, with what the others had reached at their last comparisons.
+    """
+
+    def __init__(self, population: Population) -> None:
+        self._population = population
+        self._live: dict[str, Standing | None] = {}
+        """The trials that have not ended, in the order in which they began; None: it has not arrived."""
+        self._gone: set[str] = set()
+
+    def begins(self, trial_id: str) -> None:
+        """Add a trial to the population."""
+        self._population.begins(trial_id)
+        self._live[trial_id] = None
+
+    def due_at(self, trial_id: str) -> int:
+        """Return the end of the present interval."""
+        return self._population.due_at(trial_id)
+
+    def reached(self, standing: Standing, others: object) -> Decision:  # noqa: ARG002 (it is compared where it waits)
+        """Let a trial go on that has not come to its comparison yet."""
+        return Decision.GO_ON
+
+    def arrives(self, standing: Standing) -> None:
+        """Take a trial that waits for its comparison."""
+        self._live[standing.trial_id] = standing
+
+    def leaves(self, trial_id: str) -> None:
+        """Wait for a trial again."""
+        if trial_id in self._live:
+            self._live[trial_id] = None
+
+    def ended(self, standing: Standing) -> None:
+        """Take a trial out."""
+        self.gone(standing.trial_id)
+
+    def gone(self, trial_id: str) -> None:
+        """Take a trial out, however it ended."""
+        self._live.pop(trial_id, None)
+        self._gone.add(trial_id)
+
+    def take_outcomes(self) -> dict[str, Outcome]:
+        """Compare the trials if all of them have arrived."""
+        standings = [standing for standing in self._live.values() if standing is not None]
+        if len(standings) < len(self._live) or not standings:
+            return {}
+        self._live = dict.fromkeys(self._live)
+        return self._population.compared(standings, _Ended(self._gone))
+
+
+class HyperBandMeeting:
+    """The trials of a bracket wait at its milestones; see `HyperBand`."""
+
+    def __init__(self, band: HyperBand) -> None:
+        self._band = band
+        self._waiting: dict[str, None] = {}
+        self._outcomes: dict[str, Outcome] = {}
+
+    def begins(self, trial_id: str) -> None:
+        """Give a trial a place in a bracket."""
+        self._band.begins(trial_id)
+
+    def due_at(self, trial_id: str) -> int | None:
+        """Return the next milestone of a trial's bracket."""
+        return self._band.next_milestone(trial_id)
+
+    def reached(self, standing: Standing, others: object) -> Decision:  # noqa: ARG002 (the band knows the others)
+        """Decide about a trial between two milestones: one without a score ends after the grace period."""
+        return self._band.reached(standing, NobodyWaits())
+
+    def arrives(self, standing: Standing) -> None:
+        """Take a trial that is at a milestone."""
+        decision = self._band.reached(standing, NobodyWaits())
+        if decision is Decision.WAIT:
+            self._waiting[standing.trial_id] = None
+        else:
+            self._waiting.pop(standing.trial_id, None)
+            self._outcomes[standing.trial_id] = decision
+            if decision is Decision.STOP:
+                self._band.gone(standing.trial_id)
+
+    def leaves(self, trial_id: str) -> None:
+        """Forget that a trial waits; it will arrive again, unless it is decided about before."""
+        self._waiting.pop(trial_id, None)
+
+    def ended(self, standing: Standing) -> None:
+        """Take a trial out."""
+        self.gone(standing.trial_id)
+
+    def gone(self, trial_id: str) -> None:
+        """Take a trial out, however it ended; the others may be due now."""
+        self._waiting.pop(trial_id, None)
+        self._outcomes.pop(trial_id, None)
+        self._band.gone(trial_id)
+
+    def take_outcomes(self) -> dict[str, Outcome]:
+        """Return who goes on beyond a milestone, and who ends there."""
+        for trial_id in self._band.take_ended():
+            self._waiting.pop(trial_id, None)
+            self._outcomes[trial_id] = Decision.STOP
+        for trial_id in [name for name in self._waiting if not self._band.waits(name)]:
+            del self._waiting[trial_id]
+            self._outcomes[trial_id] = Decision.GO_ON
+        outcomes, self._outcomes = self._outcomes, {}
+        return outcomes
