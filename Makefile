@@ -8,6 +8,7 @@
 # make faults  kill drivers and training processes at random moments, COUNT of each (100), and lose what a sweep stands on:
 #              a table; it goes on where it was cut, or anew with FRESH=--fresh
 # make bench   the benchmarks, beside their peers, in one table
+# make bench-search   what each search method finds on ARLBench's tasks; hours to days, goes on where it was stopped
 # make bench-choice   what each way to choose a setting loses, from trainings that were done before (docs/choice.md)
 # make docs    the site of all documentation, into site/: open site/index.html
 
@@ -18,7 +19,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 # torch first and pinned: whatever depends on it then takes it as it is.
 TORCH := $(shell grep '^torch==' constraints.txt)
 
-.PHONY: install sweep test test-slow unit lint types learn kills faults bench bench-choice docs clean
+.PHONY: install sweep test test-slow unit lint types learn kills faults bench bench-choice bench-search docs clean
 
 sweep: install
 	$(BIN)/tune-jobs launch cartpole-ppo
@@ -101,6 +102,9 @@ bench: $(VENV)/installed-bench
 
 bench-choice: $(VENV)/installed-test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.benchmarks.choice
+
+bench-search: $(VENV)/installed-test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.benchmarks.search
 
 # Warnings, links that lead nowhere among them, are errors; with --quiet they would not be.
 docs: $(VENV)/installed-docs

@@ -50,7 +50,6 @@ class SharedByDQN(Shared):
     optimizer: str
     target_network: bool
     replay: str
-    learning_starts: int
     target_update_unit: str
     epsilon_unit: str
 

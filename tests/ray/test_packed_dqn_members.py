@@ -115,6 +115,30 @@ def test_a_member_does_not_depend_on_the_others(variant: str) -> None:
             assert getattr(packed, name) == getattr(alone, name), name
 
 
+def test_members_begin_to_learn_at_their_own_env_step() -> None:
+    """Each in a stack of all, and alone: the same episodes and numbers of updates, and weights but for rounding."""
+    starts = (0, 70, 190)
+
+    def trained(*wanted: int) -> dict[int, tuple[DQNMember, list[MemberStats]]]:
+        stack = make_stack()
+        for start in wanted:
+            values: dict[str, Any] = {**WATCHED, "learning_starts": start}
+            add(stack, f"m{start}", 7 + start, **values)
+        seen = [stack.train_iteration() for _ in range(5)]
+        found = {start: copy.deepcopy(stack.member(f"m{start}")) for start in wanted}
+        stack.envs.close()
+        return {start: (member, [stats[f"m{start}"] for stats in seen]) for start, member in found.items()}
+
+    together = trained(*starts)
+    assert len({member.num_updates for member, _ in together.values()}) == len(starts)
+    for start in starts:
+        (alone, seen_alone), (packed, seen) = trained(start)[start], together[start]
+        assert packed.num_updates == alone.num_updates > 0
+        assert [found.episodes for found in seen] == [found.episodes for found in seen_alone]
+        for name, value in alone.weights.items():
+            np.testing.assert_allclose(packed.weights[name], value, rtol=1e-4, atol=1e-4, err_msg=name)
+
+
 def test_members_of_one_seed_are_the_same() -> None:
     stack = make_stack()
     for name in ("a", "b"):

@@ -223,6 +223,7 @@ ALIKE = {
     "dqn": {
         "lr": 0.1, "activation": "tanh", "hidden_sizes": [9, 7], "replay_capacity": 99, "epsilon_decay": 5.0,
         "adam_beta1": 0.5, "target_update_freq": 7,
+        "learning_starts": 5,
     },
 }  # fmt: skip
 APART = {
@@ -234,7 +235,7 @@ APART = {
         "hidden_sizes": [8], "num_envs": 3, "normalize_observations": True, "train_batch_size": 16,
         "env_steps_per_iteration": 77, "train_freq": 3, "updates_per_env_step": 1.0, "double_q": False,
         "dueling": False, "n_step": 3, "td_loss": "mse", "optimizer": "rmsprop", "replay": "prioritized",
-        "learning_starts": 5, "target_update_unit": "episode", "tau": 0.5, "epsilon_unit": "episode",
+        "target_update_unit": "episode", "tau": 0.5, "epsilon_unit": "episode",
     },
 }  # fmt: skip
 

@@ -71,7 +71,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         self._n_step.add_member(member.member_id, hyperparams)
         if member.num_updates and self._shared.replay != "none":
             # Its memory is empty again. It is filled to where it was when learning began; until then nothing is learnt.
-            num_steps = max(self._shared.learning_starts, self._shared.train_batch_size)
+            num_steps = max(hyperparams.learning_starts, self._shared.train_batch_size)
             self._refilled_at[member.member_id] = member.num_env_steps + num_steps
 
     def _forget(self, member_id: str) -> None:
@@ -118,7 +118,8 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         if member.num_env_steps < self._refilled_at.get(member.member_id, 0):
             return False
         (size,) = self._replay.sizes(self._replay.slots([member.member_id]))
-        return member.num_env_steps >= self._shared.learning_starts and bool(size >= self._shared.train_batch_size)
+        has_a_batch = bool(size >= self._shared.train_batch_size)
+        return has_a_batch and member.num_env_steps >= member.hyperparams.learning_starts
 
     def _num_updates(self, member: Member[DQNHyperparams]) -> int:
         """Return the number of updates that are due; it allows for rounding, as 10 x 0.1 is less than 1 in binary."""

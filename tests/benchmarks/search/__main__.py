@@ -1,0 +1,89 @@
+"""`make bench-search`: what each search method finds on ARLBench's tasks; it goes on where it was interrupted.
+
+It trains what is missing (hours), then writes the tables into docs/search-benchmark.md, between its two marks.
+`--tables` trains nothing and takes the runs that are whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import platform
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks.ppo import machine_name
+from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, run_all
+from tests.benchmarks.search.tables import tables
+from tests.benchmarks.search.tasks import HERE, TASKS
+from tests.benchmarks.search.trainings import Trainings
+
+DATA = HERE / "data"
+PAGE = HERE.parents[2] / "docs" / "search-benchmark.md"
+BEGIN, END = "<!-- bench-search: begin -->", "<!-- bench-search: end -->"
+
+
+def runs_file(task: str, method: str) -> Path:
+    """Return the file of a method's runs of a task."""
+    return DATA / f"{task}.{method}.json"
+
+
+def keep(task: str, runs: dict[tuple[str, int], Run]) -> None:
+    """Write the runs of a task, a file a method, with the machine and the date."""
+    for method in {name for name, _ in runs}:
+        found = [run for (name, _), run in sorted(runs.items(), key=lambda item: item[0]) if name == method]
+        about: dict[str, Any] = {
+            "task": task,
+            "method": method,
+            "date": datetime.now(UTC).date().isoformat(),
+            "machine": machine_name(),
+            "python": platform.python_version(),
+            "runs": [
+                {"scores": list(map(_finite, run.scores)), "best": run.best, "test": _finite(run.test)} for run in found
+            ],
+        }
+        runs_file(task, method).write_text(json.dumps(about, indent=1) + "\n")
+
+
+def _finite(score: float) -> float | None:
+    """Return a score as JSON has it: null where a seed failed."""
+    return score if math.isfinite(score) else None
+
+
+def read_runs(task: str, method: str) -> dict[str, Any] | None:
+    """Return what was kept of a method's runs of a task; None: nothing."""
+    file = runs_file(task, method)
+    return json.loads(file.read_text()) if file.exists() else None
+
+
+def write_page(lines: list[str]) -> None:
+    """Put lines between the marks of the page."""
+    text = PAGE.read_text()
+    before, rest = text.split(BEGIN)
+    _, after = rest.split(END)
+    PAGE.write_text(f"{before}{BEGIN}\n" + "\n".join(lines) + f"\n{END}{after}")
+
+
+def main() -> None:
+    """Train what is missing, and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; none: all")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="these alone")
+    parser.add_argument("--runs", type=int, default=NUM_RUNS, help="of each method")
+    parser.add_argument("--processes", type=int, default=2, help="how many packs train at once")
+    parser.add_argument("--tables", action="store_true", help="train nothing")
+    options = parser.parse_args()
+    DATA.mkdir(exist_ok=True)
+    for name in options.tasks or TASKS:
+        if not options.tables:
+            trainings = Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)
+            keep(name, run_all(TASKS[name], trainings, options.methods, options.runs))
+    lines = list(tables({(task, method): read_runs(task, method) for task in TASKS for method in METHODS}))
+    write_page(lines)
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

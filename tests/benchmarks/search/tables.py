@@ -1,0 +1,84 @@
+"""The tables of the benchmark of the search: what each method found, beside what ARLBench publishes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from tests.benchmarks.search.tasks import TASKS
+
+Kept = Mapping[tuple[str, str], dict[str, Any] | None]
+"""What was kept of the runs, by task and method."""
+
+
+def tables(kept: Kept) -> Iterator[str]:
+    """Yield the lines of the page's tables; a cell without runs is empty."""
+    methods = list(dict.fromkeys(method for (_, method), found in kept.items() if found is not None))
+    tasks = [task for task in TASKS if any(kept.get((task, method)) for method in methods)]
+    yield "The best point of a run by its score while tuning, as ARLBench publishes it, mean of the runs:"
+    yield ""
+    yield from _table(kept, tasks, methods, "score", published=True)
+    yield ""
+    yield "The same points trained again on five seeds on which nothing was chosen:"
+    yield ""
+    yield from _table(kept, tasks, methods, "test", published=False)
+    yield ""
+    yield from _ranks(kept, tasks, methods)
+    yield ""
+    yield from _made(kept, tasks, methods)
+
+
+def values_of(found: dict[str, Any], what: str) -> list[float]:
+    """Return one number of each run: `score`, the best while tuning, or `test`; -inf where a seed failed."""
+
+    def number(value: float | None) -> float:
+        return -math.inf if value is None else value
+
+    return [max(map(number, run["scores"])) if what == "score" else number(run["test"]) for run in found["runs"]]
+
+
+def _table(kept: Kept, tasks: list[str], methods: list[str], what: str, *, published: bool) -> Iterator[str]:
+    theirs = list(TASKS[tasks[0]].published) if published and tasks else []
+    yield f"| task | {' | '.join([*methods, *(f'ARLBench: {name}' for name in theirs)])} |"
+    yield "|---" * (1 + len(methods) + len(theirs)) + "|"
+    for task in tasks:
+        cells = [_cell(found, what) if (found := kept.get((task, method))) else "" for method in methods]
+        cells += [f"{TASKS[task].published[name]:g}" for name in theirs]
+        yield f"| {task} | {' | '.join(cells)} |"
+
+
+def _cell(found: dict[str, Any], what: str) -> str:
+    values = np.array(values_of(found, what))
+    if len(values) < 2 or not np.isfinite(values).all():
+        return f"{values.mean():.1f} ({len(values)} runs)"
+    half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
+    return f"{values.mean():.1f} ± {half:.1f}"
+
+
+def _ranks(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
+    """Yield mean ranks over the tasks that all methods have run, each run compared with those of its number."""
+    whole = [task for task in tasks if all(kept.get((task, method)) for method in methods)]
+    if not whole or len(methods) < 2:
+        return
+    told = []
+    for what, words in (("score", "while tuning"), ("test", "on test seeds")):
+        ranks = []
+        for task in whole:
+            rows = [values_of(found, what) for method in methods if (found := kept[task, method])]
+            num_runs = min(map(len, rows))
+            columns = np.array([row[:num_runs] for row in rows])
+            ranks.append(stats.rankdata(-columns, axis=0).mean(axis=1))
+        means = np.mean(ranks, axis=0)
+        named = ", ".join(f"{method} {mean:.2f}" for method, mean in zip(methods, means, strict=True))
+        told.append(f"{words}: {named}")
+    yield f"Mean rank of {len(methods)} over {len(whole)} tasks, {'; '.join(told)}."
+
+
+def _made(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
+    made = (kept.get((task, method)) for task in tasks for method in methods)
+    seen = {(found["date"], found["machine"]) for found in made if found is not None}
+    yield "Made " + "; ".join(f"{date} on {machine}" for date, machine in sorted(seen)) + "."

@@ -1,0 +1,151 @@
+"""Trainings of the benchmark's tasks: made in packs, on all cores, and kept in a file, so that none is made twice.
+
+A training is a point, a seed, and the mean of 128 greedy episodes at its end. It is made by the packed engine as a
+trial is, without Ray: what is measured is what points a method asks for, and these depend on scores alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from policies.errors import TuneJobsError
+from tests.benchmarks.search.tasks import Task
+from tune_jobs.plan.points import point_hyperparams
+from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
+
+MAX_AT_ONCE = 24
+"""Trainings in a pack; more gain little, and one that a kill takes with it is lost."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A training to make."""
+
+    point: Mapping[str, Any]
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """What tells it from others."""
+        return json.dumps([dict(sorted(self.point.items())), self.seed])
+
+
+class Trainings:
+    """The trainings of one task, in a file of JSON lines.
+
+    Args:
+        task: The task.
+        file: Where they are kept; it need not exist.
+        num_processes: How many packs train at once.
+    """
+
+    def __init__(self, task: Task, file: Path, num_processes: int) -> None:
+        self._task, self._file, self._num_processes = task, file, num_processes
+        self._known: dict[str, float | None] = {}
+        if file.exists():
+            for line in file.read_text().splitlines():
+                row = json.loads(line)
+                self._known[Wanted(row["point"], row["seed"]).key] = row["return"]
+
+    def __len__(self) -> int:
+        """How many are known."""
+        return len(self._known)
+
+    def returns(self, wanted: Sequence[Wanted]) -> Iterator[float | None]:
+        """Yield each training's mean greedy return, None for one that failed; those that are not known are made."""
+        missing = list({item.key: item for item in wanted if item.key not in self._known}.values())
+        if missing:
+            self._make(missing)
+        yield from (self._known[item.key] for item in wanted)
+
+    def _make(self, missing: Sequence[Wanted]) -> None:
+        share = math.ceil(len(missing) / self._num_processes)
+        size = min(MAX_AT_ONCE, share)
+        packs = [missing[first : first + size] for first in range(0, len(missing), size)]
+        context = multiprocessing.get_context("spawn")
+        with (
+            ProcessPoolExecutor(self._num_processes, mp_context=context, initializer=_alone_on_a_core) as pool,
+            self._file.open("a") as file,
+        ):
+            futures = {
+                pool.submit(train, self._task, [(dict(item.point), item.seed) for item in pack]): pack for pack in packs
+            }
+            for future in as_completed(futures):
+                for item, value in zip(futures[future], future.result(), strict=True):
+                    self._known[item.key] = value
+                    file.write(json.dumps({"point": dict(item.point), "seed": item.seed, "return": value}) + "\n")
+                file.flush()
+
+
+def _alone_on_a_core() -> None:
+    os.nice(10)
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+
+def train(task: Task, wanted: Sequence[tuple[dict[str, Any], int]]) -> list[float | None]:
+    """Train a pack and return each member's mean greedy return at its end; None: it failed.
+
+    Args:
+        task: The task.
+        wanted: Points and training seeds.
+    """
+    from policies.acting.evaluate import Episodes, Evaluator
+    from policies.acting.load import policy_from_portable
+    from policies.packed.evaluation import evaluate_many
+    from tune_jobs.training.packed import PackedEngine
+    from tune_jobs.training.protocol import TrialTask
+
+    spec = task.spec
+    engine = PackedEngine()
+    names = [f"t{index:04d}" for index in range(len(wanted))]
+    for name, (point, seed) in zip(names, wanted, strict=True):
+        hyperparams = point_hyperparams(spec, point, 0)
+        engine.add(
+            TrialTask(
+                sweep_place=".",
+                trial_id=name,
+                # As far apart as the training seeds of a sweep.
+                seed=1024 * seed,
+                algorithm=spec.algorithm,
+                hyperparams=hyperparams.model_dump(mode="json"),
+                env_id=spec.env.id,
+                env_args=spec.env.wrapped_args,
+                stop=StopSpec(),
+                evaluation=EvaluationSpec(),
+                checkpoints=CheckpointSpec(),
+                evaluation_seeds=(0,),
+            ),
+            None,
+        )
+    found: dict[str, float | None] = {}
+    policies = {}
+    left = set(names)
+    while left:
+        for name, stats in engine.train_iteration().items():
+            if isinstance(stats, Exception):
+                found[name] = None
+            elif stats.num_env_steps >= spec.stop.num_env_steps:
+                policies[name] = engine.policy(name)
+            else:
+                continue
+            engine.remove(name)
+            left.discard(name)
+    engine.close()
+    evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, task.evaluation_seeds)
+    acting = [policy_from_portable(portable) for portable in policies.values()]
+    for name, episodes in zip(policies, evaluate_many(evaluator, acting), strict=True):
+        if isinstance(episodes, Episodes):
+            found[name] = episodes.mean_return
+        elif isinstance(episodes, TuneJobsError):
+            found[name] = None
+        else:
+            raise episodes
+    return [found[name] for name in names]

@@ -1,0 +1,141 @@
+"""The benchmark of the search, with trainings that are a formula."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.benchmarks.search import trainings as module
+from tests.benchmarks.search.runs import Run, mean_or_worst, run, run_all
+from tests.benchmarks.search.tables import tables
+from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
+from tests.benchmarks.search.trainings import Trainings, Wanted
+
+TASK = TASKS["cartpole-ppo"]
+Formula = Callable[[Mapping[str, Any], int], float | None]
+
+
+def lr_is_best_at_a_thousandth(point: Mapping[str, Any], seed: int) -> float | None:
+    """Higher is better; the seed adds a little."""
+    return None if point["lr"] > 0.05 else -abs(math.log10(point["lr"]) + 3) + 0.001 * seed
+
+
+def played(method: str, number: int, formula: Formula = lr_is_best_at_a_thousandth) -> tuple[Run, list[list[Wanted]]]:
+    """A run whose trainings are the formula, and what it asked for at each time."""
+    generator, asked = run(TASK, method, number), []
+    wanted = next(generator)
+    while True:
+        asked.append(wanted)
+        try:
+            wanted = generator.send([formula(item.point, item.seed) for item in wanted])
+        except StopIteration as end:
+            return end.value, asked
+
+
+@pytest.mark.parametrize("method", ["random", "tpe"])
+def test_a_run_is_32_points_of_three_seeds_and_the_best_on_five_others(method: str) -> None:
+    found, asked = played(method, 1)
+    tuned = [item for wanted in asked[:-1] for item in wanted]
+    assert len(tuned) == 32 * len(TUNING_SEEDS)
+    assert [item.seed for item in tuned] == list(TUNING_SEEDS) * 32
+    assert [item.seed for item in asked[-1]] == list(TEST_SEEDS)
+    assert not set(TEST_SEEDS) & set(TUNING_SEEDS)
+    assert {json.dumps(item.point) for item in asked[-1]} == {json.dumps(found.best)}
+    assert found.score == max(found.scores) == pytest.approx(-abs(math.log10(found.best["lr"]) + 3) + 0.001)
+    assert found.test == pytest.approx(-abs(math.log10(found.best["lr"]) + 3) + 0.102)
+    # A failed seed is below everything.
+    assert [score == -math.inf for score in found.scores] == [item.point["lr"] > 0.05 for item in tuned[::3]]
+
+
+def test_a_run_is_the_same_again_and_another_number_is_another_run() -> None:
+    first, asked = played("tpe", 0)
+    again, asked_again = played("tpe", 0)
+    assert (first, asked) == (again, asked_again)
+    assert played("tpe", 1)[1] != asked
+    # The model comes after ten random points, which are those of the random search.
+    drawn = [item.point for item in played("random", 0)[1][0]]
+    assert [item.point for item in asked[0]] == drawn[:30]
+    assert len(asked) == 1 + 22 + 1
+    assert asked[1][0].point != drawn[30]
+
+
+def test_a_seed_that_failed_makes_its_point_the_worst() -> None:
+    assert mean_or_worst([1.0, 2.0]) == 1.5
+    assert mean_or_worst([1.0, None]) == -math.inf
+    assert mean_or_worst([1.0, math.nan]) == -math.inf
+
+
+def test_no_training_is_made_twice_whenever_the_benchmark_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    limit = 40
+
+    def make(self: Trainings, missing: list[Wanted]) -> None:
+        with self._file.open("a") as file:
+            for item in missing:
+                if len(made) == limit:
+                    raise KeyboardInterrupt
+                made.append(item.key)
+                self._known[item.key] = value = lr_is_best_at_a_thousandth(item.point, item.seed)
+                file.write(json.dumps({"point": dict(item.point), "seed": item.seed, "return": value}) + "\n")
+
+    monkeypatch.setattr(Trainings, "_make", make)
+    with pytest.raises(KeyboardInterrupt):
+        run_all(TASK, Trainings(TASK, tmp_path / "made.jsonl", 1), ["random", "tpe"], 2)
+    limit = 10**6
+    found = run_all(TASK, Trainings(TASK, tmp_path / "made.jsonl", 1), ["random", "tpe"], 2)
+    assert len(made) == len(set(made))
+    assert {name: item for name, item in found.items() if name[1] == 0} == {
+        ("random", 0): played("random", 0)[0], ("tpe", 0): played("tpe", 0)[0],
+    }  # fmt: skip
+
+
+def test_the_tables_show_means_intervals_and_ranks() -> None:
+    def kept(*values: float) -> dict[str, Any]:
+        runs = [{"scores": [value - 1, value], "best": {}, "test": value - 2} for value in values]
+        return {"date": "2026-11-23", "machine": "a machine", "runs": runs}
+
+    text = "\n".join(tables({("cartpole-dqn", "random"): kept(1, 2, 3), ("cartpole-dqn", "tpe"): kept(5, 5, 2)}))
+    # The t distribution's 97.5 % quantile with 2 degrees of freedom is 4.303; the deviations are 1 and 1.732.
+    assert "| cartpole-dqn | 2.0 ± 2.5 | 4.0 ± 4.3 | 485.7 | 500 | 466.7 | 421.3 |" in text
+    assert "| cartpole-dqn | 0.0 ± 2.5 | 2.0 ± 4.3 |" in text
+    assert "while tuning: random 1.67, tpe 1.33" in text
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_every_task_is_as_the_published_ones(task: Task) -> None:
+    spec = task.spec
+    assert (spec.num_samples, spec.seeds_per_point) == (32, len(TUNING_SEEDS))
+    assert len(task.evaluation_seeds) == 128
+    assert spec.hyperparams["hidden_sizes"] == [64, 64]
+    assert spec.space["lr"].model_dump() == {"loguniform": (1e-6, 0.1)}
+
+
+@pytest.mark.ray
+def test_a_training_is_that_of_a_pack_and_a_failed_one_is_none() -> None:
+    """One training of 256 env steps beside one whose learning rate ruins it."""
+    data = TASK.spec.model_dump(mode="json", exclude_defaults=True) | {"stop": {"num_env_steps": 512}}
+    small = _small(data)
+    point = {"lr": 1e-3, "minibatch_size": 128}
+    ruined = {"lr": 1e30, "minibatch_size": 128}
+    first, second, third = module.train(small, [(point, 0), (ruined, 0), (point, 1)])
+    assert first is not None
+    assert third is not None
+    assert 8 <= first <= 500
+    assert first != third
+    assert second is None
+    assert module.train(small, [(point, 0)]) == [first]
+
+
+def _small(data: dict[str, Any]) -> Task:
+    from tune_jobs.spec.file import load_spec
+
+    small = Task("small", {})
+    vars(small)["spec"] = load_spec(data)
+    return small
