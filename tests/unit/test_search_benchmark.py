@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.benchmarks.search import trainings as module
-from tests.benchmarks.search.runs import Run, mean_or_worst, run, run_all
+from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run, run_all
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
 from tests.benchmarks.search.trainings import Trainings, Wanted
@@ -25,9 +25,11 @@ def lr_is_best_at_a_thousandth(point: Mapping[str, Any], seed: int) -> float | N
     return None if point["lr"] > 0.05 else -abs(math.log10(point["lr"]) + 3) + 0.001 * seed
 
 
-def played(method: str, number: int, formula: Formula = lr_is_best_at_a_thousandth) -> tuple[Run, list[list[Wanted]]]:
+def played(
+    method: str, number: int, formula: Formula = lr_is_best_at_a_thousandth, task: Task = TASK
+) -> tuple[Run, list[list[Wanted]]]:
     """A run whose trainings are the formula, and what it asked for at each time."""
-    generator, asked = run(TASK, method, number), []
+    generator, asked = run(task, method, number), []
     wanted = next(generator)
     while True:
         asked.append(wanted)
@@ -62,6 +64,18 @@ def test_a_run_is_the_same_again_and_another_number_is_another_run() -> None:
     assert [item.point for item in asked[0]] == drawn[:30]
     assert len(asked) == 1 + 22 + 1
     assert asked[1][0].point != drawn[30]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_does_not_act_is_not_in_a_point(method: str) -> None:
+    _, asked = played(method, 0, task=TASKS["cartpole-dqn"])
+    points = [item.point for wanted in asked for item in wanted]
+    for name, acts in (
+        ("target_update_freq", lambda point: point["target_network"]),
+        ("prioritized_alpha", lambda point: point["replay"] == "prioritized"),
+    ):
+        assert {name in point for point in points} == {True, False}
+        assert all((name in point) is bool(acts(point)) for point in points)
 
 
 def test_a_seed_that_failed_makes_its_point_the_worst() -> None:
