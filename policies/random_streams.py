@@ -10,6 +10,7 @@ Streams derived from the seed of a sweep, by `spawn_key` of `numpy.random.SeedSe
 | (3,) | where the confirmation seeds begin |
 | (4, trial, change) | population based training: how a trial's change number `change` changes its values |
 | (5, point) | search method tpe: its sampler |
+| (6, point) | other search methods that have a model: what they draw for it, and where they look |
 
 Points are counted there without those that somebody chose, so that these change no other.
 
@@ -34,7 +35,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-_POINT, _TRAINING, _EVALUATION, _CONFIRMATION, _MUTATION, _TPE = range(6)
+_POINT, _TRAINING, _EVALUATION, _CONFIRMATION, _MUTATION, _TPE, _MODEL = range(7)
 """The first elements of spawn keys: for a new stream, take the next number and add a row to the table above."""
 
 
@@ -87,6 +88,11 @@ def mutation(sweep_seed: int, trial_index: int, num_changes: int) -> np.random.G
 def tpe_seed(sweep_seed: int, point_index: int) -> int:
     """Return the seed of the sampler that proposes a point."""
     return int(_spawned(sweep_seed, _TPE, point_index).generate_state(1)[0])
+
+
+def model_draws(sweep_seed: int, point_index: int) -> np.random.Generator:
+    """Return the generator of a search method that proposes a point by a model."""
+    return np.random.default_rng(_spawned(sweep_seed, _MODEL, point_index))
 
 
 # From a trial's seed.

@@ -31,7 +31,7 @@ SLOW = {
     "tests/ray/test_chosen_points.py::test_its_values_act_in_each_of_its_seeds_and_the_others_stay_as_they_are[rllib]":
         "the same, packed",
     "tests/ray/test_chosen_points.py::test_tpe_goes_on_behind_it_with_its_own_draws_and_is_told_of_it":
-        "tests/unit/test_chosen_point.py, and tests/unit/test_tpe.py",
+        "tests/unit/test_chosen_point.py, and tests/unit/test_search_methods.py",
     "tests/ray/test_confirming.py::test_an_interrupted_race_goes_on_as_it_would_have": "tests/ray/test_more_seeds.py",
     "tests/ray/test_confirming.py::test_it_is_left_out_where_it_is_off_or_somebody_replicates":
         "tests/unit/test_confirm.py",
@@ -44,7 +44,7 @@ SLOW = {
     "tests/ray/test_more_seeds.py::test_leading_settings_get_fresh_seeds_and_train_to_the_end[rllib-hyperband]":
         "the same, packed",
     "tests/ray/test_more_seeds.py::test_points_that_tpe_chose_are_trained_again":
-        "the others of its file, and tests/unit/test_tpe.py",
+        "the others of its file, and tests/unit/test_search_methods.py",
     "tests/ray/test_pack_interruption.py::test_members_go_on_from_their_checkpoints_after_a_kill_and_an_interruption":
         "`make kills`, and tests/ray/test_interruption.py",
     "tests/ray/test_packs.py::test_members_of_a_pack_that_dies_again_go_on_alone": "tests/ray/test_pack_driver.py",
@@ -52,7 +52,7 @@ SLOW = {
         "the same, asha, and tests/ray/test_hyperband.py",
     "tests/ray/test_schedulers.py::test_every_scheduler_runs_to_the_end[hyperband]": "tests/ray/test_hyperband.py",
     "tests/ray/test_search.py::test_tpe_runs_as_many_trials_at_once_as_the_machine_allows_and_goes_on_when_extended":
-        "tests/unit/test_pack_sizes.py, and tests/unit/test_tpe.py",
+        "tests/unit/test_pack_sizes.py, and tests/unit/test_search_methods.py",
     "tests/ray/test_search.py::test_a_population_that_is_stopped_goes_on_with_its_newest_values[rllib]":
         "the same, packed",
     "tests/ray/test_repetitions.py::test_a_trial_comes_to_the_same_by_itself[rllib]": "the same, packed",

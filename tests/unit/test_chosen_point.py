@@ -202,9 +202,9 @@ def test_what_a_domain_can_give(domain: dict[str, Any], inside: list[Any], beyon
 
 def test_tpe_learns_from_a_point_inside_and_proposes_the_same_with_one_outside() -> None:
     pytest.importorskip("optuna")
-    from test_tpe import SPACE as OWN
-    from test_tpe import make_spec as tpe_spec
-    from test_tpe import record, valley
+    from test_search_methods import SPACE as OWN
+    from test_search_methods import make_spec as tpe_spec
+    from test_search_methods import record, valley
 
     from tune_jobs.search.history import known_points
     from tune_jobs.search.proposal import propose_point

@@ -37,7 +37,7 @@ def grid(**values: Any) -> dict[str, dict[str, list[bool | float | str]]]:
         ({"scheduler": {"type": "asha", "quantile_fraction": 0.5}}, ["scheduler.quantile_fraction can't act"]),
         (
             {"search": {"num_startup_trials": 3}},
-            ["search.num_startup_trials can't act: search.type is random, not tpe."],
+            ["search.num_startup_trials can't act: search.type is random, not gp or forest or tpe."],
         ),
         ({"scheduler": {"type": "asha", "reduction_factor": 4, "grace_env_steps": 100}}, []),
         ({"scheduler": {"type": "asha", "quantile_fraction": 0.25}}, []),

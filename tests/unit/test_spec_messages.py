@@ -111,7 +111,10 @@ def test_no_whole_sweep_does(value: Any) -> None:
     ("fields", "message"),
     [
         ({"stop": [1]}, "stop: [1] is not allowed: give a mapping of its fields (training_return, "),
-        ({"search": False}, "search: False is not allowed: give random or tpe, or a mapping of its fields"),
+        (
+            {"search": False},
+            "search: False is not allowed: give random, auto, gp, forest or tpe, or a mapping",
+        ),
         ({"env": 3}, "env: 3 is not allowed: give a Gymnasium id such as CartPole-v1, or a mapping of id and args"),
         ({"env": {"id": "x", "pixels": "yes"}}, "env.pixels: 'yes' is not allowed: it should be true or false"),
         ({"rl_module": "x"}, "rl_module: 'x' is not allowed: write module:Class"),

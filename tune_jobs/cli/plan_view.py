@@ -27,7 +27,7 @@ def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
     print_facts(console, _plan_facts(spec, plan))
     for note in (*plan.notes, *(plan.packs.notes if plan.packs is not None else ())):
         console.print(f"note: {note}", style="yellow")
-    console.print(_plan_table(plan))
+    console.print(_plan_table(spec, plan))
     hidden = len(plan.trials) - _MAX_TRIALS_SHOWN
     if hidden > 0:
         console.print(f"and {hidden:,} more; --json lists them all")
@@ -96,7 +96,7 @@ def _resources(cpus: float, gpus: float) -> str:
 
 
 def _search_fact(spec: SweepSpec) -> str:
-    if spec.search.type == "random":
+    if not spec.search.has_model:
         return "random draws for each combination of the grids"
     return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
 
@@ -108,11 +108,11 @@ def _confirm_fact(race: Race | None) -> str:
     return f"the {len(race.contenders)} leading settings get more seeds: at most {trials} (confirm: none leaves it out)"
 
 
-def _plan_table(plan: SweepPlan) -> Table:
+def _plan_table(spec: SweepSpec, plan: SweepPlan) -> Table:
     names = searched_names(trial.point for trial in plan.trials)
     engines_differ = len(plan.engines) > 1
     table = make_table("trial", "seed", *names, *(["engine"] if engines_differ else []))
     for trial in plan.trials[:_MAX_TRIALS_SHOWN]:
-        values = [value_text(trial.point, name, none="by tpe") for name in names]
+        values = [value_text(trial.point, name, none=f"by {spec.search.type}") for name in names]
         table.add_row(trial.trial_id, str(trial.seed), *values, *([trial.engine] if engines_differ else []))
     return table

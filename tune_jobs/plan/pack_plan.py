@@ -17,8 +17,8 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 MAX_SLOTS = 64
 """The most trials that one pack trains at once."""
 
-MAX_AT_ONCE_TPE = 4
-"""How many trials run at once with search.type tpe, if there are not more CPUs.
+MAX_AT_ONCE_BY_MODEL = 4
+"""How many trials run at once where a model chooses the points, if there are not more CPUs.
 
 The model learns from trials that have ended; about running trials it knows only that they run. A pack that trains
 dozens at once would begin most points of a sweep before the model has any results, which would be random search. With
@@ -82,8 +82,8 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack]
 def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, int]:
     """Return how many packs and slots CPUs, GPUs and the limits on trials at once allow."""
     limit = math.inf if spec.resources.max_concurrent is None else spec.resources.max_concurrent
-    if spec.search.type == "tpe":
-        limit = min(limit, max(MAX_AT_ONCE_TPE, fitting))
+    if spec.search.has_model:
+        limit = min(limit, max(MAX_AT_ONCE_BY_MODEL, fitting))
     num_packs = max(1, int(min(fitting, num_members, limit)))
     share = math.ceil(num_members / num_packs)
     # Trials run in several rounds of equal size, so that the last ones are not left to one pack.

@@ -24,7 +24,7 @@ def trial_id(index: int) -> str:
 
 def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = ()) -> int:
     """Return the number of a sweep's points, those among them that somebody chose."""
-    drawn = spec.num_samples if spec.search.type == "tpe" else num_points(spec.space, spec.num_samples)
+    drawn = spec.num_samples if spec.search.has_model else num_points(spec.space, spec.num_samples)
     return drawn + len(chosen_points)
 
 

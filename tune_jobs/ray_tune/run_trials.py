@@ -157,7 +157,7 @@ class _Run:
         searched = [name for name in self._job.trial_ids if name not in set(replicas)]
         if searched:
             self._scheduler = self._build_scheduler()
-            if spec.search.type == "tpe":
+            if spec.search.has_model:
                 self._chooser = PointChooser(spec, self._record, self.keeper.all_records, self.keeper.change)
             self._stage(searched, "")
         if replicas and not (searched and self.store.stop_requested()):

@@ -123,7 +123,7 @@ def outside_notes(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord]) -
     for item in chosen_points:
         if names := outside(spec.space, item.point):
             told = ", ".join(f"{name} {short_text(item.point[name])}" for name in names)
-            model = ", but tpe's model can't learn from it" if spec.search.type == "tpe" else ""
+            model = f", but {spec.search.type}'s model can't learn from it" if spec.search.has_model else ""
             domains = domains_text({name: spec.space[name] for name in names})
             notes.append(
                 f"Point {item.num_points} was chosen with {told}, outside of space ({domains}): it is trained{model}."

@@ -5,7 +5,7 @@ A point is known to a method by its values, by what became of each of its seeds,
 - ended: of each seed its best evaluation return, which the selection compares too; None for one that failed or was
   never evaluated with a finite return, which counts as worse than all that was;
 - ended early by a scheduler: the same, and the rung that its first trial reached;
-- running: the scores of those seeds that have ended;
+- running: the scores of those seeds that have ended, which are not like the others: what is solved ends early;
 - planned, but not begun, or chosen by somebody with a value that the search could not give: nothing, as a model has no
   place for it.
 """

@@ -37,7 +37,7 @@ def planned_points(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] =
 
 
 def _drawn_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
-    if spec.search.type == "random":
+    if not spec.search.has_model:
         return list(draw_points(spec.space, spec.num_samples, spec.seed))
     num_random = min(spec.search.num_startup_trials, spec.num_samples)
     known = [draw_point(spec.space, index, spec.seed) for index in range(num_random)]

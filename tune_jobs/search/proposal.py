@@ -53,6 +53,8 @@ class _ByModule:
 
 
 _METHODS: Mapping[str, _ByModule] = {
+    "forest": _ByModule("forest", needs="sklearn", called="scikit-learn", extra="forest"),
+    "gp": _ByModule("gp"),
     "tpe": _ByModule("tpe", needs="optuna", called="Optuna", extra="tpe"),
 }
 

@@ -40,8 +40,8 @@ FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
 def search_problems(spec: SweepFields) -> Found:
     """Return what is wrong with a sweep's search method and scheduler."""
     found: Found = []
-    if spec.search.type == "tpe":
-        found += _tpe_problems(spec)
+    if spec.search.has_model:
+        found += _model_problems(spec)
     if spec.scheduler.type in ("pbt", "hyperband") and spec.resources.max_concurrent is not None:
         text = (
             f"{spec.resources.max_concurrent} cannot be used with scheduler.type {spec.scheduler.type}, which pauses "
@@ -75,7 +75,7 @@ _USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
         "quantile_fraction": ("pbt",),
         "resample_probability": ("pbt",),
     },
-    "search": {"num_startup_trials": ("tpe",)},
+    "search": {"num_startup_trials": ("gp", "forest", "tpe")},
 }
 """The types of search and scheduler that a field is for; `perturb_every_env_steps` is refused without pbt."""
 
@@ -116,7 +116,7 @@ def check_extendable(spec: SweepFields) -> None:
     Raises:
         SpecError: The space has nothing random to draw, and no search method or scheduler chooses values.
     """
-    chosen = spec.search.type != "random" or spec.scheduler.type == "pbt"
+    chosen = spec.search.has_model or spec.scheduler.type == "pbt"
     if not chosen and not any(domain.is_random for domain in spec.space.values()):
         why = "its space has only grids" if spec.space else "it has no space"
         raise SpecError(
@@ -158,22 +158,24 @@ def check_takes_points(spec: SweepFields) -> None:
         )
 
 
-def _tpe_problems(spec: SweepFields) -> Found:
+def _model_problems(spec: SweepFields) -> Found:
+    method = spec.search.type
     if is_baseline(spec):
-        return [("search.type", f"tpe needs an algorithm that learns, and {spec.algorithm} does not: use random")]
+        return [("search.type", f"{method} needs an algorithm that learns, and {spec.algorithm} does not: use random")]
     found: Found = []
     if not spec.space:
-        found.append(("search.type", "tpe has nothing to search: space is empty"))
+        found.append(("search.type", f"{method} has nothing to search: space is empty"))
     if spec.scheduler.type in ("pbt", "hyperband"):
         why = {
-            "pbt": "pbt changes the values that tpe would learn from: use search.type random",
-            "hyperband": "hyperband waits for whole groups of trials, tpe starts one after another: use asha",
+            "pbt": f"pbt changes the values that {method} would learn from: use search.type random",
+            "hyperband": f"hyperband waits for whole groups of trials, {method} starts one after another: use asha",
         }
-        found.append(("search.type", f"tpe cannot be used with scheduler.type {why[spec.scheduler.type]}"))
+        found.append(("search.type", f"{method} cannot be used with scheduler.type {why[spec.scheduler.type]}"))
     if spec.space and spec.num_samples <= spec.search.num_startup_trials:
         text = (
             f"{spec.num_samples} is not more than search.num_startup_trials, {spec.search.num_startup_trials}: all "
-            "points would be random. With tpe, num_samples is the number of points, and grids are lists to choose from"
+            f"points would be random. With {method}, num_samples is the number of points, and grids are lists to "
+            "choose from"
         )
         found.append(("num_samples", text))
     return found

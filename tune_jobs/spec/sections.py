@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -23,6 +24,9 @@ from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import ENGINES
 from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
+SearchType = Literal["random", "auto", "gp", "forest", "tpe"]
+AUTO_SEARCH: SearchType = "gp"
+"""What `search: auto` is: the method that found the best points in decision 40, and needs nothing to be installed."""
 SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
 
 _RETURN = {"return": "final"}
@@ -103,14 +107,23 @@ class StopSpec(Section):
 class SearchSpec(Section):
     """How the points of the space are chosen."""
 
-    type: Literal["random", "tpe"] = Field(
+    type: Annotated[SearchType, AfterValidator(lambda given: AUTO_SEARCH if given == "auto" else given)] = Field(
         "random",
-        description="random: independent draws, and every combination of grids; tpe: a model of the finished trials "
-        "proposes the next points (Bergstra et al. 2011; install tune-jobs[tpe]).",
+        description="random: independent draws, and every combination of grids. The others have a model of the "
+        "finished trials, which proposes the next points: gp (a Gaussian process), forest (a random forest, as SMAC's; "
+        "install tune-jobs[forest]), tpe (Bergstra et al. 2011; install tune-jobs[tpe]); auto: the best of them, "
+        f"{AUTO_SEARCH}.",
     )
     num_startup_trials: PositiveWhole = Field(
-        10, description="tpe: how many points have to end before the model proposes points; until then they are random."
+        10,
+        description="gp, forest, tpe: how many points have to end before the model proposes points; until then they "
+        "are random.",
     )
+
+    @property
+    def has_model(self) -> bool:
+        """Whether the points of trials that have not begun depend on those that have ended."""
+        return self.type != "random"
 
 
 class SchedulerSpec(Section):
@@ -273,13 +286,13 @@ class SweepFields(Section):
     hyperparams: dict[str, Any] = Field(default_factory=dict, description="Fixed hyperparameters.")
     space: dict[str, Domain] = Field(default_factory=dict, description="Searched hyperparameters.")
     num_samples: PositiveWhole = Field(
-        1, description="Random draws for each combination of the grids' values; with tpe: points."
+        1, description="Random draws for each combination of the grids' values; with a search by a model: points."
     )
     seeds_per_point: PositiveWhole = Field(1, description="Trials per point, each with its own seed.")
     seed: Annotated[WholeNumber, Field(ge=0)] = Field(0, description="Sweep seed: fixes points and all other seeds.")
     stop: StopSpec = Field(default_factory=StopSpec, description="When a trial ends.")
     search: Annotated[SearchSpec, _from_text("type")] = Field(
-        default_factory=SearchSpec, description="Search method: random or tpe, or a mapping."
+        default_factory=SearchSpec, description="Search method: random, auto, gp, forest or tpe, or a mapping."
     )
     scheduler: Annotated[SchedulerSpec, _from_text("type")] = Field(
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."

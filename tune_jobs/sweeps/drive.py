@@ -293,7 +293,7 @@ def most_at_once(store: Sweep, now: int, *, num_trials: int) -> int:
     """
     spec = stored_spec(store.read_record())
     # What a search proposes depends on how many trials run at once.
-    return now if spec.search.type == "tpe" else spec.resources.max_concurrent or num_trials
+    return now if spec.search.has_model else spec.resources.max_concurrent or num_trials
 
 
 def packs_for_more_nodes(store: Sweep, packs: PackPlan | None) -> int:
@@ -304,7 +304,7 @@ def packs_for_more_nodes(store: Sweep, packs: PackPlan | None) -> int:
         packs: The packs that the present nodes hold; None: there are none.
     """
     spec = stored_spec(store.read_record())
-    if packs is None or spec.search.type == "tpe":
+    if packs is None or spec.search.has_model:
         return 0
     at_once = packs.num_packs * packs.slots
     needed = math.ceil(max(0, len(packs.trial_ids) - at_once) / packs.slots)

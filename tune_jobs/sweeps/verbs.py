@@ -300,7 +300,7 @@ def inject(
     Args:
         sweep: Name or folder.
         point: A value for each searched hyperparameter, by its name. A value outside of its domain is trained too, if
-            the algorithm takes it; tpe's model learns nothing from such a point, and a note says so.
+            the algorithm takes it; a search by a model learns nothing from such a point, and a note says so.
         storage: Folder for sweeps.
         address: Ray cluster to run on.
         finish: The same as for `launch`.

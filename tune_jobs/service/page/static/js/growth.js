@@ -1,9 +1,9 @@
 // How many trials come of what is asked for, as the service counts them.
 import { counted } from "./format.js";
 
-// Points of one more sample: a draw for each combination of the grids; TPE draws from those too.
+// Points of one more sample: a draw for each combination of the grids; models propose from those too.
 function pointsPerSample(spec) {
-  if (spec.search?.type === "tpe") return 1;
+  if ((spec.search?.type ?? "random") !== "random") return 1;
   return Object.values(spec.space ?? {}).reduce((product, domain) => product * (domain.grid?.length ?? 1), 1);
 }
 

@@ -1,4 +1,4 @@
-"""TPE on trials that take no time: the score is a function of the point."""
+"""The search methods that have a model, on trials that take no time: the score is a function of the point."""
 
 import builtins
 import importlib.util
@@ -22,13 +22,16 @@ from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 
-pytest.importorskip("optuna")
-
+METHODS = [
+    pytest.param(method, marks=pytest.mark.skipif(importlib.util.find_spec(needs) is None, reason=f"needs {needs}"))
+    for method, needs in (("gp", "scipy"), ("forest", "sklearn"), ("tpe", "optuna"))
+]
+each_method = pytest.mark.parametrize("method", METHODS)
 SPACE = {"lr": {"loguniform": [1e-5, 1e-1]}, "activation": {"choice": ["tanh", "relu", "silu"]}}
 
 
-def make_spec(num_samples: int = 40, startup: int = 8, **changes: Any) -> SweepSpec:
-    search = {"type": "tpe", "num_startup_trials": startup}
+def make_spec(num_samples: int = 40, startup: int = 8, method: str = "tpe", **changes: Any) -> SweepSpec:
+    search = {"type": method, "num_startup_trials": startup}
     base = {"env": "CartPole-v1", "algorithm": "ppo", "space": SPACE, "num_samples": num_samples, "search": search}
     return load_spec({**base, **changes})
 
@@ -67,11 +70,12 @@ def search(spec: SweepSpec, score: Callable[[dict[str, Any]], float], *, at_once
     return [item.point for item in records]
 
 
+@each_method
 @pytest.mark.parametrize("at_once", [1, 4])
-def test_later_points_concentrate_where_scores_are_better_than_those_of_random_ones(at_once: int) -> None:
+def test_later_points_concentrate_where_scores_are_better_than_those_of_random_ones(method: str, at_once: int) -> None:
     gains, silu = [], []
     for seed in range(3):
-        spec = make_spec(seed=seed)
+        spec = make_spec(seed=seed, method=method)
         points = search(spec, valley, at_once=at_once)[20:]
         random = [draw_point(spec.space, index, spec.seed) for index in range(20, 40)]
         gains.append(np.mean([valley(p) for p in points]) - np.mean([valley(p) for p in random]))
@@ -81,39 +85,43 @@ def test_later_points_concentrate_where_scores_are_better_than_those_of_random_o
     assert np.mean(silu) > 0.55
 
 
-def test_points_are_the_planned_random_ones_until_enough_have_ended() -> None:
-    spec = make_spec(startup=8)
+@each_method
+def test_points_are_the_planned_random_ones_until_enough_have_ended(method: str) -> None:
+    spec = make_spec(method=method, startup=8)
     points = search(spec, valley)
     plan = make_plan(spec, Machine(num_cpus=2))
     assert points[:8] == [trial.point for trial in plan.trials[:8]]
     assert points[8] != draw_point(spec.space, 8, spec.seed)
 
 
-def test_the_same_records_give_the_same_point_whatever_ran_before() -> None:
-    spec = make_spec()
+@each_method
+def test_the_same_records_give_the_same_point_whatever_ran_before(method: str) -> None:
+    spec = make_spec(method=method)
     points = search(spec, valley)[:12]
     records = [record(index, point, valley(point)) for index, point in enumerate(points)]
     again = [TrialRecord.model_validate(json.loads(item.model_dump_json())) for item in records]
     first = propose_point(spec, records, 12, lambda point: None)
     assert propose_point(spec, again, 12, lambda point: None) == first
-    assert propose_point(make_spec(seed=1), records, 12, lambda point: None) != first
+    assert propose_point(make_spec(method=method, seed=1), records, 12, lambda point: None) != first
     assert propose_point(spec, records, 13, lambda point: None) != first
 
 
-def test_trials_that_run_at_the_same_time_are_kept_apart() -> None:
-    spec = make_spec(startup=4, space={"lr": SPACE["lr"]})
+@each_method
+def test_trials_that_run_at_the_same_time_are_kept_apart(method: str) -> None:
+    spec = make_spec(method=method, startup=4, space={"lr": SPACE["lr"]})
     ended = [record(index, {"lr": lr}, valley({"lr": lr, "activation": "silu"})) for index, lr in enumerate(
         [1e-5, 1e-4, 9e-4, 1e-3, 1.1e-3, 1e-2, 1e-1])]  # fmt: skip
     alone = [propose_point(spec, ended, 7 + k, lambda point: None)["lr"] for k in range(12)]
     running = [record(7 + k, {"lr": 1e-3 * (1 + k / 50)}, status="running") for k in range(6)]
     beside = [propose_point(spec, ended + running, 13 + k, lambda point: None)["lr"] for k in range(12)]
 
-    def near(values: Sequence[float]) -> np.float64:
-        return cast("np.float64", np.mean(np.abs(np.log10(values) + 3) < 0.1))
+    def far(values: Sequence[float]) -> np.float64:
+        return cast("np.float64", np.mean(np.abs(np.log10(values) + 3)))
 
-    assert near(beside) < near(alone)
+    assert far(beside) > 1.3 * far(alone)
 
 
+@each_method
 @pytest.mark.parametrize(
     "bad",
     [
@@ -123,8 +131,8 @@ def test_trials_that_run_at_the_same_time_are_kept_apart() -> None:
         {"status": "stopped", "score": -50.0, "steps": 20_000},
     ],
 )
-def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad: dict[str, Any]) -> None:
-    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
+def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(method: str, bad: dict[str, Any]) -> None:
+    spec = make_spec(method=method, startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
     grid = np.linspace(0.02, 0.98, 24)
     records = [
         record(index, {"lr": lr}, **({"score": 1.0} if lr < 0.5 else bad)) for index, lr in enumerate(map(float, grid))
@@ -133,8 +141,11 @@ def test_points_that_failed_were_not_scored_or_were_ended_early_are_avoided(bad:
     assert np.mean(np.array(proposed) < 0.5) > 0.8
 
 
-def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_steps_within_a_rung_do_not_matter() -> None:
-    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
+@each_method
+def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_steps_within_a_rung_do_not_matter(
+    method: str,
+) -> None:
+    spec = make_spec(method=method, startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, scheduler="asha")
 
     def proposed(left: dict[str, Any], right: dict[str, Any]) -> np.float64:
         records = [
@@ -150,8 +161,9 @@ def test_of_trials_ended_early_those_that_got_a_rung_further_are_better_and_step
     assert proposed({"score": 9.0, "steps": 10_000}, {"score": 1.0, "steps": 10_400}) > 0.8
 
 
-def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended() -> None:
-    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, seeds_per_point=2)
+@each_method
+def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended(method: str) -> None:
+    spec = make_spec(method=method, startup=4, space={"lr": {"uniform": [0.001, 1.0]}}, seeds_per_point=2)
 
     def proposed(other_seed: dict[str, Any]) -> np.float64:
         records = []
@@ -166,13 +178,18 @@ def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended() -> 
             np.mean([propose_point(spec, records, 24 + k, lambda point: None)["lr"] < 0.5 for k in range(20)]),
         )
 
-    assert proposed({"score": -9.0}) > 0.8  # mean -2
-    assert proposed({"score": 5.0}) < 0.2
-    assert proposed({"score": None, "status": "failed"}) > 0.8
-    assert proposed({"score": 99.0, "status": "running"}) > 0.8
+    most = 0.65 if method == "forest" else 0.8  # the forest draws a fifth
+    assert proposed({"score": -9.0}) > most  # mean -2
+    assert proposed({"score": 5.0}) < 1 - most
+    assert proposed({"score": None, "status": "failed"}) > most
+    # A model may look where nothing has ended, but not because of seeds that ended before their point.
+    running = proposed({"score": 99.0, "status": "running"})
+    assert running == proposed({"score": -99.0, "status": "running"})
+    assert method != "tpe" or running > 0.8
 
 
-def test_every_kind_of_domain_keeps_its_bounds_steps_and_types() -> None:
+@each_method
+def test_every_kind_of_domain_keeps_its_bounds_steps_and_types(method: str) -> None:
     space = {
         "lr": {"qloguniform": [0.01, 0.5, 0.01]},
         "gamma": {"quniform": [0.9, 0.99, 0.03]},
@@ -184,7 +201,7 @@ def test_every_kind_of_domain_keeps_its_bounds_steps_and_types() -> None:
         "hidden_sizes": {"grid": [[8], [16, 16]]},
         "vf_share_layers": {"choice": [True, False]},
     }
-    spec = make_spec(num_samples=30, startup=4, space=space)
+    spec = make_spec(method=method, num_samples=30, startup=4, space=space)
     points = search(spec, lambda point: -point["lr"] + point["num_epochs"])
     seen = {name: [point[name] for point in points] for name in space}
     assert set(map(json.dumps, seen["hidden_sizes"])) <= {"[8]", "[16, 16]"}
@@ -201,8 +218,9 @@ def test_every_kind_of_domain_keeps_its_bounds_steps_and_types() -> None:
         assert not any(isinstance(value, np.generic) for value in point.values())
 
 
-def test_a_proposal_whose_values_do_not_go_together_is_replaced() -> None:
-    spec = make_spec(startup=4, space={"lr": {"uniform": [0.001, 1.0]}})
+@each_method
+def test_a_proposal_whose_values_do_not_go_together_is_replaced(method: str) -> None:
+    spec = make_spec(method=method, startup=4, space={"lr": {"uniform": [0.001, 1.0]}})
     records = [record(index, {"lr": lr}, lr) for index, lr in enumerate([0.1, 0.3, 0.5, 0.7, 0.9])]
     asked = []
 
@@ -236,6 +254,7 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.Monkey
         make_plan(make_spec(), Machine(num_cpus=2))
     assert "tune-jobs[tpe]" in caught.value.hint
     make_plan(make_spec(search={"type": "random"}), Machine(num_cpus=2))
+    make_plan(make_spec(search={"type": "auto"}), Machine(num_cpus=2))
 
 
 def test_the_model_learns_from_the_score_that_the_selection_goes_by() -> None:

@@ -1,0 +1,71 @@
+"""Propose points by a Gaussian process of noisy scores, and expected improvement.
+
+What it costs does not grow with the number of points: the settings of the process are found anew only when their number
+has grown by a tenth, from the first points alone, so that the same points give the same settings whatever was asked
+before; and the process itself is given the best of them, the newest, and some of the others.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from policies import random_streams
+from tune_jobs.search.asking import Check, Question
+from tune_jobs.search.candidates import best_point
+from tune_jobs.search.coordinates import Cube
+from tune_jobs.search.gaussian_process import Observed, Posterior, Settings, fit
+from tune_jobs.search.history import KnownPoint
+from tune_jobs.search.improvement import log_expected_improvement
+from tune_jobs.search.warped import observed
+
+Floats = NDArray[np.float64]
+_MOST_FITTED, _MOST_GIVEN = 120, 240
+"""The most points that settings are found by, and that the process is given."""
+
+
+def propose(question: Question, check: Check) -> dict[str, Any]:
+    """Answer by a Gaussian process; see `tune_jobs.search.asking.Method`.
+
+    Raises:
+        SpecError: None of many points is valid.
+    """
+    cube = Cube(question.space)
+    rng = random_streams.model_draws(question.seed, question.index)
+    settings = _settings(cube, question.known)
+    seen, units = observed(cube, question.known, _MOST_GIVEN)
+    awaited = cube.units([point.point for point in question.known if point.is_running])
+    posterior = Posterior(settings, cube.group_of_column, seen, cube.columns(awaited))
+    # What runs is expected to be as good as the model says: to be equal to it is no improvement.
+    expected = posterior.mean_at_given()
+    best = float(expected.max())
+    near = np.concatenate([units, awaited])[np.argsort(-expected, kind="stable")[:10]]
+
+    def promise(columns: Floats) -> Floats:
+        return log_expected_improvement(*posterior.at(columns), best)
+
+    tried = [point.point for point in question.known]
+    return best_point(cube, promise, near, tried=tried, rng=rng, check=check)
+
+
+def _settings(cube: Cube, known: Sequence[KnownPoint]) -> Settings:
+    """Return the settings of the process, of the first points that ended, whose number grows by tenths."""
+    num_ended = sum(not point.is_running for point in known)
+    num_first = num_ended - num_ended % max(1, num_ended // 10)
+    ended = [point for point in known if not point.is_running]
+    first = [point for point in known[:num_first] if not point.is_running]
+    seen, _ = observed(cube, first or ended, _MOST_FITTED)
+    groups = tuple(map(int, cube.group_of_column))
+    return _fitted(seen.columns.tobytes(), seen.means.tobytes(), seen.counts.tobytes(), seen.spread, groups)
+
+
+@functools.lru_cache(maxsize=8)
+def _fitted(columns: bytes, means: bytes, counts: bytes, spread: float, group_of_column: tuple[int, ...]) -> Settings:
+    """Return the settings that `fit` finds; kept, as finding them takes longer than all else."""
+    groups = np.array(group_of_column)
+    at = np.frombuffer(columns).reshape(-1, len(groups))
+    return fit(Observed(at, np.frombuffer(means), np.frombuffer(counts), spread), groups)
