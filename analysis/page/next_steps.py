@@ -120,7 +120,8 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     env = env if isinstance(env, Mapping) else {"id": str(env)}
     env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
     cap = source.sweep.section("stop").get("num_env_steps")
-    changed = [name for name in ("frame_stack", "pixels", "failure_penalty") if env.get(name) not in (None, 1, False)]
+    names = ("frame_stack", "pixels", "action_mask", "failure_penalty")
+    changed = [name for name in names if env.get(name) not in (None, 1, False)]
     note = f" The env's {', '.join(changed)} are left out." if changed else ""
     if spec.get("rl_module"):
         note += " The RLModule of your own is left out."

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from policies.acting.policy import Policy, copy_space
 from policies.envs.make import check_env
+from policies.envs.masks import MaskedBox
+from policies.envs.own_actions import sizes_of
 from policies.errors import SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
 from policies.portable.file import PolicyNetwork, PortablePolicy, action_problem, describe_space
@@ -24,7 +26,7 @@ BASELINES: tuple[str, ...] = ("random", "constant")
 
 
 class ConstantPolicy(Policy):
-    """A policy that repeats one action, whatever it observes.
+    """A policy that repeats one action, whatever it observes; where a mask forbids it, the first that is allowed.
 
     Args:
         observation_space: The env's; only its shape matters.
@@ -70,7 +72,22 @@ class ConstantPolicy(Policy):
         return cls(info.observation_space, info.action_space, action, env_id=info.env_id, env_args=info.env_args)
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
-        return np.repeat(self._action[None], len(observations), axis=0)
+        actions = np.repeat(self._action[None], len(observations), axis=0)
+        if isinstance(self.observation_space, MaskedBox):
+            return self._allowed(actions, observations[:, : self.observation_space.num_masked])
+        return actions
+
+    def _allowed(self, actions: NDArray[Any], masks: NDArray[np.float32]) -> NDArray[Any]:
+        """Return the actions, with the first value that is allowed in place of each that a mask forbids."""
+        space = self.action_space
+        start = int(space.start) if isinstance(space, gym.spaces.Discrete) else 0
+        sizes = sizes_of(space)
+        columns = actions.reshape(len(actions), -1) - start
+        for place, block in enumerate(np.split(masks, np.cumsum(sizes)[:-1], axis=1)):
+            chosen = columns[:, place]
+            is_allowed = np.take_along_axis(block, chosen[:, None], axis=1)[:, 0] > 0
+            columns[:, place] = np.where(is_allowed, chosen, block.argmax(axis=1))
+        return (columns + start).reshape(actions.shape)
 
 
 def baseline_policy(

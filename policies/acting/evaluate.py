@@ -228,7 +228,7 @@ def episode_steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_epis
     while ended_by is None:
         # A copy: an env may write its next observation into the same array.
         observation = np.array(episode.observation)
-        action = policy.act(observation)
+        action = policy.act_on_row(observation)
         if episode.step(action):
             ended_by = "terminated" if episode.has_terminated else "truncated"
         elif episode.length >= max_episode_steps:

@@ -17,6 +17,8 @@ from policies.acting.policy import Action, NetworkPolicy, Policy
 from policies.envs.action_names import action_names
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
+from policies.envs.masks import FORBIDDEN
+from policies.envs.own_actions import Choices
 from policies.envs.rendering import draw_without_display
 from policies.errors import EnvError, said_by
 
@@ -124,6 +126,8 @@ def _actions(env: gym.Env[Any, Any]) -> LiveActions:
     space = env.action_space
     if isinstance(space, gym.spaces.Discrete):
         return LiveActions(int(space.start), action_names(env), None, None)
+    if isinstance(space, Choices):
+        return LiveActions(None, None, _numbers(np.zeros(len(space.sizes))), _numbers(space.nvec - 1))
     box = cast("gym.spaces.Box", space)
     return LiveActions(None, None, _numbers(box.low), _numbers(box.high))
 
@@ -180,9 +184,13 @@ def _plain(action: Action | None) -> int | list[float | None] | None:
 def _scores(policy: Policy, observation: Any) -> tuple[list[float | None] | None, ScoreKind | None]:
     if observation is None or not isinstance(policy, NetworkPolicy):
         return None, None
+    if isinstance(policy.action_space, Choices):
+        # Which of the probabilities are of which choice is more than a row of numbers tells.
+        return None, None
     output = policy.outputs(np.asarray(observation, dtype=np.float32)[None])[0].astype(np.float64)
     if output.size > 2 * MAX_SHOWN:
         return None, None
+    output[output <= FORBIDDEN] = -np.inf
     network = policy.portable.network
     if network.kind == "categorical":
         powers = np.exp(output - output.max())

@@ -14,6 +14,7 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 
 from policies.acting.policy import WeightsPolicy
+from policies.envs.own_actions import Choices
 from policies.errors import CheckpointError
 from policies.networks.rl_modules import import_module_class
 from policies.portable.file import ModuleWeights, PortablePolicy
@@ -70,6 +71,8 @@ class ModulePolicy(WeightsPolicy):
             actions = np.concatenate([self._greedy(batch[index : index + 1]) for index in range(len(batch))])
         if isinstance(self.action_space, gym.spaces.Discrete):
             return actions + int(self.action_space.start)
+        if isinstance(self.action_space, Choices):
+            return actions.astype(np.int64)
         return self._to_actions(actions)
 
     def _greedy(self, observation: torch.Tensor) -> NDArray[Any]:

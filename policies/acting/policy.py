@@ -1,8 +1,9 @@
 """Policies that act, computed by NumPy alone: a network read from a portable file, or a random policy.
 
 `Policy.act` takes one observation, shape (n,) or (height, width, channels), and gives one action ready for `env.step`,
-or takes a batch, shape (num, ...), and gives a batch of actions. Acting is greedy. The actions are those that RLlib
-sends to the env: shifted by the start of a Discrete space, and for Box actions transformed as the policy file says:
+or takes a batch, shape (num, ...), and gives a batch of actions. Acting is greedy, among the actions that a mask
+allows if the environment has one. The actions are in the environment's own form (`policies.envs.own_actions`), shifted
+by the start of a Discrete space, and for Box actions transformed as the policy file says:
 
 * `unsquash`: the network's [-1, 1] is stretched over the bounds and clipped to them; all of them are finite.
 * `by_component`: the same for components with two bounds; the others are clipped to the bound that they have.
@@ -12,6 +13,7 @@ sends to the env: shifted by the start of a Discrete space, and for Box actions 
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -26,6 +28,8 @@ from policies import random_streams
 from policies.envs.action_bounds import ToBounds
 from policies.envs.flat import FlatBox
 from policies.envs.make import check_env
+from policies.envs.masks import FORBIDDEN, MaskedBox, draw_allowed, num_masked
+from policies.envs.own_actions import Choices, is_made, own_actions
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
     ActionTransform,
@@ -35,8 +39,9 @@ from policies.portable.file import (
 )
 from policies.portable.forward import ForwardPass
 
-ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
+ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any] | Choices
 Action = int | NDArray[Any]
+"""What `act_on_rows` gives for a row."""
 
 
 NON_FINITE_HINT = "Lower the learning rate, or set grad_clip; scale rewards and observations down if they are large."
@@ -68,29 +73,41 @@ class Policy(ABC):
         self.env_args = dict(env_args or {})
         self.description = description
 
-    def act(self, observations: Any) -> Action:
+    def act(self, observations: Any, mask: Any = None) -> Any:
         """Return the greedy action for one observation, or for each observation of a batch.
 
         Args:
             observations: Shape: that of one observation, or (num, *that shape). Where observations were made vectors
                 (`policies.envs.flat`), also what the environment itself gives: a dict, a tuple, a choice.
+            mask: Which actions are allowed: zeros and ones, one for each value of each choice, or a batch of such. It
+                is needed where the environment says it in its infos or by a method; one that is a member of the
+                observations is read there.
 
         Returns:
-            For one observation, what `env.step` takes: an int (Discrete) or an array of shape (action_dim,)
-            (Box). For a batch, an array of shape (num,) or (num, action_dim).
+            For one observation, what `env.step` takes: an int (Discrete), an array (Box, MultiDiscrete, MultiBinary),
+            or a dict or tuple of these. For a batch, an array of shape (num,) or (num, *shape of an action), or a list
+            of dicts or tuples.
 
         Raises:
-            ObservationError: The observations have another shape, or are not numbers.
+            ObservationError: The observations have another shape, or are not numbers; there is no mask where one is
+                needed, one that is none, or one that a policy trained without masks can't use.
         """
-        shape = self.observation_space.shape or ()
+        space = self.observation_space
+        shape = space.shape or ()
         try:
-            if isinstance(self.observation_space, FlatBox):
-                observations = self.observation_space.flat_or_own(observations)
+            if isinstance(space, MaskedBox):
+                observations = space.joined_or_own(observations, mask)
+            elif mask is not None:
+                raise ValueError("there is a mask, but it was trained without one")  # noqa: TRY301 (as the others)
+            elif isinstance(space, FlatBox):
+                observations = space.flat_or_own(observations)
             batch = np.asarray(observations, dtype=np.float32)
         except (TypeError, ValueError) as error:
+            hint = "Pass what env.reset or env.step returned"
+            if isinstance(space, MaskedBox) and space.key is None:
+                hint += ', and mask=info["action_mask"], or what the environment calls it'
             raise ObservationError(
-                f"Observations of {self.env_id} must be {self._wanted()}: {error}.",
-                "Pass what env.reset or env.step returned.",
+                f"Observations of {self.env_id} must be {self._wanted()}: {error}.", f"{hint}."
             ) from error
         single = batch.ndim == len(shape)
         if batch.shape[-len(shape) :] != shape or batch.ndim > len(shape) + 1:
@@ -101,10 +118,17 @@ class Policy(ABC):
             )
         actions = self._act_batch(batch[None] if single else batch)
         if not single:
-            return actions
-        return (
-            int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", actions[0])
-        )
+            return own_actions(self.action_space, actions)
+        if is_made(self.action_space):
+            return self.action_space.own(actions[0])
+        return int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else actions[0]
+
+    def act_on_row(self, observation: NDArray[Any]) -> Action:
+        """Return the greedy action for one vector or image, as environments of `policies.envs.make` take it."""
+        if type(self).act is not Policy.act or type(self).act_on_rows is not Policy.act_on_rows:
+            return cast("Action", self.act(observation))
+        (action,) = self._act_batch(np.asarray(observation, dtype=np.float32)[None])
+        return int(action) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", action)
 
     def act_on_rows(self, observations: NDArray[Any]) -> NDArray[Any]:
         """Return the greedy actions, shape (num,) or (num, action_dim), for vectors or images of shape (num, ...)."""
@@ -114,8 +138,12 @@ class Policy(ABC):
         return self._act_batch(np.asarray(observations, dtype=np.float32))
 
     def _wanted(self) -> str:
-        numbers = f"numbers of shape {self.observation_space.shape}"
         space = self.observation_space
+        if isinstance(space, MaskedBox):
+            beside = "" if space.key is not None else "with a mask, "
+            own = "" if space.original is None else f"of {space.original} {beside}".rstrip(", ") + ", or "
+            return f"{own}{space.num_masked} zeros and ones and then numbers of shape {space.seen.shape}"
+        numbers = f"numbers of shape {space.shape}"
         return f"of {space.original}, or {numbers}" if isinstance(space, FlatBox) else numbers
 
     def check_finite(self) -> None:  # noqa: B027 (a baseline has no weights)
@@ -169,24 +197,30 @@ class NetworkPolicy(WeightsPolicy):
     def __init__(self, portable: PortablePolicy, description: str | None = None) -> None:
         super().__init__(portable, description)
         self._forward = ForwardPass(portable.network)
+        self._num_masked = num_masked(self.observation_space)
 
     def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
         """Return the network's raw output: logits, means and log standard deviations, Q-values, or advantages.
 
         Args:
-            observations: Shape (num, n), or (num, height, width, channels).
+            observations: Shape (num, n), or (num, height, width, channels), with their masks if there are some.
 
         Returns:
-            Shape (num, num_outputs).
+            Shape (num, num_outputs); `FORBIDDEN` where a mask forbids the action.
         """
-        return self._forward(np.asarray(observations, dtype=np.float32))
+        rows = np.asarray(observations, dtype=np.float32)
+        if not self._num_masked:
+            return self._forward(rows)
+        # One piece of memory: what a row gives may not depend on how it lies there.
+        outputs = self._forward(np.ascontiguousarray(rows[:, self._num_masked :]))
+        return np.where(rows[:, : self._num_masked] > 0, outputs, np.float32(FORBIDDEN))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         return self._to_actions(self.outputs(observations))
 
 
 class RandomPolicy(Policy):
-    """Draws actions uniformly from the action space, as `action_space.sample()` does.
+    """Draws actions uniformly from the action space, or from what a mask allows, as `action_space.sample()` does.
 
     Args:
         observation_space: The env's; only its shape matters.
@@ -225,12 +259,18 @@ class RandomPolicy(Policy):
         self.action_space.seed(random_streams.random_actions_seed(seed))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:
-        actions = [self.action_space.sample() for _ in range(len(observations))]
+        space, observed = self.action_space, self.observation_space
+        if isinstance(observed, MaskedBox):
+            actions = [draw_allowed(space, row[: observed.num_masked], observed.sizes) for row in observations]
+        else:
+            actions = [space.sample() for _ in range(len(observations))]
         return np.array(actions).reshape(len(observations), *(self.action_space.shape or ()))
 
 
 def copy_space(space: gym.Space[Any]) -> ActionSpace:
     """Return a copy of a space, with a random generator of its own."""
+    if is_made(space):
+        return type(space)(space.original)
     if isinstance(space, gym.spaces.Box):
         return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
     if isinstance(space, gym.spaces.Discrete):
@@ -264,6 +304,8 @@ def action_function(
     if isinstance(action_space, gym.spaces.Discrete):
         start = int(action_space.start)
         return lambda outputs: np.argmax(outputs, axis=1) + start
+    if isinstance(action_space, Choices):
+        return functools.partial(largest_of_each, sizes=action_space.sizes)
     low, high, dtype = action_space.low, action_space.high, action_space.dtype
     size = math.prod(action_space.shape)
     transform = portable.action_transform
@@ -273,6 +315,12 @@ def action_function(
     if transform == "none":
         return lambda outputs: outputs[:, :size].astype(dtype)
     return lambda outputs: np.clip(outputs[:, :size], low, high).astype(dtype)
+
+
+def largest_of_each(outputs: NDArray[Any], sizes: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return the place of each choice's largest output, (..., choices), of outputs of shape (..., sum of sizes)."""
+    blocks = np.split(outputs, np.cumsum(sizes)[:-1], axis=-1)
+    return np.stack([block.argmax(axis=-1) for block in blocks], axis=-1)
 
 
 def action_transform(action_space: gym.Space[Any]) -> ActionTransform:

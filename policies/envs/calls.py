@@ -148,7 +148,7 @@ def watch_env(env: _Watched) -> _Watched:
 
 def watch_policy(policy: _Watched) -> _Watched:
     """Have a policy write its calls to the page, if this process is watched."""
-    return _watch(policy, {"act": Call.ACT})
+    return _watch(policy, {"act": Call.ACT, "act_on_row": Call.ACT})
 
 
 def _watch(thing: _Watched, methods: dict[str, Call]) -> _Watched:

@@ -17,6 +17,7 @@ import numpy as np
 from policies.envs.checked import is_sound, reward_as_number
 from policies.envs.faults import env_failed
 from policies.envs.flat import FlatBox, needs_flattening
+from policies.envs.masks import sample
 from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
@@ -29,8 +30,8 @@ _RESET_HINT = (
 )
 
 
-def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> None:
-    """Reset an environment, step it once with some action, and check what it returns.
+def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Reset an environment, step it once with some action, check what it returns, and return the first infos.
 
     Args:
         env: The environment.
@@ -42,20 +43,19 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
         EnvError: It returned something other than it should.
     """
     name = f"The environment {env_id!r}" + (f" with arguments {dict(env_args)!r}" if env_args else "")
-    _check_call(
+    observation, infos = _check_call(
         env, "reset", lambda: env.reset(seed=0),
         find_problem=_reset_problem, complaint=f"{name} cannot be reset", hint=_RESET_HINT,
     )  # fmt: skip
     space = copy.deepcopy(env.action_space)  # the env may draw from its own
     space.seed(0)
-    action = space.sample()
-    # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
-    action = action.item() if isinstance(action, np.generic) else action
+    action = sample(env, space, observation)
     _check_call(
         env, "step", lambda: env.step(action),
         find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {action!r} after a reset",
         hint=_STEP_HINT,
     )  # fmt: skip
+    return dict(infos)
 
 
 def _check_call(
@@ -66,11 +66,18 @@ def _check_call(
     find_problem: Callable[[Any, gym.Space[Any]], str | None],
     complaint: str,
     hint: str,
-) -> None:
+) -> Any:
+    """Call a method of an environment, check what it returns, and return it.
+
+    Raises:
+        EnvFailedError: The env raised an error.
+        EnvError: It returned something other than it should.
+    """
     env_id = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
     with _returned_by(env.unwrapped, method) as inner:
         try:
-            problem = find_problem(call(), env.observation_space)
+            returned = call()
+            problem = find_problem(returned, env.observation_space)
         except BaseException as error:  # an env may raise anything
             # The error may be a wrapper's, caused by what the env returned.
             problem = find_problem(inner[-1], env.unwrapped.observation_space) if inner else None
@@ -78,6 +85,7 @@ def _check_call(
                 raise env_failed(complaint, error, f"Check the env's arguments, or mend its {method}().") from error
     if problem is not None:
         raise EnvError(f"{method}() of {env_id} returns {problem}.", hint)
+    return returned
 
 
 @contextlib.contextmanager

@@ -181,27 +181,28 @@ def is_flattened(env: gym.Env[Any, Any]) -> bool:
     return False
 
 
-def _leaves(space: gym.Space[Any], keys: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], gym.Space[Any]]]:
+def leaves(space: gym.Space[Any], keys: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], gym.Space[Any]]]:
+    """Yield the members of a space that have none themselves, each with the keys that lead to it."""
     if isinstance(space, gym.spaces.Dict):
         for key, inner in space.spaces.items():
-            yield from _leaves(inner, (*keys, key))
+            yield from leaves(inner, (*keys, key))
     elif isinstance(space, gym.spaces.Tuple):
         for index, inner in enumerate(space.spaces):
-            yield from _leaves(inner, (*keys, index))
+            yield from leaves(inner, (*keys, index))
     else:
         yield keys, space
 
 
 def _parts_of(space: gym.Space[Any]) -> tuple[_Part, ...]:
     parts, end = list[_Part](), 0
-    for keys, leaf in _leaves(space, ()):
+    for keys, leaf in leaves(space, ()):
         sizes, lowest = np.zeros(0, np.int64), np.zeros(0, np.int64)
         if isinstance(leaf, gym.spaces.Discrete):
             sizes, lowest = np.array([leaf.n], np.int64), np.array([leaf.start], np.int64)
         elif isinstance(leaf, gym.spaces.MultiDiscrete):
             sizes, lowest = (values.ravel().astype(np.int64) for values in (leaf.nvec, leaf.start))
         elif not isinstance(leaf, gym.spaces.Box | gym.spaces.MultiBinary):
-            raise UnsupportedMemberError(_named(keys), leaf)
+            raise UnsupportedMemberError(named(keys), leaf)
         size = int(sizes.sum()) if sizes.size else math.prod(leaf.shape or ())
         parts.append(_Part(keys, leaf, end, end := end + size, sizes, lowest, np.cumsum(sizes) - sizes))
     return tuple(parts)
@@ -216,8 +217,9 @@ def _shape_and_dtype(original: gym.Space[Any], total: int) -> tuple[tuple[int, .
     return (total,), np.float32
 
 
-def _named(keys: tuple[Any, ...]) -> str:
-    return "observation" + "".join(f"[{key!r}]" for key in keys)
+def named(keys: tuple[Any, ...], what: str = "observation") -> str:
+    """Return how messages name a member: `observation['a'][0]`."""
+    return what + "".join(f"[{key!r}]" for key in keys)
 
 
 def _member(observation: Any, keys: tuple[Any, ...]) -> Any:
@@ -233,7 +235,7 @@ def _member(observation: Any, keys: tuple[Any, ...]) -> Any:
         except (KeyError, IndexError, TypeError):
             kind = "tuple" if isinstance(key, int) else "dict"
             what = f"with no member {key!r}" if isinstance(value, Mapping | tuple | list) else f"that is no {kind}"
-            raise ValueError(f"{shortened(value)} as {_named(keys[:depth])}, {what}") from None
+            raise ValueError(f"{shortened(value)} as {named(keys[:depth])}, {what}") from None
     return value
 
 
@@ -244,7 +246,7 @@ def _write(numbers: NDArray[np.float32], part: _Part, value: Any) -> None:
         ValueError: The value is not of its space.
     """
     if problem := _written(numbers, part, value):
-        raise ValueError(f"{shortened(value)} as {_named(part.keys)}, {problem}")
+        raise ValueError(f"{shortened(value)} as {named(part.keys)}, {problem}")
 
 
 def _written(numbers: NDArray[np.float32], part: _Part, value: Any) -> str:

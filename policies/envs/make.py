@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -28,8 +28,17 @@ from policies.envs.faults import close_env, is_of_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, UnsupportedMemberError, flattened, is_flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
+from policies.envs.masks import ACTION_MASK, masks_actions
+from policies.envs.own_actions import (
+    Choices,
+    UnsupportedActionsError,
+    is_taken,
+    made_of,
+    sizes_of,
+    takes_own_actions,
+)
 from policies.envs.rendering import draw_without_display
-from policies.envs.space_hints import action_hint, observation_hint
+from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.wrappers import FailurePenalty, ObservationWrappers
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
@@ -85,6 +94,10 @@ class EnvInfo:
     """Whether `make_vector_env` uses the env's own vectorised version."""
     failure: FailureRule | None = None
     """The rule by which its episodes end by failure; None if they never do, or it is not known."""
+    mask: str | None = None
+    """Where its mask of actions comes from, in words; None if it has none, or none that is used."""
+    unused_mask: str | None = None
+    """The name of an info that looks like a mask of actions, which is not used."""
 
     @property
     def observes_images(self) -> bool:
@@ -109,6 +122,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         env_id, spec = find_env(env_id)
         kwargs = dict(env_args or {})
         wrappers = ObservationWrappers.take_from(kwargs)
+        mask = masks_actions(env)
         info = EnvInfo(
             env_id=env_id,
             env_args=copy.deepcopy(dict(env_args or {})),
@@ -116,16 +130,24 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
             max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
-            has_vector_entry_point=not (wrappers.pixels or is_flattened(env))
+            has_vector_entry_point=not (wrappers.pixels or is_flattened(env) or takes_own_actions(env) or mask)
             and _takes_vector_entry_point(spec, kwargs),
             failure=failure_rule(env_id, spec, env.metadata, kwargs),
+            mask=None if mask is None else mask.place,
         )
-        _check_observation_space(info)
         _check_action_space(info, algorithm)
-        check_first_step(env, info.env_id, info.env_args)
+        _check_observation_space(info)
+        infos = check_first_step(env, info.env_id, info.env_args)
     finally:
         close_env(env)
+    if mask is None and wrappers.action_mask is None and _looks_like_mask(infos.get(ACTION_MASK), info.action_space):
+        return replace(info, unused_mask=ACTION_MASK)
     return info
+
+
+def _looks_like_mask(value: Any, action_space: gym.Space[Any]) -> bool:
+    sizes = sizes_of(action_space)
+    return bool(sizes) and isinstance(value, np.ndarray) and value.size == sum(sizes)
 
 
 def make_env(
@@ -180,13 +202,13 @@ def make_vector_env(
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
-            env = None if wrappers.pixels else _own_vector_env(spec, num_envs, kwargs)
+            env = None if wrappers.pixels or wrappers.action_mask else _own_vector_env(spec, num_envs, kwargs)
             if env is None:
                 if wrappers.pixels:
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
                 env = gym.make_vec(
                     spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
-                    wrappers=(wrappers.wrap_pixels, flattened, PlainSteps), **kwargs,
+                    wrappers=(wrappers.wrap_pixels, wrappers.wrap_mask, flattened, PlainSteps), **kwargs,
                 )  # fmt: skip
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
@@ -277,11 +299,11 @@ def _check_limit(env_id: str, limit: Any) -> None:
 def _own_vector_env(
     spec: EnvSpec, num_envs: int, env_args: dict[str, Any]
 ) -> gym.vector.VectorEnv[Any, Any, Any] | None:
-    """Make the env's own vectorised version; None: it has none, or that observes neither vectors nor images."""
+    """Make the env's own vectorised version; None: it has none, or one whose spaces are not as policies need them."""
     if not _takes_vector_entry_point(spec, env_args):
         return None
     env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **env_args)
-    if not needs_flattening(env.single_observation_space):
+    if not needs_flattening(env.single_observation_space) and is_taken(env.single_action_space):
         return env
     close_env(env)
     return None
@@ -339,22 +361,24 @@ def _check_observation_space(info: EnvInfo) -> None:
 
 def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
     space = info.action_space
-    if isinstance(space, gym.spaces.Discrete):
+    if not is_taken(space):
+        try:
+            made_of(space)
+        except UnsupportedActionsError as error:
+            raise EnvError(
+                f"{info.env_id} has actions {error}, which no policy gives: actions are choices or numbers.",
+                action_hint(),
+            ) from error
+    if algorithm != "dqn":
         return
-    if not isinstance(space, gym.spaces.Box):
-        raise EnvError(
-            f"{info.env_id} has actions of kind {type(space).__name__} ({space}); only Discrete and 1-D Box "
-            "actions are supported.",
-            action_hint(info.env_id, space),
-        )
-    if algorithm == "dqn":
+    if isinstance(space, gym.spaces.Box):
         raise EnvError(
             f"DQN cannot train on {info.env_id}: its actions are continuous ({space}), and DQN needs Discrete ones.",
             "Use 'algorithm: ppo', or an env with Discrete actions.",
         )
-    if len(space.shape) != 1 or space.shape[0] == 0 or not np.issubdtype(space.dtype, np.floating):
+    if isinstance(space, Choices):
         raise EnvError(
-            f"{info.env_id} has actions of shape {space.shape} and dtype {space.dtype}; only floating-point "
-            "Box actions of shape (n,) are supported.",
-            action_hint(info.env_id, space),
+            f"DQN cannot train on {info.env_id}: its actions are {len(space.sizes)} choices at once ({space}), and DQN "
+            "needs a single one.",
+            f"Use 'algorithm: ppo', which makes each choice by itself. {one_choice_hint(info.env_id, space.original)}",
         )

@@ -24,8 +24,13 @@ def observation_hint(env_id: str, space: gym.Space[Any]) -> str:
     return f"{_HOW}, in a gymnasium.ObservationWrapper that makes a vector of float32 of an observation."
 
 
-def action_hint(env_id: str, space: gym.Space[Any]) -> str:
-    """Suggest what turns these actions into Discrete or 1-D Box actions."""
+def action_hint() -> str:
+    """Suggest what turns actions that no policy gives into such as policies give."""
+    return f"{_HOW}, in a gymnasium.ActionWrapper whose actions are all choices, or all numbers."
+
+
+def one_choice_hint(env_id: str, space: gym.Space[Any]) -> str:
+    """Suggest what turns several choices at once into a single one."""
     env = _make(env_id)
     sizes = _combinations(space)
     if sizes is not None and math.prod(sizes) <= _MAX_COMBINATIONS:
@@ -37,13 +42,7 @@ def action_hint(env_id: str, space: gym.Space[Any]) -> str:
             f"gymnasium.spaces.Discrete({math.prod(sizes)}))"
         )
         return f"{_HOW}: `{wrapped}` has one action for each combination."
-    if isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating) and 0 not in space.shape:
-        flat = f"gymnasium.spaces.flatten_space({env}.action_space)"
-        wrapped = (
-            f"gymnasium.wrappers.TransformAction({env}, lambda action: numpy.reshape(action, {space.shape}), {flat})"
-        )
-        return f"{_HOW}: `{wrapped}` has 1-D Box actions."
-    return f"{_HOW}, in a gymnasium.ActionWrapper with Discrete or 1-D floating-point Box actions."
+    return f"{_HOW}, in a gymnasium.ActionWrapper with Discrete actions."
 
 
 def _make(env_id: str) -> str:

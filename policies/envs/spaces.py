@@ -11,10 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.envs.flat import MAX_SIZE, FlatBox
+from policies.envs.masks import MaskedBox
+from policies.envs.own_actions import Choices, is_made, made_of
 from policies.errors import MALFORMED, CheckpointError
 
 _FLAT = "made_of"
 """In the description of the vectors that observations are made, the space of the observations themselves."""
+_OWN = "sent_as"
+"""In the description of actions as policies give them, the space of the environment's own."""
+_MASK = "mask"
+"""In the description of vectors that begin with a mask, how many values each choice has, and the mask's member."""
+PolicyActions = gym.spaces.Box | gym.spaces.Discrete[Any] | Choices
+"""The spaces of actions that policies give."""
 
 
 def observation_dtype(space: gym.Space[Any]) -> type[np.uint8 | np.float32]:
@@ -23,16 +31,22 @@ def observation_dtype(space: gym.Space[Any]) -> type[np.uint8 | np.float32]:
 
 
 def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
-    """Return a Box or Discrete space as a JSON object.
+    """Return the space of a policy's observations or actions as a JSON object.
 
     Infinite bounds become the strings "inf" and "-inf". Bounds that are all equal become one number, because the bounds
-    of an image would fill pages. A `FlatBox` has a key for the space that it is made of, too.
+    of an image would fill pages. A `FlatBox`, a `MaskedBox`, `Choices` and `Numbers` have keys for what they are made
+    of, too.
 
     Raises:
         CheckpointError: The space is of another kind.
     """
+    if isinstance(space, MaskedBox):
+        own = {} if space.original is None else {_FLAT: _describe_any(space.original)}
+        return {**_describe_box(space), **own, _MASK: {"sizes": list(space.sizes), "key": space.key}}
     if isinstance(space, FlatBox):
         return {**_describe_box(space), _FLAT: _describe_any(space.original)}
+    if is_made(space):
+        return {**_describe_any(space), _OWN: _describe_any(space.original)}
     if isinstance(space, gym.spaces.Box | gym.spaces.Discrete):
         return _describe_any(space)
     raise _cannot_describe(space)
@@ -44,7 +58,8 @@ def _describe_any(space: gym.Space[Any]) -> dict[str, Any]:
     if isinstance(space, gym.spaces.Discrete):
         return {"type": "discrete", "n": int(space.n), "start": int(space.start)}
     if isinstance(space, gym.spaces.MultiDiscrete):
-        return {"type": "multi_discrete", "nvec": space.nvec.tolist(), "start": space.start.tolist()}
+        dtype = {} if space.dtype == np.int64 else {"dtype": str(space.dtype)}
+        return {"type": "multi_discrete", "nvec": space.nvec.tolist(), "start": space.start.tolist(), **dtype}
     if isinstance(space, gym.spaces.MultiBinary):
         return {"type": "multi_binary", "shape": [int(size) for size in space.shape]}
     if isinstance(space, gym.spaces.Dict):
@@ -71,28 +86,61 @@ def _cannot_describe(space: gym.Space[Any]) -> CheckpointError:
     )
 
 
-def space_from_description(description: Mapping[str, Any]) -> gym.spaces.Box | gym.spaces.Discrete[Any]:
+def space_from_description(description: Mapping[str, Any]) -> PolicyActions:
     """Return the space that `describe_space` described.
 
     Raises:
         CheckpointError: The description is incomplete or contradicts itself.
     """
     try:
-        if (original := description.get(_FLAT)) is not None:
+        made: gym.Space[Any] | None = None
+        if (mask := description.get(_MASK)) is not None:
+            made = _masked(description, mask)
+        elif (original := description.get(_FLAT)) is not None:
             made = FlatBox(_any_from_description(original))
-            if list(made.shape) != list(description["shape"]) or str(made.dtype) != description["dtype"]:
-                raise ValueError(f"a {_FLAT} that makes {made}")
-            return made
-        space = _any_from_description(description) if description["type"] in ("box", "discrete") else None
+        elif (original := description.get(_OWN)) is not None:
+            made = made_of(_any_from_description(original))
+        if made is not None:
+            _check_same(made, description)
+        elif description["type"] in ("box", "discrete"):
+            made = _any_from_description(description)
     except MALFORMED as error:
         raise CheckpointError(
             f"A space is described as {str(description)[:200]}, which makes none: {str(error)[:200]}.",
             "Write the policy file again from its checkpoint.",
         ) from error
-    if isinstance(space, gym.spaces.Box | gym.spaces.Discrete):
-        return space
-    raise CheckpointError(
-        f"A space is described as of type {str(description['type'])[:80]!r}; known are 'box' and 'discrete'.",
+    if isinstance(made, gym.spaces.Box | gym.spaces.Discrete | Choices):
+        return made
+    raise _unknown(description)
+
+
+def _masked(description: Mapping[str, Any], mask: Mapping[str, Any]) -> MaskedBox:
+    sizes, key = tuple(int(size) for size in mask["sizes"]), mask["key"]
+    if min(sizes) < 1 or sum(sizes) > MAX_SIZE or not (key is None or isinstance(key, str)):
+        raise ValueError(f"a mask {mask}")
+    if (original := description.get(_FLAT)) is not None:
+        return MaskedBox.of(_any_from_description(original), sizes, key)
+    whole = _any_from_description(description)
+    assert isinstance(whole, gym.spaces.Box)
+    behind = slice(sum(sizes), None)
+    return MaskedBox(gym.spaces.Box(whole.low[behind], whole.high[behind], dtype=np.float32), sizes)
+
+
+def _check_same(made: gym.Space[Any], description: Mapping[str, Any]) -> None:
+    """Check that a space is of the type, shape and dtype of its description.
+
+    Raises:
+        ValueError: It is not.
+    """
+    found = _describe_any(made)
+    if any(found[name] != description[name] for name in ("type", "shape", "dtype", "nvec") if name in found):
+        raise ValueError(f"it makes {made!r}")
+
+
+def _unknown(description: Mapping[str, Any]) -> CheckpointError:
+    return CheckpointError(
+        f"A space is described as of type {str(description['type'])[:80]!r}; known are 'box' and 'discrete', and "
+        f"'multi_discrete' of actions with what they are {_OWN.replace('_', ' ')}.",
         "Write the policy file again from its checkpoint, or update tune-jobs.",
     )
 
@@ -103,7 +151,8 @@ def _any_from_description(description: Mapping[str, Any]) -> gym.Space[Any]:
         return gym.spaces.Discrete(int(description["n"]), start=int(description.get("start", 0)))
     if kind == "multi_discrete":
         nvec, start = (np.array(description[key], np.int64) for key in ("nvec", "start"))
-        return gym.spaces.MultiDiscrete(nvec, start=start)
+        dtype: Any = np.dtype(description.get("dtype", "int64")).type
+        return gym.spaces.MultiDiscrete(nvec, start=start, dtype=dtype)
     if kind == "multi_binary":
         shape = _checked_shape(description)
         return gym.spaces.MultiBinary(shape if len(shape) != 1 else shape[0])
@@ -146,4 +195,7 @@ def _numbers_to_json(value: Any) -> Any:
 
 
 def _numbers_from_json(value: Any) -> Any:
-    return [_numbers_from_json(item) for item in value] if isinstance(value, list) else float(value)
+    if isinstance(value, list):
+        return [_numbers_from_json(item) for item in value]
+    # Whole numbers of 64 bits are more than floating-point ones hold.
+    return value if isinstance(value, int) else float(value)

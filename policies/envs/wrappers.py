@@ -1,8 +1,8 @@
 """Wrappers that change observations, and one that changes the rewards of training.
 
 Frames and pixels belong to the environment: the observations are the same in training, evaluation and videos.
-So they travel in the env arguments, under the reserved keys `frame_stack` and `pixels`. The failure penalty belongs to
-training alone, and is never among the env arguments.
+So they travel in the env arguments, under the reserved keys `frame_stack` and `pixels`, and so does the name of the
+mask of actions, `action_mask`. The failure penalty belongs to training alone, and is never among the env arguments.
 
 Words: a *frame* is one observation; an *image* is of shape (rows, columns, channels).
 """
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from policies.envs.failures import FailureRule
 from policies.envs.flat import flattened
+from policies.envs.masks import ACTION_MASK, MaskedBox, Setting, check_setting, masked, num_masked
+from policies.envs.own_actions import with_own_actions
 from policies.errors import EnvError
 
 FRAME_STACK, PIXELS = "frame_stack", "pixels"
@@ -33,10 +35,11 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True)
 class ObservationWrappers:
-    """The wrappers that an environment gets around its time limit: pixels first, then frames."""
+    """The wrappers that an environment gets around its time limit: pixels, its mask of actions, frames."""
 
     frame_stack: int = 1
     pixels: bool = False
+    action_mask: Setting = None
 
     @classmethod
     def take_from(cls, env_args: dict[str, Any]) -> ObservationWrappers:
@@ -46,19 +49,36 @@ class ObservationWrappers:
             EnvError: A value has the wrong type.
         """
         frames, pixels = env_args.pop(FRAME_STACK, 1), env_args.pop(PIXELS, False)
+        mask = check_setting(env_args.pop(ACTION_MASK, None))
         if isinstance(frames, bool) or not isinstance(frames, int) or frames < 1:
             raise EnvError(f"{FRAME_STACK} is {frames!r}; it must be a whole number >= 1.", "1 stacks nothing.")
         if not isinstance(pixels, bool):
             raise EnvError(f"{PIXELS} is {pixels!r}; it must be true or false.", "Set it to true, or leave it out.")
-        return cls(frames, pixels)
+        if pixels and mask:
+            raise EnvError(
+                f"{ACTION_MASK} is {mask!r} and {PIXELS} true: masks go with vectors, not with images.",
+                f"Leave {PIXELS} out, or set {ACTION_MASK}: false.",
+            )
+        return cls(frames, pixels, mask)
 
     def wrap(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
         """Return an environment with these wrappers; for pixels, it must have been made with a render mode.
 
-        What it observes is made vectors, or images, first.
+        It takes actions as policies give them, and what it observes is made vectors, or images.
+
+        Raises:
+            EnvError: It has not the mask that is named.
         """
-        env = flattened(self.wrap_pixels(env))
+        env = flattened(self.wrap_mask(self.wrap_pixels(env)))
         return StackFrames(env, self.frame_stack) if self.frame_stack > 1 else env
+
+    def wrap_mask(self, env: gym.Env[Any, Any]) -> Any:
+        """Return an environment that takes actions as policies give them, and observes which of them are allowed.
+
+        Raises:
+            EnvError: It has not the mask that is named.
+        """
+        return masked(with_own_actions(env), False if self.pixels else self.action_mask)
 
     def wrap_pixels(self, env: gym.Env[Any, Any]) -> Any:
         """Return an environment that observes pixels, if they are wanted, else the environment itself."""
@@ -69,13 +89,17 @@ class ObservationWrappers:
         return StackFramesVector(env, self.frame_stack) if self.frame_stack > 1 else env
 
 
-def with_wrappers(env_args: Mapping[str, Any], *, frame_stack: int, pixels: bool) -> dict[str, Any]:
+def with_wrappers(
+    env_args: Mapping[str, Any], *, frame_stack: int, pixels: bool, action_mask: Setting = None
+) -> dict[str, Any]:
     """Return env arguments with the reserved keys of those wrappers that change something."""
     wrapped = dict(env_args)
     if frame_stack > 1:
         wrapped[FRAME_STACK] = frame_stack
     if pixels:
         wrapped[PIXELS] = True
+    if action_mask is not None:
+        wrapped[ACTION_MASK] = action_mask
     return wrapped
 
 
@@ -147,14 +171,17 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
             "be stacked.",
             f"Leave {FRAME_STACK} out, or choose another env.",
         )
-    low, high = (np.concatenate([bound] * num_frames, axis=-1) for bound in (space.low, space.high))
-    return gym.spaces.Box(low, high, dtype=cast("Any", space.dtype).type)
+    seen = space.seen if isinstance(space, MaskedBox) else space
+    low, high = (np.concatenate([bound] * num_frames, axis=-1) for bound in (seen.low, seen.high))
+    stacked = gym.spaces.Box(low, high, dtype=cast("Any", space.dtype).type)
+    return MaskedBox(stacked, space.sizes) if isinstance(space, MaskedBox) else stacked
 
 
 class StackFrames(gym.Wrapper[Any, Any, Any, Any]):
     """Observe the last frames at once, oldest first; after a reset they are all the first observation.
 
-    Vectors of n numbers are joined into one of shape (num_frames * n,), images along their channels.
+    Vectors of n numbers are joined into one of shape (num_frames * n,), images along their channels. Of masks there is
+    only the newest, before them all.
 
     Raises:
         EnvError: The observations are neither vectors nor images.
@@ -164,18 +191,19 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self.num_frames = num_frames
         self.observation_space = _stacked_space(_name(env), env.observation_space, num_frames)
+        self._num_masked = num_masked(env.observation_space)
         self._stack: NDArray[Any] = np.zeros(0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment and fill the stack with its observation."""
         frame, info = self.env.reset(seed=seed, options=options)
-        self._stack = np.concatenate([np.asarray(frame)] * self.num_frames, axis=-1)
+        self._stack = _filled(np.asarray(frame), self.num_frames, self._num_masked)
         return self._stack, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment; its observation replaces the oldest one."""
         frame, reward, terminated, truncated, info = self.env.step(action)
-        self._stack = _push(self._stack, np.asarray(frame))
+        self._stack = _push(self._stack, np.asarray(frame), self._num_masked)
         return self._stack, reward, terminated, truncated, info
 
 
@@ -191,6 +219,7 @@ class StackFramesVector(gym.vector.VectorWrapper):
         name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         self.single_observation_space = _stacked_space(name, env.single_observation_space, num_frames)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._num_masked = num_masked(env.single_observation_space)
         self._stack: NDArray[Any] = np.zeros(0)
         self._ended = np.zeros(env.num_envs, dtype=np.bool_)
 
@@ -199,23 +228,29 @@ class StackFramesVector(gym.vector.VectorWrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all sub-environments and fill their stacks."""
         frames, info = self.env.reset(seed=cast("int | None", seed), options=options)
-        self._stack = np.concatenate([frames] * self.num_frames, axis=-1)
+        self._stack = _filled(frames, self.num_frames, self._num_masked)
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         return self._stack, info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all sub-environments; where the step only reset an ended episode, the stack begins anew."""
         frames, rewards, terminated, truncated, info = self.env.step(actions)
-        stack = _push(self._stack, frames)
+        stack = _push(self._stack, frames, self._num_masked)
         if self._ended.any():
-            stack[self._ended] = np.concatenate([frames[self._ended]] * self.num_frames, axis=-1)
+            stack[self._ended] = _filled(frames[self._ended], self.num_frames, self._num_masked)
         self._stack, self._ended = stack, np.logical_or(terminated, truncated)
         return stack, rewards, terminated, truncated, info
 
 
-def _push(stack: NDArray[Any], frames: NDArray[Any]) -> NDArray[Any]:
+def _filled(frames: NDArray[Any], num_frames: int, num_masked: int) -> NDArray[Any]:
+    """Return stacks of equal frames, each with one mask before them."""
+    return np.concatenate([frames[..., :num_masked]] + [frames[..., num_masked:]] * num_frames, axis=-1)
+
+
+def _push(stack: NDArray[Any], frames: NDArray[Any], num_masked: int) -> NDArray[Any]:
     """Return the stack with new frames, as a new array, because callers may keep the old one."""
-    return np.concatenate([stack[..., frames.shape[-1] :], frames], axis=-1)
+    mask, new = frames[..., :num_masked], frames[..., num_masked:]
+    return np.concatenate([mask, stack[..., num_masked + new.shape[-1] :], new], axis=-1)
 
 
 class FailurePenalty(gym.vector.VectorWrapper):

@@ -126,6 +126,8 @@ def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str
         "max_episode_steps": info.max_episode_steps,
         "has_vector_entry_point": info.has_vector_entry_point,
         "failure": None if info.failure is None else {"reward": info.failure.reward},
+        "mask": info.mask,
+        "unused_mask": info.unused_mask,
     }
 
 

@@ -46,6 +46,14 @@ class EpsilonGreedy:
         actions = q_values.argmax(dim=-1)
         epsilon = self.exploration_schedule.at(t)
         if epsilon > 0.0:
-            random_actions = torch.randint(q_values.shape[-1], actions.shape, device=actions.device)
+            random_actions = self._draw(batch[Columns.OBS], actions.shape, q_values.shape[-1])
             actions = torch.where(torch.rand(actions.shape, device=actions.device) < epsilon, random_actions, actions)
         return {Columns.ACTIONS: actions}
+
+    def _draw(self, observations: Tensor, shape: torch.Size, num_actions: int) -> Tensor:
+        """Draw random actions, of those that a mask allows if there is one."""
+        # A module that derives from another of our classes knows of masks.
+        num_masked = getattr(self, "_num_masked", 0)
+        if not num_masked:
+            return torch.randint(num_actions, shape, device=observations.device)
+        return torch.multinomial(observations[..., :num_masked].float(), 1).squeeze(-1)

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from policies.envs.masks import FORBIDDEN, num_masked, seen_by_networks
 from policies.errors import SpecError
 from policies.portable.convolution import output_shape
 from policies.portable.file import Normalization
@@ -124,6 +125,8 @@ def initialize(module: nn.Module, initializer: str, gain: float) -> None:
 class ObservationStatistics:
     """Mixin for an RLModule: scales uint8 observations by 1/255 and, if asked to, normalises observations.
 
+    Where observations begin with a mask, networks see what is behind it, and `allowed` applies it to what they give.
+
     `setup` must call `add_statistics`, the forward passes `prepare`. With `model_config["normalize_observations"]` the
     running mean, variance and count are buffers of the module. So they go where its weights go: to env runners and into
     checkpoints and portable policies. All networks of one module, also a target network, use the same statistics.
@@ -136,13 +139,15 @@ class ObservationStatistics:
     obs_count: Tensor
     _observation_scale: float = 1.0
     _normalizes: bool = False
+    _num_masked: int = 0
 
     def add_statistics(self) -> None:
         """Register the buffers, if observations are to be normalised."""
         self._observation_scale = observation_scale(self.observation_space)
+        self._num_masked = num_masked(self.observation_space)
         self._normalizes = bool(self.model_config.get("normalize_observations"))
         if self._normalizes:
-            shape = self.observation_space.shape or ()
+            shape = seen_by_networks(self.observation_space).shape or ()
             self.register_buffer("obs_mean", torch.zeros(shape))  # type: ignore[attr-defined]
             self.register_buffer("obs_var", torch.ones(shape))  # type: ignore[attr-defined]
             # A whole number, because RLlib's checkpoints would turn it into a float, which is exact to 24 bits only.
@@ -150,12 +155,20 @@ class ObservationStatistics:
 
     def prepare(self, observations: Tensor) -> Tensor:
         """Return observations, shape (B, ...), as the networks get them: scaled and, if asked to, normalised."""
+        if self._num_masked:
+            observations = observations[..., self._num_masked :]
         if self._observation_scale != 1.0:
             observations = observations.float() * self._observation_scale
         if self._normalizes:
             factor = torch.rsqrt(self.obs_var + VARIANCE_EPSILON)
             observations = ((observations - self.obs_mean) * factor).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
         return observations
+
+    def allowed(self, outputs: Tensor, observations: Tensor) -> Tensor:
+        """Return logits or Q-values, `FORBIDDEN` where the masks of observations, (B, ...), forbid the action."""
+        if not self._num_masked:
+            return outputs
+        return outputs.masked_fill(observations[..., : self._num_masked] == 0, FORBIDDEN)
 
     @torch.no_grad()
     def update_observation_statistics(self, observations: Tensor | NDArray[Any]) -> None:
@@ -171,6 +184,7 @@ class ObservationStatistics:
         if not self._normalizes or num_new == 0:
             return
         batch = torch.as_tensor(observations, device=self.obs_mean.device).double() * self._observation_scale
+        batch = batch[:, self._num_masked :] if self._num_masked else batch
         mean = batch.mean(dim=0)
         count = int(self.obs_count)
         total = count + num_new

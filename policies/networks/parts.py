@@ -13,6 +13,8 @@ from typing import Any
 import gymnasium as gym
 from torch import nn
 
+from policies.envs.masks import seen_by_networks
+from policies.envs.own_actions import sizes_of
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 from policies.networks.epsilon import EpsilonSchedule
 from policies.networks.layers import Encoder, hidden_gain, initialize
@@ -81,11 +83,12 @@ class DQNNetworks(nn.Module):
 
 
 def num_policy_outputs(action_space: gym.Space[Any]) -> int:
-    """Return the number of outputs: a mean and a log standard deviation per component, or one logit per action."""
+    """Return the number of outputs: a mean and a log standard deviation per component, or a logit per value."""
     if isinstance(action_space, gym.spaces.Box):
         return 2 * math.prod(action_space.shape)
-    assert isinstance(action_space, gym.spaces.Discrete)
-    return int(action_space.n)
+    sizes = sizes_of(action_space)
+    assert sizes
+    return sum(sizes)
 
 
 def make_encoder(observation_space: gym.Space[Any], config: Mapping[str, Any]) -> Encoder:
@@ -95,7 +98,7 @@ def make_encoder(observation_space: gym.Space[Any], config: Mapping[str, Any]) -
         SpecError: The convolutions do not fit the observations.
     """
     activation = _OUR_ACTIVATIONS[config["fcnet_activation"]]
-    return Encoder(observation_space, config["fcnet_hiddens"], activation, config["conv_filters"])
+    return Encoder(seen_by_networks(observation_space), config["fcnet_hiddens"], activation, config["conv_filters"])
 
 
 def initialize_networks(

@@ -69,13 +69,14 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
 
     def _forward(self, batch: Batch, **_: Any) -> Batch:
         features = self._actor(self.prepare(batch[Columns.OBS]))
-        return {Columns.ACTION_DIST_INPUTS: self._policy(features)}
+        return {Columns.ACTION_DIST_INPUTS: self.allowed(self._policy(features), batch[Columns.OBS])}
 
     def _forward_train(self, batch: Batch, **_: Any) -> Batch:
         observations = self.prepare(batch[Columns.OBS])
         features = self._actor(observations)
         embeddings = features if self._shares else self.encoder["critic_encoder"](observations)
-        return {Columns.EMBEDDINGS: embeddings, Columns.ACTION_DIST_INPUTS: self._policy(features)}
+        outputs = self.allowed(self._policy(features), batch[Columns.OBS])
+        return {Columns.EMBEDDINGS: embeddings, Columns.ACTION_DIST_INPUTS: outputs}
 
     def _policy(self, features: Tensor) -> Tensor:
         outputs: Tensor = self.pi(features)
@@ -137,30 +138,35 @@ class DQNModule(EpsilonGreedy, ObservationStatistics, DefaultDQNTorchRLModule): 
 
     def compute_q_values(self, batch: Batch) -> Batch:
         """Return the Q-values of the online network, shape (B, num_actions)."""
-        return {QF_PREDS: _q_values(self.prepare(batch[Columns.OBS]), self.encoder, self.af, self.vf)}
+        observations = batch[Columns.OBS]
+        q_values = _q_values(self.prepare(observations), self.encoder, self.af, self.vf)
+        return {QF_PREDS: self.allowed(q_values, observations)}
 
     def forward_target(self, batch: Batch) -> Batch:
         """Return the Q-values of the target network, or of the online one if there is none, without gradient."""
-        return {QF_PREDS: self._bootstrap(self.prepare(batch[Columns.OBS]))}
+        return {QF_PREDS: self._bootstrap(batch[Columns.OBS])}
 
     def _forward_inference(self, batch: Batch, **_: Any) -> Batch:
         return {Columns.ACTIONS: self.compute_q_values(batch)[QF_PREDS].argmax(dim=-1)}
 
     def _forward_train(self, batch: Batch, **_: Any) -> Batch:
-        next_observations = self.prepare(batch[Columns.NEXT_OBS])
+        next_observations = batch[Columns.NEXT_OBS]
         out = self.compute_q_values(batch)
         if self.uses_double_q:
             # Only the best action is used, so no gradient is needed.
             with torch.no_grad():
-                out[QF_NEXT_PREDS] = _q_values(next_observations, self.encoder, self.af, self.vf)
+                out[QF_NEXT_PREDS] = self.compute_q_values({Columns.OBS: next_observations})[QF_PREDS]
         out[QF_TARGET_NEXT_PREDS] = self._bootstrap(next_observations)
         return out
 
     @torch.no_grad()
     def _bootstrap(self, observations: Tensor) -> Tensor:
+        prepared = self.prepare(observations)
         if self.uses_target_network:
-            return _q_values(observations, self._target_encoder, self._target_af, self._target_vf)
-        return _q_values(observations, self.encoder, self.af, self.vf)
+            q_values = _q_values(prepared, self._target_encoder, self._target_af, self._target_vf)
+        else:
+            q_values = _q_values(prepared, self.encoder, self.af, self.vf)
+        return self.allowed(q_values, observations)
 
 
 def _q_values(observations: Tensor, encoder: nn.Module, af: nn.Module, vf: nn.Module | None) -> Tensor:

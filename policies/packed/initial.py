@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from policies import random_streams
+from policies.envs.masks import seen_by_networks
 from policies.hyperparams import PPOHyperparams
 from policies.networks.parts import DQNNetworks, PPONetworks, model_config
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, H, Member, Weights
@@ -40,7 +41,7 @@ def new_member(
     if not isinstance(hyperparams, PPOHyperparams) and hyperparams.target_network:
         weights |= {f"{TARGET_PREFIX}{name}": np.array(value) for name, value in weights.items()}
     if hyperparams.normalize_observations:
-        shape = observation_space.shape or ()
+        shape = seen_by_networks(observation_space).shape or ()
         weights[OBS_MEAN], weights[OBS_VAR] = np.zeros(shape, np.float32), np.ones(shape, np.float32)
         weights[OBS_COUNT] = np.array(0, dtype=np.int64)
     return Member(

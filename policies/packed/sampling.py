@@ -1,6 +1,7 @@
 """Track episodes and prepare observations, for the stacks of both PPO and DQN.
 
-Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, D numbers per observation.
+Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, W numbers per observation, the first A
+of which are a mask of actions if there is one, D that networks see.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.masks import FORBIDDEN
 from policies.networks.layers import OBSERVATION_CLIP, VARIANCE_EPSILON
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, AnyMember
 
@@ -74,10 +76,12 @@ class Observations:
         members: The members in the order of the rows.
         num_envs: Sub-environments per member, N.
         normalizes: Whether observations are normalised.
+        num_masked: The numbers of a mask, A.
     """
 
-    def __init__(self, members: Sequence[AnyMember], num_envs: int, *, normalizes: bool) -> None:
+    def __init__(self, members: Sequence[AnyMember], num_envs: int, *, normalizes: bool, num_masked: int = 0) -> None:
         self._members, self._num_envs, self._normalizes = members, num_envs, normalizes
+        self._num_masked = num_masked
         if normalizes:
             self._refresh()
 
@@ -87,7 +91,10 @@ class Observations:
         self._factor = (1.0 / np.sqrt(variance + np.float32(VARIANCE_EPSILON))).astype(np.float32)
 
     def prepare(self, observations: Floats) -> Floats:
-        """Return prepared observations: (S, D) as (M, N, D), or (T, S, D) as (T, M, N, D)."""
+        """Return what networks see of observations: (S, W) as (M, N, D), or (T, S, W) as (T, M, N, D)."""
+        if self._num_masked:
+            # In one piece of memory, as other sums may be rounded otherwise.
+            observations = np.ascontiguousarray(observations[..., self._num_masked :])
         num_members = len(self._members)
         x: Floats = observations.reshape(*observations.shape[:-2], num_members, -1, observations.shape[-1])
         if not self._normalizes:
@@ -99,7 +106,8 @@ class Observations:
     def prepare_rows(self, rows: Floats, num_inputs: int) -> Floats:
         """Prepare the observations in rows of a replay memory, (M, B, columns), in place, and return the rows."""
         if self._normalizes:
-            for first in (0, num_inputs + 1):
+            masked = self._num_masked
+            for first in (masked, masked + num_inputs + 1 + masked):
                 columns = rows[..., first : first + num_inputs]
                 columns -= self._mean
                 columns *= self._factor
@@ -108,12 +116,15 @@ class Observations:
 
     def part(self, start: int, stop: int) -> Observations:
         """Return the same for only the members from start to stop."""
-        return Observations(self._members[start:stop], self._num_envs, normalizes=self._normalizes)
+        return Observations(
+            self._members[start:stop], self._num_envs, normalizes=self._normalizes, num_masked=self._num_masked
+        )
 
     def learn(self, observations: Floats) -> None:
-        """Add observations as the env returned them, (T, S, D), to each member's statistics."""
+        """Add observations as the env returned them, (T, S, W), to each member's statistics."""
         if not self._normalizes:
             return
+        observations = observations[..., self._num_masked :]
         rows = observations.reshape(len(observations), len(self._members), -1, observations.shape[-1])
         for index, member in enumerate(self._members):
             merge_statistics(member, rows[:, index].reshape(-1, observations.shape[-1]))
@@ -133,6 +144,18 @@ def merge_statistics(member: AnyMember, rows: Floats) -> None:
     weights[OBS_MEAN] = (weights[OBS_MEAN] + delta * (num_new / total)).astype(np.float32)
     weights[OBS_VAR] = (squares / total).astype(np.float32)
     weights[OBS_COUNT] = np.array(total, dtype=np.int64)
+
+
+def mask_outputs(outputs: Floats, observations: NDArray[Any], num_masked: int) -> None:
+    """Write `FORBIDDEN` over outputs, (..., A), where the masks of observations, (..., W), forbid the action."""
+    np.copyto(outputs, np.float32(FORBIDDEN), where=observations[..., :num_masked] == 0)
+
+
+def allowed_at(numbers: NDArray[np.float64], observations: NDArray[Any], num_masked: int) -> NDArray[np.int64]:
+    """Return an action that is allowed for each uniform number in [0, 1), (...), each of them equally likely."""
+    counts = np.cumsum(observations[..., :num_masked] > 0, axis=-1)
+    chosen = np.minimum((numbers * counts[..., -1]).astype(np.int64), counts[..., -1] - 1)
+    return np.asarray((counts > chosen[..., None]).argmax(axis=-1), dtype=np.int64)
 
 
 def one_hot(actions: NDArray[np.int64], num_actions: int) -> Floats:

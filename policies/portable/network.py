@@ -4,7 +4,8 @@ Words: a *layer* is a linear map followed by an activation; the *network* is the
 scale, normalization, convolutions, layers; all but the layers are optional. The network's *kind* says what the output
 means:
 
-* `categorical` (PPO, Discrete actions): one logit per action; greedy: the largest.
+* `categorical` (PPO, Discrete actions): one logit per action; greedy: the largest. Of several choices at once: the
+  logits of one choice after another; greedy: the largest of each.
 * `gaussian` (PPO, Box actions): mean and log standard deviation of each component; greedy: the mean.
 * `q_values` (DQN): one value per action; greedy: the largest. The layers of a dueling network end in the advantages:
   the state value is left out, because it is the same for all actions and never changes which one is greedy.
@@ -24,13 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.activations import ACTIVATIONS
+from policies.envs.masks import MaskedBox, seen_by_networks
+from policies.envs.own_actions import Choices, sizes_of
 from policies.errors import SpecError
 from policies.portable.convolution import output_shape
 
 NetworkKind = Literal["categorical", "gaussian", "q_values", "random", "constant", "module"]
 BASELINE_KINDS: tuple[NetworkKind, ...] = ("random", "constant")
 Tensors = dict[str, NDArray[Any]]
-ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any]
+ActionSpace = gym.spaces.Box | gym.spaces.Discrete[Any] | Choices
 
 _MODULE_PREFIX = "module."
 
@@ -211,7 +214,10 @@ def network_problem(network: PolicyNetwork, observation_space: gym.Space[Any], a
         if network.layers or network.conv:
             return f"a network of kind {kind!r} has {len(network.layers)} layers, but takes none"
         return "" if kind == "module" else _baseline_problem(network, action_space)
-    shape = observation_space.shape or ()
+    sizes = sizes_of(action_space)
+    if isinstance(observation_space, MaskedBox) and observation_space.sizes != sizes:
+        return f"the mask is of choices of {observation_space.sizes} values, but the actions are of {sizes}"
+    shape = seen_by_networks(observation_space).shape or ()
     return _normalization_problem(network.normalization, shape) or _chain_problem(network, shape, action_space)
 
 
@@ -224,8 +230,11 @@ def _chain_problem(network: PolicyNetwork, shape: tuple[int, ...], action_space:
         if problem := _conv_problem(network.conv, shape):
             return problem
         shape = output_shape(shape, conv_filters(network.conv))
-    num_actions = 2 * math.prod(action_space.shape) if isinstance(action_space, gym.spaces.Box) else action_space.n
-    return _layers_problem(network.layers, math.prod(shape), int(num_actions))
+    sizes = sizes_of(action_space)
+    if network.kind == "q_values" and len(sizes) != 1:
+        return f"a network of kind 'q_values' gives no actions of {len(sizes)} choices"
+    num_actions = 2 * math.prod(action_space.shape) if isinstance(action_space, gym.spaces.Box) else sum(sizes)
+    return _layers_problem(network.layers, math.prod(shape), num_actions)
 
 
 def conv_filters(conv: tuple[ConvLayer, ...]) -> list[tuple[int, int, int]]:
@@ -290,7 +299,7 @@ def action_problem(action: int | tuple[float, ...] | None, space: ActionSpace) -
     """Return why an action is not in a space; empty if it is.
 
     Args:
-        action: An int for Discrete actions; one number for each component for Box actions.
+        action: An int for Discrete actions; one number for each component or choice for others.
         space: The action space.
     """
     if isinstance(space, gym.spaces.Discrete):
@@ -303,6 +312,10 @@ def action_problem(action: int | tuple[float, ...] | None, space: ActionSpace) -
         shown = list(action) if isinstance(action, tuple) else action
         return f"{shown!r} is none of the actions, each of which is {numbers}"
     values = np.array(action, dtype=np.float64).reshape(space.shape)
+    if isinstance(space, Choices):
+        fits = bool(((values == np.rint(values)) & (values >= 0) & (values < space.nvec)).all())
+        whole = f"whole numbers from 0 to {[size - 1 for size in space.sizes]}"
+        return "" if fits else f"{list(action)!r} is none of the actions, which are {whole}"
     # Compared in the space's own precision, or its bounds themselves would seem to lie outside.
     if not space.contains(values.astype(space.dtype)):
         return f"{list(action)!r} is none of the actions, which lie in {space.low.tolist()} to {space.high.tolist()}"

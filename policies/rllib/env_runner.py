@@ -87,7 +87,7 @@ def _is_actor() -> bool:
 
 
 class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
-    """Samples fragments of (T, N) arrays; Box observations, flat or images, Discrete or flat Box actions.
+    """Samples fragments of (T, N) arrays; Box observations, flat or images, actions of the kinds that policies give.
 
     `finished_episodes` gathers (return, length) of every whole episode, over fragment boundaries, until
     `pop_finished_episodes` takes them: RLlib's own mean covers only the episodes of one iteration.
@@ -311,8 +311,9 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     def _for_env(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return actions as the env takes them; the stored ones stay as the policy drew them."""
         if self._to_bounds is None:
-            start = self.env.single_action_space.start
+            space = self.env.single_action_space
             # The network's outputs count from 0; RLlib itself ignores that a space may start elsewhere.
+            start = space.start if isinstance(space, gym.spaces.Discrete) else 0
             return actions + start if start else actions
         return self._to_bounds(actions)
 

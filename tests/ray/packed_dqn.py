@@ -88,8 +88,15 @@ def add_noise_rows(stack: DQNStack, gamma: float = 0.9) -> None:
     """Transitions with rewards of all sizes and discounts of one to three steps, the same for all members."""
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(100, stack._replay.num_columns)).astype(np.float32)
-    rows[:, [stack._num_inputs, -4]] = 1.0
+    num_masked, num_observed = stack._num_masked, stack._num_masked + stack._num_inputs
+    rows[:, [num_observed, -4]] = 1.0
     rows[:, -3] = rng.integers(0, stack._num_actions, 100)
+    if num_masked:
+        for start in (0, num_observed + 1):
+            masks = rng.integers(0, 2, (100, num_masked))
+            # What was done was allowed, and something is in each state.
+            masks[np.arange(100), rows[:, -3].astype(int) if start == 0 else rng.integers(num_masked, size=100)] = 1
+            rows[:, start : start + num_masked] = masks
     rows[:, -2] *= 3.0
     rows[:, -1] = gamma ** rng.integers(1, 4, 100) * (rng.random(100) < 0.7)
     slots = stack._replay.slots([member.member_id for member in stack.members])
@@ -147,7 +154,7 @@ def follow(group: DQNGroup, found: dict[str, Learned]) -> contextlib.ExitStack:
         for index, member in enumerate(group.members):
             one = found[member.member_id]
             weights = None if drawn.weights is None else drawn.weights[index].copy()
-            one.batches.append(as_transitions(rows[index], group._num_inputs, weights))
+            one.batches.append(as_transitions(rows[index], group._num_masked + group._num_inputs, weights))
             one.losses.append(stats[index]["total_loss"])
             one.lrs.append(stats[index]["lr"])
             one.td_errors.append(losses[-1].td_errors[index].abs().numpy())

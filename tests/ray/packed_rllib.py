@@ -149,19 +149,21 @@ def parts_of(sampled: Sampled, member: PPOMember) -> tuple[int, Batch, NDArray[n
     raise KeyError(member.member_id)
 
 
-def rllib_batch(sampled: Sampled, member: PPOMember, *, is_gaussian: bool) -> Any:
+def rllib_batch(sampled: Sampled, member: PPOMember, *, sizes: tuple[int, ...], is_one_choice: bool) -> Any:
     """The member's rows as RLlib's connectors would hand them to the Learner."""
     from ray.rllib.policy.sample_batch import MultiAgentBatch, SampleBatch
 
     index, batch, observations = parts_of(sampled, member)
     actions = torch.from_numpy(batch.actions[index])
     outputs = torch.from_numpy(batch.outputs[index])
-    if is_gaussian:
+    if not sizes:
         mean, log_std = outputs.chunk(2, dim=-1)
         logp = torch.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=-1)  # type: ignore[no-untyped-call]
     else:
-        actions = actions.argmax(dim=-1)
-        logp = torch.distributions.Categorical(logits=outputs).log_prob(actions)  # type: ignore[no-untyped-call]
+        chosen = [part.argmax(dim=-1) for part in actions.split(sizes, dim=-1)]  # type: ignore[no-untyped-call]
+        each = [torch.distributions.Categorical(logits=part) for part in outputs.split(sizes, dim=-1)]  # type: ignore[no-untyped-call]
+        logp = torch.stack([one.log_prob(value) for one, value in zip(each, chosen, strict=True)]).sum(dim=0)  # type: ignore[no-untyped-call]
+        actions = chosen[0] if is_one_choice else torch.stack(chosen, dim=-1)
     columns = {
         "obs": torch.from_numpy(observations.copy()),
         "actions": actions,
@@ -299,7 +301,7 @@ def compare(
     ours = learn_in_pack(stack, sampled)
     pairs = []
     for name in sorted(old):
-        batch = rllib_batch(sampled, old[name], is_gaussian=stack._is_gaussian)
+        batch = rllib_batch(sampled, old[name], sizes=stack._heads.sizes, is_one_choice=stack._is_one_choice)
         pairs.append((ours[name], learn_in_rllib(old[name], env_id, batch)))
         assert np.abs(ours[name].weights["pi.weight"] - old[name].weights["pi.weight"]).max() > 1e-5
     stack.envs.close()

@@ -55,6 +55,24 @@ PACKS: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {
 }  # fmt: skip
 
 
+MASKED: dict[str, dict[str, Any]] = {
+    "double, dueling": {"target_update_freq": 10},
+    "plain": {"double_q": False, "dueling": False, "target_network": False, "normalize_observations": True},
+    "n-step": {"double_q": False, "n_step": 3, "tau": 0.2},
+}
+
+
+@pytest.mark.parametrize("name", MASKED)
+def test_a_mask_is_in_the_targets_as_in_rllibs_learner(name: str) -> None:
+    members = [MASKED[name], {**MASKED[name], "hidden_sizes": (5,)}]
+    pairs, _ = compare(members, env_id="TestForbidding-v0")
+    for ours, theirs in pairs:
+        for what, value in differences(ours, present(theirs)).items():
+            assert value < ROUNDING, what
+        # What is forbidden has no value.
+        assert np.abs(np.concatenate(ours.td_errors)).max() < 100
+
+
 def test_all_activations_and_both_of_each_kind_have_a_pack() -> None:
     members = [{**shared, **values} for shared, several in PACKS.values() for values in several]
     assert {values.get("activation", "relu") for values in members} == set(ACTIVATIONS)

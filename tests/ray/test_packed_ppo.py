@@ -58,6 +58,19 @@ PACKS: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
         {"kl_target": 1e-4, "grad_clip": 0.3},
         {"hidden_sizes": (3,), "kl_coeff": 1.5},
     ]),
+    "several choices": ("TestReply-v0", {"entropy_coeff": 0.1}, [
+        {"clip_param": 0.05}, {"hidden_sizes": (5,), "grad_clip": 0.3},
+    ]),
+    "several choices, shared layers, KL": ("TestReply-v0", {"vf_share_layers": True, "use_kl_loss": True}, [
+        {"kl_coeff": 1.5, "entropy_coeff": 0.05}, {"hidden_sizes": (5,), "kl_target": 1e-4},
+    ]),
+    "masked, KL, normalised": (
+        "TestForbidding-v0", {"use_kl_loss": True, "normalize_observations": True, "entropy_coeff": 0.1}, [
+        {"kl_coeff": 1.5}, {"hidden_sizes": (5,), "clip_param": 0.05, "grad_clip": 0.3},
+    ]),
+    "several choices, masked, shared layers": ("TestForbiddingTwo-v0", {"vf_share_layers": True}, [
+        {"entropy_coeff": 0.1}, {"hidden_sizes": (5,), "clip_param": 0.05},
+    ]),
 }  # fmt: skip
 
 

@@ -5,9 +5,11 @@ from typing import Any
 import pytest
 
 from policies.envs import modules as env_modules
+from policies.envs.make import check_env
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import Algorithm
+from tune_jobs.plan.env_checks import check_env_rules
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
@@ -87,11 +89,27 @@ def test_a_penalty_changes_nothing_of_what_others_than_training_make() -> None:
     assert made.env.env_args == {}
 
 
-@pytest.mark.parametrize("name", ["frame_stack", "pixels", "failure_penalty"])
+@pytest.mark.parametrize("name", ["frame_stack", "pixels", "action_mask", "failure_penalty"])
 def test_wrappers_are_no_arguments_of_the_env(name: str) -> None:
     with pytest.raises(SpecError, match=rf"env\.args\.{name} is 1") as caught:
         plan({"id": "CartPole-v1", "args": {name: 1}})
     assert f"env.{name}" in caught.value.hint
+
+
+def test_a_mask_that_is_named_goes_where_the_env_is_made_and_not_with_a_module_of_ones_own() -> None:
+    for setting in ("action_mask", True):
+        made = plan({"id": "Taxi-v3", "action_mask": setting}, "dqn")
+        assert made.env.env_args == {"action_mask": setting}
+        assert any("by info['action_mask'], are drawn" in note for note in made.notes)
+    made = plan("Taxi-v3", "dqn")
+    assert made.env.env_args == {}
+    assert any("env.action_mask: true uses it" in note for note in made.notes)
+    made = plan({"id": "Taxi-v3", "action_mask": False}, "dqn")
+    assert made.env.env_args == {"action_mask": False}
+    assert not any("action_mask" in note for note in made.notes)
+    spec = load_spec({"env": "Taxi-v3", "algorithm": "dqn", "rl_module": "odd_envs:Net"})
+    with pytest.raises(SpecError, match=r"Taxi-v3 says which actions are allowed .* but rl_module is 'odd_envs:Net'"):
+        check_env_rules(spec, check_env("Taxi-v3", {"action_mask": True}), [])
 
 
 def test_a_sweep_file_cannot_tell_env_runners_which_modules_are_allowed() -> None:

@@ -147,9 +147,9 @@ def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error() -> None
     [
         ({"observation_space": gym.spaces.Box(0, 255, (8, 0, 3), np.uint8)}, "have 0 numbers"),
         ({"observation_space": gym.spaces.Dict(a=gym.spaces.Text(2))}, r"observation\['a'\] is of kind Text"),
-        ({"action_space": gym.spaces.MultiDiscrete([2, 2])}, "actions of kind MultiDiscrete"),
-        ({"action_space": gym.spaces.Box(-1, 1, (2, 2))}, r"actions of shape \(2, 2\)"),
-        ({"action_space": gym.spaces.Box(0, 5, (2,), np.int32)}, "int32"),
+        ({"action_space": gym.spaces.Text(3)}, r"action is of kind Text \(.*\), neither choices nor numbers"),
+        ({"action_space": gym.spaces.Box(-1, 1, (0, 2))}, "of 0 numbers"),
+        ({"action_space": gym.spaces.Dict(a=gym.spaces.Box(0, 1, (2,)), b=gym.spaces.Discrete(2))}, r"action\['a'\]"),
     ],
 )
 def test_spaces_that_cannot_be_taken_are_refused(spaces: dict[str, Any], words: str) -> None:

@@ -85,9 +85,9 @@ def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit(
     seen = []
 
     class Spy(NetworkPolicy):
-        def act(self, observations: Any) -> int | NDArray[Any]:
+        def act(self, observations: Any, mask: Any = None) -> Any:
             seen.append(np.array(observations))
-            return super().act(observations)
+            return super().act(observations, mask)
 
     policy = Spy(make_portable("CartPole-v1", seed=2))
     episodes = evaluate_policy(policy, env_id="CartPole-v1", seeds=[11, 12])

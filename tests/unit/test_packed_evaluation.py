@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
 import policies.packed.evaluation
@@ -120,8 +119,8 @@ def test_policies_of_many_shapes_and_kinds_side_by_side() -> None:
 
 def test_a_class_of_somebody_s_own_acts_as_it_does() -> None:
     class Contrary(NetworkPolicy):
-        def act(self, observations: Any) -> int | NDArray[Any]:
-            return 1 - super().act(observations)
+        def act(self, observations: Any, mask: Any = None) -> Any:
+            return 1 - super().act(observations, mask)
 
     policies = [Contrary(deep("good").portable), deep("good")]
     contrary, good = assert_as_alone(policies)

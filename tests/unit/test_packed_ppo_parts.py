@@ -33,16 +33,18 @@ def column(*values: float) -> torch.Tensor:
 
 
 def make_case(
-    num_actions: int, *, with_kl: bool, with_old_values: bool = False, seed: int = 0
+    *sizes: int, with_kl: bool, with_old_values: bool = False, seed: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor, Minibatch]:
     """(outputs, values, minibatch) with ratios far from 1 and values far from their targets, and from the old ones."""
     rng = torch.Generator().manual_seed(seed)
-    outputs = 2 * torch.randn(M, B, num_actions, generator=rng)
-    old_outputs = outputs + torch.randn(M, B, num_actions, generator=rng)
-    actions = nn.functional.one_hot(torch.randint(num_actions, (M, B), generator=rng), num_actions).to(outputs.dtype)
+    outputs = 2 * torch.randn(M, B, sum(sizes), generator=rng)
+    # Of several choices the ratios are products.
+    old_outputs = outputs + torch.randn(M, B, sum(sizes), generator=rng) / len(sizes) ** 0.5
+    chosen = [nn.functional.one_hot(torch.randint(size, (M, B), generator=rng), size) for size in sizes]
+    actions = torch.cat(chosen, dim=-1).to(outputs.dtype)
     batch = ppo.Minibatch(
         actions=actions,
-        logp=(torch.log_softmax(old_outputs, dim=-1) * actions).sum(dim=-1),
+        logp=ppo.log_probabilities(old_outputs, actions, heads=ppo.Heads(sizes)),
         advantages=torch.randn(M, B, generator=rng),
         value_targets=3 * torch.randn(M, B, generator=rng),
         old_outputs=old_outputs if with_kl else None,
@@ -66,20 +68,21 @@ COEFFICIENTS = ppo.Coefficients(
 @pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("with_old_values", [False, True])
 @pytest.mark.parametrize("with_kl", [False, True])
-@pytest.mark.parametrize("num_actions", [2, 3, 6])
-def test_gradients_by_hand_are_those_of_the_loss(num_actions: int, with_kl: bool, with_old_values: bool) -> None:
-    outputs, values, batch = make_case(num_actions, with_kl=with_kl, with_old_values=with_old_values)
-    ratio = (ppo.log_probabilities(outputs, batch.actions, is_gaussian=False) - batch.logp).exp()
+@pytest.mark.parametrize("sizes", [(2,), (3,), (6,), (2, 2), (3, 1, 4)], ids=str)
+def test_gradients_by_hand_are_those_of_the_loss(sizes: tuple[int, ...], with_kl: bool, with_old_values: bool) -> None:
+    outputs, values, batch = make_case(*sizes, with_kl=with_kl, with_old_values=with_old_values)
+    heads = ppo.Heads(sizes)
+    ratio = (ppo.log_probabilities(outputs, batch.actions, heads=heads) - batch.logp).exp()
     for limited in (ratio > 1.3, ratio < 0.7):
         for sign in (-1, 1):
             # Clipped and not clipped, on both sides.
             assert (limited & (sign * batch.advantages > 0)).sum() > M * B / 20
     errors = (values - batch.value_targets) ** 2
     assert 0.1 < (errors > COEFFICIENTS.vf_clip_param).float().mean() < 0.9
-    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
+    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, heads=heads)
     outputs.requires_grad_()
     values.requires_grad_()
-    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
+    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, heads=heads)
     parts.total_loss.sum().backward()  # type: ignore[no-untyped-call]
     for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
         close(mine, other)
@@ -97,10 +100,10 @@ def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
             "entropy_coeff": column(*[entropy_coeff] * M),
         }
     )
-    found = ppo.gradients(outputs, values, batch, coefficients, is_gaussian=False)
+    found = ppo.gradients(outputs, values, batch, coefficients, heads=ppo.Heads((2,)))
     outputs.requires_grad_()
     values.requires_grad_()
-    ppo.loss(outputs, values, batch, coefficients, is_gaussian=False).total_loss.sum().backward()  # type: ignore[no-untyped-call]
+    ppo.loss(outputs, values, batch, coefficients, heads=ppo.Heads((2,))).total_loss.sum().backward()  # type: ignore[no-untyped-call]
     for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
         close(mine, other)
 
@@ -118,8 +121,8 @@ def by_definition(values: torch.Tensor, old_values: torch.Tensor, targets: torch
 def test_the_larger_of_both_value_errors_counts() -> None:
     outputs, values, batch = make_case(2, with_kl=False, with_old_values=True)
     assert batch.old_values is not None
-    found = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False).vf_loss
-    no_range = ppo.loss(outputs, values, replace(batch, old_values=None), COEFFICIENTS, is_gaussian=False).vf_loss
+    found = ppo.loss(outputs, values, batch, COEFFICIENTS, heads=ppo.Heads((2,))).vf_loss
+    no_range = ppo.loss(outputs, values, replace(batch, old_values=None), COEFFICIENTS, heads=ppo.Heads((2,))).vf_loss
     for index in range(M):
         limit = float(COEFFICIENTS.vf_clip_range[index])
         rows = by_definition(values[index], batch.old_values[index], batch.value_targets[index], limit)
@@ -133,13 +136,13 @@ def test_a_member_without_a_range_of_values_learns_to_the_bit_as_if_no_other_had
     if is_gaussian:
         batch.actions = batch.actions[..., :2]
     beside, alone = (
-        ppo.gradients(outputs, values, rows, COEFFICIENTS, is_gaussian=is_gaussian)
+        ppo.gradients(outputs, values, rows, COEFFICIENTS, heads=ppo.Heads(() if is_gaussian else (4,)))
         for rows in (batch, replace(batch, old_values=None))
     )
     assert torch.equal(beside[1][1], alone[1][1])
     assert not torch.equal(beside[1], alone[1])
     losses = [
-        ppo.loss(outputs, values, rows, COEFFICIENTS, is_gaussian=is_gaussian).vf_loss[1]
+        ppo.loss(outputs, values, rows, COEFFICIENTS, heads=ppo.Heads(() if is_gaussian else (4,))).vf_loss[1]
         for rows in (batch, replace(batch, old_values=None))
     ]
     assert torch.equal(*losses)
@@ -152,7 +155,7 @@ def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name: str, 
     if is_gaussian:
         batch.actions = batch.actions[..., :2]
     getattr(batch, name)[1, 7] = math.nan
-    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, is_gaussian=is_gaussian)
+    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, heads=ppo.Heads(() if is_gaussian else (4,)))
     gradient = found[0 if name == "advantages" else 1]
     assert gradient[1, 7].isnan().all()
     assert gradient[[0, 2, 3]].isfinite().all()
@@ -161,9 +164,9 @@ def test_what_is_no_number_reaches_its_members_gradient_and_no_other(name: str, 
 @pytest.mark.usefixtures("in_double")
 def test_ratios_begin_at_one() -> None:
     outputs, values, batch = make_case(3, with_kl=True)
-    batch.logp = ppo.log_probabilities(outputs, batch.actions, is_gaussian=False)
+    batch.logp = ppo.log_probabilities(outputs, batch.actions, heads=ppo.Heads((3,)))
     batch.old_outputs = outputs
-    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, is_gaussian=False)
+    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, heads=ppo.Heads((3,)))
     close(parts.policy_loss, -batch.advantages.mean(dim=1))
     close(parts.kl, torch.zeros(M))
 

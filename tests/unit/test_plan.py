@@ -146,6 +146,14 @@ def test_what_is_made_of_observations_is_told() -> None:
     assert not [note for note in plan().notes if "are made" in note]
 
 
+@pytest.mark.usefixtures("env_plugin")
+def test_what_actions_are_made_of_is_told() -> None:
+    told = plan("env=TestReply-v0").notes
+    assert "Actions of TestReply-v0 are made of 2 choices: MultiDiscrete([2 3], start=[ 1 -1])." in told
+    told = plan("env=TestReply-v0", "env.args.kind=matrix").notes
+    assert "Actions of TestReply-v0 are made of vectors: Box(-1.0, 1.0, (2, 1), float64)." in told
+
+
 @pytest.mark.parametrize(
     ("overrides", "part"),
     [

@@ -28,15 +28,17 @@ ACTIONS: dict[str, gym.Space[Any]] = {
     "multi-discrete matrix": spaces.MultiDiscrete(cast("Any", [[3, 2], [2, 2]])),
     "multi-binary": spaces.MultiBinary(3),
     "multi-binary matrix": spaces.MultiBinary([2, 2]),
-    "matrix": spaces.Box(-1, 1, (2, 2), np.float32),
-    "number": spaces.Box(-1, 1, (), np.float32),
 }
 BEYOND: dict[str, tuple[gym.Space[Any], gym.Space[Any], str]] = {
     "graph": (spaces.Graph(NUMBERS, None), NUMBERS, "gymnasium.ObservationWrapper"),
     "sequence": (spaces.Sequence(NUMBERS), NUMBERS, "gymnasium.ObservationWrapper"),
     "empty": (spaces.Box(-1, 1, (0,), np.float32), NUMBERS, "gymnasium.ObservationWrapper"),
-    "dict of actions": (NUMBERS, spaces.Dict({"a": NUMBERS}), "gymnasium.ActionWrapper"),
-    "many combinations": (NUMBERS, spaces.MultiDiscrete([1000] * 3), "gymnasium.ActionWrapper"),
+    "choices and numbers": (
+        NUMBERS,
+        spaces.Dict({"a": NUMBERS, "b": spaces.Discrete(2)}),
+        "all choices, or all numbers",
+    ),
+    "text": (NUMBERS, spaces.Text(3), "gymnasium.ActionWrapper"),
 }
 
 Refusal = Callable[..., EnvError]
@@ -119,11 +121,12 @@ def test_the_wrapper_that_is_named_makes_observations_that_are_taken(
 def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(
     kind: str, refusal: Refusal, own_module: OwnModule
 ) -> None:
-    own_module(expression_in(refusal(NUMBERS, ACTIONS[kind])))
-    info = check_env("wrapped_envs:Wrapped-v0", None, "ppo")
+    own_module(expression_in(refusal(NUMBERS, ACTIONS[kind], "dqn")))
+    info = check_env("wrapped_envs:Wrapped-v0", None, "dqn")
     env, space = gym.make("Wrapped-v0"), info.action_space
     env.reset()
-    actions = range(int(space.n)) if isinstance(space, spaces.Discrete) else [space.sample() for _ in range(5)]
+    assert isinstance(space, spaces.Discrete)
+    actions = range(int(space.n))
     sent = []
     step = env.unwrapped.step
 
@@ -141,6 +144,13 @@ def test_the_wrapper_that_is_named_makes_actions_that_can_be_taken(
 def test_what_no_wrapper_of_gymnasiums_does_needs_one_of_ones_own(kind: str, refusal: Refusal) -> None:
     observations, actions, words = BEYOND[kind]
     assert words in refusal(observations, actions).hint
+
+
+@pytest.mark.parametrize("space", [spaces.MultiDiscrete([1000] * 3), spaces.Tuple((spaces.Discrete(2),) * 2)], ids=str)
+def test_choices_of_which_no_expression_makes_one_need_a_wrapper_of_ones_own(
+    space: gym.Space[Any], refusal: Refusal
+) -> None:
+    assert "ActionWrapper with Discrete actions" in refusal(NUMBERS, space, "dqn").hint
 
 
 def test_a_class_of_a_module_is_made_as_such() -> None:

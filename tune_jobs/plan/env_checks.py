@@ -11,6 +11,8 @@ import numpy as np
 from policies.acting.baselines import BASELINES
 from policies.envs.failures import check_failure_penalty
 from policies.envs.make import EnvInfo
+from policies.envs.masks import ACTION_MASK, seen_by_networks
+from policies.envs.own_actions import Choices
 from policies.envs.wrappers import FRAME_STACK, PIXELS
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
@@ -27,7 +29,7 @@ def check_env_args(spec: SweepSpec) -> None:
     Raises:
         SpecError: There is one.
     """
-    for name in (FRAME_STACK, PIXELS, "failure_penalty"):
+    for name in (FRAME_STACK, PIXELS, ACTION_MASK, "failure_penalty"):
         if name in spec.env.args:
             raise SpecError(
                 f"env.args.{name} is {spec.env.args[name]!r}, but {name} is not an argument of an env's constructor.",
@@ -45,7 +47,8 @@ def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperpa
 
     Raises:
         SpecError: There is a penalty but no failure; convolutions but no images, or images but no convolutions; or a
-            constant action that the environment does not have; or the objective is about a threshold that nobody knows.
+            constant action that the environment does not have; a module of the user's own and a mask of actions; or the
+            objective is about a threshold that nobody knows.
     """
     _check_constant_actions(spec, env, hyperparams)
     if spec.objective.type == "steps_to_threshold" and spec.objective.threshold is None and env.threshold is None:
@@ -60,6 +63,13 @@ def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperpa
         except EnvError as error:
             hint = error.hint.replace("failure_penalty", "env.failure_penalty")
             raise SpecError(f"env.{error.message}", hint) from error
+    if spec.rl_module is not None and env.mask is not None:
+        raise SpecError(
+            f"{env.env_id} says which actions are allowed ({env.mask}), but rl_module is {spec.rl_module!r}: only our "
+            "own networks keep to a mask.",
+            f"Leave rl_module out; or set env.{ACTION_MASK}: false, and read the mask in the module, where the "
+            "observations have it.",
+        )
     if spec.algorithm not in BASELINES:
         _check_networks(spec, env, hyperparams)
 
@@ -81,11 +91,13 @@ def _some_action(env: EnvInfo) -> str:
     space: Any = env.action_space
     if hasattr(space, "n"):
         return str(int(space.start))
+    if isinstance(space, Choices):
+        return json.dumps([0] * len(space.sizes), separators=(",", ":"))
     return json.dumps(np.clip(np.zeros(space.shape), space.low, space.high).ravel().tolist(), separators=(",", ":"))
 
 
 def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -> None:
-    shape = tuple(env.observation_space.shape or ())
+    shape = tuple(seen_by_networks(env.observation_space).shape or ())
     domain = spec.space.get("conv_filters")
     place = "hyperparams.conv_filters" if domain is None else "space.conv_filters"
     # A search method may choose the points later, so every value that it can choose is checked.

@@ -6,6 +6,8 @@ import itertools
 import math
 from typing import TYPE_CHECKING, Any
 
+from policies.envs.masks import seen_by_networks
+from policies.envs.own_actions import sizes_of
 from policies.hyperparams import DQNHyperparams, Hyperparams, PPOHyperparams, RandomHyperparams
 from policies.portable.convolution import output_shape
 
@@ -88,8 +90,8 @@ def _num_weights(env: EnvInfo, values: Hyperparams) -> int:
     if isinstance(values, RandomHyperparams):
         return 0
     space: Any = env.action_space
-    num_outputs = 2 * int(space.n) if hasattr(space, "n") else 2 * math.prod(space.shape or ())
-    shape = tuple(env.observation_space.shape or ())
+    num_outputs = 2 * (sum(sizes_of(space)) or math.prod(space.shape or ()))
+    shape = tuple(seen_by_networks(env.observation_space).shape or ())
     weights = 0
     if values.conv_filters is not None:
         channels = [shape[-1], *(item[0] for item in values.conv_filters)]

@@ -19,6 +19,8 @@ from analysis.records import FINISHED, ChosenPointRecord, ReplicationRecord, Tri
 from analysis.wording import counted
 from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo
+from policies.envs.masks import seen_by_networks
+from policies.envs.own_actions import Choices, is_made
 from policies.errors import MALFORMED, CannotRunError, SpecError, said_by, shortened
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
@@ -334,10 +336,23 @@ def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
             f"The space has no random domain, so num_samples {spec.num_samples} repeats every point; "
             "seeds_per_point does that and averages over the seeds."
         )
-    seen = env.observation_space
+    seen = seen_by_networks(env.observation_space)
     if isinstance(seen, FlatBox):
         kind = "images of shape" if env.observes_images else "vectors of shape"
         notes.append(f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}.")
+    if is_made(actions := env.action_space):
+        kind = f"{counted(len(actions.sizes), 'choice')}" if isinstance(actions, Choices) else "vectors"
+        notes.append(f"Actions of {env.env_id} are made of {kind}: {shortened(actions.original)}.")
+    if env.mask is not None:
+        notes.append(
+            f"Only actions that {env.env_id} allows, by {env.mask}, are drawn, learned and taken; networks do not see "
+            "the mask."
+        )
+    elif env.unused_mask is not None:
+        notes.append(
+            f"{env.env_id} gives info[{env.unused_mask!r}], which seems to say which actions are allowed, and which is "
+            "not used: env.action_mask: true uses it."
+        )
     target = spec.stop.training_return
     if env.threshold is not None and target is not None and target < env.threshold:
         notes.append(

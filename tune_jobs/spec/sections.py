@@ -72,6 +72,12 @@ class EnvSpec(Section):
     pixels: Flag = Field(
         default=False, description="Observe small grey images of what the env renders, not its numbers."
     )
+    action_mask: Annotated[str, Field(min_length=1)] | Flag | None = Field(
+        None,
+        description="The name of what says which actions are allowed: a member of Dict observations, a method, or an "
+        "info of reset and step. true: a member action_mask, the method that MaskablePPO asks for, or an info "
+        "action_mask. null: the first two, if there is one. false: what there is, is no mask.",
+    )
     failure_penalty: Annotated[Number, Field(ge=-_LARGEST_REWARD, le=_LARGEST_REWARD)] | None = Field(
         None,
         description="Reward of the step in which the env ends by failure, such as the pole's fall. Training sees it, "
@@ -80,11 +86,11 @@ class EnvSpec(Section):
 
     @property
     def wrapped_args(self) -> dict[str, Any]:
-        """`args` with the wrappers of observations, as needed wherever this environment is made."""
+        """`args` with the wrappers of observations and the mask, as needed wherever this environment is made."""
         # Imported here because the command line reads and prints sweep files without Gymnasium.
         from policies.envs.wrappers import with_wrappers
 
-        return with_wrappers(self.args, frame_stack=self.frame_stack, pixels=self.pixels)
+        return with_wrappers(self.args, frame_stack=self.frame_stack, pixels=self.pixels, action_mask=self.action_mask)
 
 
 class StopSpec(Section):

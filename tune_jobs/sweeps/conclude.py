@@ -15,6 +15,7 @@ from analysis.selection import best_checkpoint as best_of
 from policies.acting.baselines import BASELINES, ConstantPolicy
 from policies.acting.load import load_policy, policy_from_portable
 from policies.acting.policy import Policy, RandomPolicy
+from policies.envs.masks import ACTION_MASK
 from policies.envs.modules import allow_modules
 from policies.envs.wrappers import FRAME_STACK, PIXELS
 from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
@@ -159,7 +160,7 @@ def find_policy(
             store = None
     if env_id is not None and env_id != policy.env_id:
         # The constructor's arguments are those of the other environment; the wrappers of observations are the policy's.
-        wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS)}
+        wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS, ACTION_MASK)}
         return PolicySource(policy, env_id, wrappers, timeout_s=timeout_s)
     return PolicySource(policy, policy.env_id, dict(policy.env_args), store, timeout_s)
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn import loss as dqn
 from policies.packed.dqn.replay import Drawn, StackedReplay
@@ -33,9 +34,10 @@ class DQNGroup:
     Args:
         members: The members.
         shared: The hyperparameters that the members share.
-        num_inputs: Numbers per observation, D.
+        num_inputs: Numbers per observation that networks see, D.
         num_actions: The number of actions, A.
         replay: The replay memory that batches are drawn from.
+        num_masked: The numbers of a mask of actions, before those that networks see: A, or 0 if there is none.
         device: Where the updates are computed; acting is on the CPU.
 
     Attributes:
@@ -51,12 +53,14 @@ class DQNGroup:
         num_actions: int,
         replay: StackedReplay,
         *,
+        num_masked: int,
         device: str,
     ) -> None:
         self.members, self._shared = members, shared
         self.positions: slice | NDArray[np.int64] = slice(0, 0)
         self.learns = False
         self._num_inputs, self._num_actions, self._device = num_inputs, num_actions, device
+        self._num_masked = num_masked
         self._replay, self._slots = replay, replay.slots([member.member_id for member in members])
         self._hyperparams = [member.hyperparams for member in members]
         self._rows = StackedRows(members, num_inputs, num_actions, device)
@@ -113,7 +117,9 @@ class DQNGroup:
         if self._has_schedule:
             self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
         num_updates = len(numbers)
-        observations = Observations(self.members, 1, normalizes=self._shared.normalize_observations)
+        observations = Observations(
+            self.members, 1, normalizes=self._shared.normalize_observations, num_masked=self._num_masked
+        )
         self._optimizer.begin(num_updates)
         stats: list[dict[str, float]] = []
         for number in range(num_updates):
@@ -131,13 +137,15 @@ class DQNGroup:
         return linear(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
 
     def _update(self, drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
-        shared, num_inputs = self._shared, self._num_inputs
+        shared, num_inputs, num_masked = self._shared, self._num_inputs, self._num_masked
         rows = observations.prepare_rows(drawn.rows, num_inputs)
         batch = torch.from_numpy(rows).to(self._device)
-        now, later = batch[..., : num_inputs + 1], batch[..., num_inputs + 1 : 2 * num_inputs + 2]
+        middle = num_masked + num_inputs + 1
+        now, later = batch[..., num_masked:middle], batch[..., middle + num_masked : 2 * middle]
+        masks = batch[..., middle : middle + num_masked] if num_masked else None
         actions, rewards, discounts = batch[..., -3].long(), batch[..., -2], batch[..., -1]
         weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
-        targets = rewards + discounts * self._next_values(later, uses_double_q=shared.double_q)
+        targets = rewards + discounts * self._next_values(later, masks, uses_double_q=shared.double_q)
         loss = dqn.loss_gradient(self._networks.forward(now), actions, targets, weights, shared)
         self._networks.backward(loss.gradient)
         norms = None
@@ -150,11 +158,13 @@ class DQNGroup:
             return []
         return self._stats(dqn.mean_loss(loss.td_errors, weights, shared), loss.q_selected.mean(dim=1), norms)
 
-    def _next_values(self, later: Tensor, *, uses_double_q: bool) -> Tensor:
+    def _next_values(self, later: Tensor, masks: Tensor | None, *, uses_double_q: bool) -> Tensor:
+        """Return Q' of the best next action that the masks, (M, B, A), allow, (M, B)."""
         num_members = len(self.members)
 
         def q_values(rows: StackedRows) -> Tensor:
-            return dqn.q_values(rows.networks.evaluate(later, 0, num_members), self._num_actions)
+            found = dqn.q_values(rows.networks.evaluate(later, 0, num_members), self._num_actions)
+            return found if masks is None else found.masked_fill(masks == 0, FORBIDDEN)
 
         if self._targets is None:
             return dqn.best_next_values(q_values(self._rows), None)

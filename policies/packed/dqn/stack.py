@@ -3,8 +3,8 @@
 An iteration does what `policies.rllib.dqn_algorithm` does for one trial: phases of sampling, each followed by the
 updates that are due.
 
-Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, B rows per batch, D numbers per
-observation.
+Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, B rows per batch, W numbers per
+observation with its mask if there is one, D that networks see.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from policies.packed.dqn.n_step import StackedNStep
 from policies.packed.dqn.replay import make_stacked_replay
 from policies.packed.envs.vector import PackedEnvs, Step
 from policies.packed.member import Member, MemberStats, group_members
-from policies.packed.sampling import Observations, merge_statistics
+from policies.packed.sampling import Observations, allowed_at, mask_outputs, merge_statistics
 from policies.packed.shared import SharedByDQN
 from policies.packed.stack import Stack
 
@@ -42,8 +42,8 @@ class _Draws:
 
     explores: Floats
     """Uniform in [0, 1), (T, M, N); below epsilon, the action is random."""
-    actions: NDArray[np.int64]
-    """The random actions, (T, M, N)."""
+    actions: NDArray[Any]
+    """The random actions, (T, M, N); with masks, the uniform numbers in [0, 1) that they are made of."""
     batches: NDArray[np.float64]
     """Uniform in [0, 1), (phases, most updates of a phase, M, B)."""
 
@@ -53,8 +53,9 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
 
     def __init__(self, shared: SharedByDQN, envs: PackedEnvs, device: str = "cpu") -> None:
         super().__init__(shared, envs, device)
-        self._replay = make_stacked_replay(shared, self._num_inputs)
-        self._n_step = StackedNStep(envs.num_envs, self._num_inputs, shared.n_step)
+        num_observed = self._num_masked + self._num_inputs
+        self._replay = make_stacked_replay(shared, num_observed)
+        self._n_step = StackedNStep(envs.num_envs, num_observed, shared.n_step)
         self._steps_per_phase = math.ceil(shared.train_freq / shared.num_envs)
         """Vector steps between two training phases."""
         self._updates_per_phase = self._steps_per_phase * envs.num_envs * shared.updates_per_env_step
@@ -92,7 +93,13 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         self._groups = []
         for members in groups:
             group = DQNGroup(
-                members, self._shared, self._num_inputs, self._num_actions, self._replay, device=self._device
+                members,
+                self._shared,
+                self._num_inputs,
+                self._num_actions,
+                self._replay,
+                num_masked=self._num_masked,
+                device=self._device,
             )
             indices = np.array([places[member.member_id] for member in members], dtype=np.int64)
             is_run = bool(np.all(np.diff(indices) == 1))
@@ -107,11 +114,17 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         self._ids = [member.member_id for member in self.members]
         self.envs.arrange(self._ids)
         self._schedules = [EpsilonSchedule.of(item.hyperparams) for item in self.members]
-        self._observations = Observations(
-            self.members, self.envs.num_envs, normalizes=self._shared.normalize_observations
-        )
+        self._observations = self._make_observations()
         self._regroup()
         self._stale = False
+
+    def _make_observations(self) -> Observations:
+        return Observations(
+            self.members,
+            self.envs.num_envs,
+            normalizes=self._shared.normalize_observations,
+            num_masked=self._num_masked,
+        )
 
     def _learns(self, member: Member[DQNHyperparams]) -> bool:
         """Whether updates of a member are due."""
@@ -174,12 +187,15 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         most = math.floor(updates_per_phase) + 1
         draws = _Draws(
             np.empty((num_steps, num_members, num_envs), dtype=np.float32),
-            np.empty((num_steps, num_members, num_envs), dtype=np.int64),
+            np.empty((num_steps, num_members, num_envs), dtype=np.float64 if self._num_masked else np.int64),
             np.empty((num_phases, most, num_members, shared.train_batch_size)),
         )
         for index, member in enumerate(self.members):
             draws.explores[:, index] = member.rng.random((num_steps, num_envs), dtype=np.float32)
-            draws.actions[:, index] = member.rng.integers(0, self._num_actions, (num_steps, num_envs))
+            if self._num_masked:
+                draws.actions[:, index] = member.rng.random((num_steps, num_envs))
+            else:
+                draws.actions[:, index] = member.rng.integers(0, self._num_actions, (num_steps, num_envs))
             if shared.replay != "none":
                 draws.batches[:, :, index] = member.rng.random((num_phases, most, shared.train_batch_size))
         return draws
@@ -192,12 +208,17 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         outputs = np.empty((num_members, num_envs, self._num_actions), dtype=np.float32)
         for group in self._groups:
             outputs[group.positions] = group.act(seen[group.positions])
+        randomly = draws.actions[number]
+        if self._num_masked:
+            by_member = observations.reshape(num_members, num_envs, -1)
+            mask_outputs(outputs, by_member, self._num_masked)
+            randomly = allowed_at(randomly, by_member, self._num_masked)
         epsilon = [
             schedule.at(member.num_episodes if schedule.unit == "episode" else member.num_env_steps)
             for schedule, member in zip(self._schedules, self.members, strict=True)
         ]
         explores = draws.explores[number] < np.array(epsilon, dtype=np.float32)[:, None]
-        actions = np.where(explores, draws.actions[number], outputs.argmax(axis=-1)).reshape(-1)
+        actions = np.where(explores, randomly, outputs.argmax(axis=-1)).reshape(-1)
         step = self.envs.step(actions)
         rows = self._n_step.rows(self._ids, observations, actions, step)
         if isinstance(rows, list):
@@ -238,10 +259,11 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         """Merge the observations of the phase into the statistics, if observations are normalised."""
         if not self._shared.normalize_observations:
             return
-        rows = np.stack(self._unlearned).reshape(len(self._unlearned), len(self.members), -1, self._num_inputs)
+        rows = np.stack(self._unlearned)[..., self._num_masked :]
+        rows = rows.reshape(len(self._unlearned), len(self.members), -1, self._num_inputs)
         self._unlearned = []
         for index, member in enumerate(self.members):
             # A refilling member's are in its checkpoint's statistics already, as far as its policy goes on as it did.
             if member.num_env_steps > self._refilled_at.get(member.member_id, 0):
                 merge_statistics(member, rows[:, index].reshape(-1, self._num_inputs))
-        self._observations = Observations(self.members, self.envs.num_envs, normalizes=True)
+        self._observations = self._make_observations()

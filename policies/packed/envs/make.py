@@ -24,6 +24,7 @@ import numpy as np
 from policies import random_streams
 from policies.envs.checked import reward_as_number
 from policies.envs.make import make_env
+from policies.envs.masks import num_masked, sample
 from policies.errors import EnvError
 from policies.packed.envs.vector import EnvKind, PackedEnvs
 
@@ -200,17 +201,21 @@ def _trace(
     env = make_env(env_id, env_args)
     space = copy.deepcopy(env.action_space)  # the env may draw from its own
     space.seed(seed)
-    actions = [space.sample() for _ in range(_TIMED_STEPS)]
-    actions = [action.item() if isinstance(action, np.generic) else action for action in actions]
+    # Drawn before the clock starts; which of them are allowed is known only then.
+    drawn = [] if num_masked(env.observation_space) else [sample(env, space, None) for _ in range(_TIMED_STEPS)]
     deadline = time.perf_counter() + seconds
     # An error of the env is reported by the trial that it happens in.
     with contextlib.suppress(Exception), contextlib.closing(env):
-        yield _Seen(0, np.array(env.reset(seed=seed)[0]))
-        for num_steps, action in enumerate(actions, start=1):
+        now = np.array(env.reset(seed=seed)[0])
+        yield _Seen(0, now)
+        for num_steps in range(1, _TIMED_STEPS + 1):
+            action = drawn[num_steps - 1] if drawn else sample(env, space, now)
             observation, reward, terminated, truncated, _ = env.step(action)
-            seen = _Seen(num_steps, np.array(observation), reward_as_number(reward), bool(terminated), bool(truncated))
+            now = np.array(observation)
+            seen = _Seen(num_steps, now, reward_as_number(reward), bool(terminated), bool(truncated))
             if terminated or truncated or num_steps == cut:
-                seen = seen._replace(first=np.array(env.reset()[0]))
+                now = np.array(env.reset()[0])
+                seen = seen._replace(first=now)
             yield seen
             if time.perf_counter() > deadline:
                 break

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import PPOHyperparams
 from policies.packed.member import Member
 from policies.packed.networks import ActingNetworks
@@ -37,13 +38,15 @@ class Batch:
     actions: Floats
     """Actions, one-hot or as the policy drew them, (M, R, actions)."""
     outputs: Floats
-    """The policy's outputs, (M, R, A)."""
+    """The policy's outputs, (M, R, A), `FORBIDDEN` where an action was not allowed."""
     advantages: Floats
     """Advantages, standardised for members with `normalize_advantages`, (M, R)."""
     value_targets: Floats
     """Value targets, (M, R)."""
     values: Floats | None = None
     """The values V of the observations, (M, R); None: no member has a `vf_clip_range`."""
+    masks: Floats | None = None
+    """Which actions were allowed, (M, R, A); None: all."""
 
 
 class PPOGroup:
@@ -54,7 +57,8 @@ class PPOGroup:
         shared: The hyperparameters that the members share.
         num_inputs: Numbers per observation.
         num_outputs: The number of outputs of the policy's head.
-        is_gaussian: Whether actions are continuous.
+        heads: What those outputs mean.
+        num_masked: The numbers of a mask of actions: A, or 0 if there is none.
         device: Where the updates are computed; acting is on the CPU.
     """
 
@@ -65,11 +69,13 @@ class PPOGroup:
         num_inputs: int,
         num_outputs: int,
         *,
-        is_gaussian: bool,
+        heads: ppo.Heads,
+        num_masked: int,
         device: str,
     ) -> None:
         self.members, self._shared = members, shared
-        self._num_outputs, self._is_gaussian, self._device = num_outputs, is_gaussian, device
+        self._num_outputs, self._heads, self._device = num_outputs, heads, device
+        self._num_masked = num_masked
         self._rows = StackedRows(members, num_inputs, num_outputs, device)
         self._networks = self._rows.networks
         self._shares = self._rows.networks_per_member == 1
@@ -130,7 +136,7 @@ class PPOGroup:
             minibatch = self._minibatch(rows)
             minibatch.old_values = None if old_values is None else old_values[chosen]
             if number == num_updates - 1:
-                parts = ppo.loss(outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian)
+                parts = ppo.loss(outputs, values, minibatch, self._coefficients, heads=self._heads)
             norms = self._update(outputs, values, minibatch)
         assert parts is not None
         self._unfinished = parts, norms, num_updates
@@ -149,11 +155,12 @@ class PPOGroup:
         observations = batch.observations
         num_members, num_rows, num_inputs = observations.shape
         num_actions, num_outputs = batch.actions.shape[2], self._num_outputs
-        self._bounds = np.cumsum([num_inputs + 1, num_actions, 1, 1, 1, num_outputs]).tolist()
+        keeps_outputs, num_masked = self._shared.use_kl_loss, self._num_masked
+        sizes = [num_inputs + 1, num_actions, 1, 1, 1, num_outputs if keeps_outputs else 0, num_masked]
+        self._bounds = np.cumsum(sizes).tolist()
         actions, outputs = torch.from_numpy(batch.actions), torch.from_numpy(batch.outputs)
-        logp = ppo.log_probabilities(outputs, actions, is_gaussian=self._is_gaussian)
-        keeps_outputs = self._shared.use_kl_loss
-        columns = np.empty((num_members, num_rows, self._bounds[-1 if keeps_outputs else -2]), dtype=np.float32)
+        logp = ppo.log_probabilities(outputs, actions, heads=self._heads)
+        columns = np.empty((num_members, num_rows, self._bounds[-1]), dtype=np.float32)
         columns[..., :num_inputs] = observations
         columns[..., num_inputs] = 1.0
         columns[..., num_inputs + 1 : self._bounds[1]] = batch.actions
@@ -161,7 +168,9 @@ class PPOGroup:
         columns[..., self._bounds[2]] = batch.advantages
         columns[..., self._bounds[3]] = batch.value_targets
         if keeps_outputs:
-            columns[..., self._bounds[4] :] = batch.outputs
+            columns[..., self._bounds[4] : self._bounds[5]] = batch.outputs
+        if batch.masks is not None:
+            columns[..., self._bounds[5] :] = batch.masks
         return torch.from_numpy(columns).view(num_members * num_rows, -1).to(self._device)
 
     def _draw_rows(self, num_rows: int, num_drawn: int) -> NDArray[np.int64]:
@@ -179,10 +188,16 @@ class PPOGroup:
         observations = rows[..., : self._bounds[0]]
         if self._shares:
             outputs = self._networks.forward(observations)
-            return outputs[..., : self._num_outputs], outputs[..., -1]
+            return self._allowed(outputs[..., : self._num_outputs], rows), outputs[..., -1]
         outputs = self._networks.forward(observations.repeat(2, 1, 1))
         num_members = len(self.members)
-        return outputs[:num_members], outputs[num_members:, :, 0]
+        return self._allowed(outputs[:num_members], rows), outputs[num_members:, :, 0]
+
+    def _allowed(self, outputs: Tensor, rows: Tensor) -> Tensor:
+        """Return logits, (M, B, A), `FORBIDDEN` where the rows' masks forbid the action: no gradient comes of these."""
+        if not self._num_masked:
+            return outputs
+        return outputs.masked_fill(rows[..., self._bounds[5] :] == 0, FORBIDDEN)
 
     def _minibatch(self, rows: Tensor) -> ppo.Minibatch:
         bounds = self._bounds
@@ -191,13 +206,13 @@ class PPOGroup:
             logp=rows[..., bounds[1]],
             advantages=rows[..., bounds[2]],
             value_targets=rows[..., bounds[3]],
-            old_outputs=rows[..., bounds[4] :] if self._shared.use_kl_loss else None,
+            old_outputs=rows[..., bounds[4] : bounds[5]] if self._shared.use_kl_loss else None,
         )
 
     def _update(self, outputs: Tensor, values: Tensor, minibatch: ppo.Minibatch) -> Tensor | None:
         """Make one gradient step and return the gradients' norms, (M, 1), if any are clipped."""
         policy_gradient, value_gradient = ppo.gradients(
-            outputs, values, minibatch, self._coefficients, is_gaussian=self._is_gaussian
+            outputs, values, minibatch, self._coefficients, heads=self._heads
         )
         num_members, num_rows = values.shape
         networks = self._networks

@@ -4,7 +4,8 @@ Source: Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equatio
 `PPOTorchLearner.compute_loss_for_module` (2.60), which clips the squared value error and adds an adaptive KL penalty;
 the range of values is that of PPO2 in OpenAI's Baselines.
 
-Shapes: M members, B rows of a minibatch per member, A actions (or components of an action).
+Shapes: M members, B rows of a minibatch per member, A actions (or components of an action, or the values of all choices
+of an action, one choice after another).
 """
 
 from __future__ import annotations
@@ -17,6 +18,37 @@ from torch import Tensor
 
 LOG_STD_CLIP = 20.0  # RLlib's value, as in policies.networks.rl_modules
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(frozen=True)
+class Heads:
+    """What the outputs of a policy mean."""
+
+    sizes: tuple[int, ...]
+    """How many values each choice of an action has; empty: actions are continuous."""
+
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether actions are continuous: means and log standard deviations, not logits."""
+        return not self.sizes
+
+    def log_softmax(self, outputs: Tensor) -> Tensor:
+        """Return the log probability of each value of each choice, (..., A)."""
+        if len(self.sizes) == 1:
+            return torch.log_softmax(outputs, dim=-1)
+        return torch.cat([torch.log_softmax(logits, dim=-1) for logits in self._each(outputs)], dim=-1)
+
+    def entropies(self, probabilities: Tensor, logp: Tensor) -> Tensor:
+        """Return the entropy of each value's choice, (..., A), or (..., 1) if there is one choice."""
+        products = probabilities * logp
+        if len(self.sizes) == 1:
+            return -products.sum(dim=-1, keepdim=True)
+        return torch.cat([-part.sum(dim=-1, keepdim=True).expand_as(part) for part in self._each(products)], dim=-1)
+
+    def _each(self, values: Tensor) -> tuple[Tensor, ...]:
+        """Return the values of each choice."""
+        found: tuple[Tensor, ...] = values.split(self.sizes, dim=-1)  # type: ignore[no-untyped-call]
+        return found
 
 
 @dataclass(eq=False)
@@ -38,7 +70,7 @@ class Minibatch:
     """The rows of one update."""
 
     actions: Tensor
-    """Discrete actions one-hot, continuous ones as the policy drew them, (M, B, A)."""
+    """Choices one-hot, one after another, continuous actions as the policy drew them, (M, B, A)."""
     logp: Tensor
     """Log probability of the action when it was drawn, (M, B)."""
     advantages: Tensor
@@ -63,7 +95,7 @@ class Parts:
 
 
 def gradients(
-    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, is_gaussian: bool
+    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, heads: Heads
 ) -> tuple[Tensor, Tensor]:
     """Return the gradients of each member's loss with respect to policy outputs and values.
 
@@ -72,16 +104,16 @@ def gradients(
         values: The value function's outputs, (M, B).
         batch: The rows.
         coefficients: The members' coefficients.
-        is_gaussian: Whether the actions are continuous.
+        heads: What the outputs mean.
 
     Returns:
         Two tensors with the shapes of `outputs` and `values`.
     """
-    if is_gaussian:
-        return _by_autograd(outputs, values, batch, coefficients)
+    if heads.is_gaussian:
+        return _by_autograd(outputs, values, batch, coefficients, heads)
     # Written out, because torch's graph of these small tensors would cost more than the networks.
     num_rows = outputs.shape[1]
-    logp_all = torch.log_softmax(outputs, dim=-1)
+    logp_all = heads.log_softmax(outputs)
     probabilities = logp_all.exp()
     logp = (logp_all * batch.actions).sum(dim=-1)
     ratio = (logp - batch.logp).exp_()
@@ -91,11 +123,11 @@ def gradients(
     weight = torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / num_rows)
     out = (probabilities - batch.actions).mul_(weight.unsqueeze(-1))
     if bool(coefficients.entropy_coeff.any()):
-        entropy = -(probabilities * logp_all).sum(dim=-1, keepdim=True)
+        entropy = heads.entropies(probabilities, logp_all)
         scale = (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
         out += (logp_all + entropy).mul_(probabilities).mul_(scale)
     if batch.old_outputs is not None:
-        old = torch.softmax(batch.old_outputs, dim=-1)
+        old = heads.log_softmax(batch.old_outputs).exp() if len(heads.sizes) > 1 else batch.old_outputs.softmax(dim=-1)
         out += (probabilities - old).mul_((coefficients.kl_coeff / num_rows).unsqueeze(-1))
     return out, _value_gradient(values, batch, coefficients)
 
@@ -126,50 +158,50 @@ def _squared_errors(values: Tensor, batch: Minibatch, coefficients: Coefficients
 
 
 def _by_autograd(
-    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients
+    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, heads: Heads
 ) -> tuple[Tensor, Tensor]:
     outputs, values = outputs.detach().requires_grad_(), values.detach().requires_grad_()
     with torch.enable_grad():
-        total = loss(outputs, values, batch, coefficients, is_gaussian=True).total_loss.sum()
+        total = loss(outputs, values, batch, coefficients, heads=heads).total_loss.sum()
         policy_gradient, value_gradient = torch.autograd.grad(total, (outputs, values))
     return policy_gradient, value_gradient
 
 
-def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, is_gaussian: bool) -> Parts:
+def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, heads: Heads) -> Parts:
     """Return each member's loss and its parts, as RLlib computes them; the arguments are those of `gradients`."""
-    logp, entropy = _logp_and_entropy(outputs, batch.actions, is_gaussian=is_gaussian)
+    logp, entropy = _logp_and_entropy(outputs, batch.actions, heads=heads)
     ratio = torch.exp(logp - batch.logp)
     limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param)
     surrogate = torch.min(batch.advantages * ratio, batch.advantages * limited)
     vf_loss = torch.minimum(_squared_errors(values, batch, coefficients), coefficients.vf_clip_param)
     kl = torch.zeros_like(entropy)
     if batch.old_outputs is not None:
-        kl = _kl(batch.old_outputs, outputs, is_gaussian=is_gaussian)
+        kl = _kl(batch.old_outputs, outputs, heads=heads)
     rows = -surrogate + coefficients.vf_loss_coeff * vf_loss - coefficients.entropy_coeff * entropy
     rows = rows + coefficients.kl_coeff * kl
     return Parts(rows.mean(dim=1), -surrogate.mean(dim=1), vf_loss.mean(dim=1), entropy.mean(dim=1), kl.mean(dim=1))
 
 
-def _logp_and_entropy(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) -> tuple[Tensor, Tensor]:
+def _logp_and_entropy(outputs: Tensor, actions: Tensor, *, heads: Heads) -> tuple[Tensor, Tensor]:
     """Return the log probability of the actions and the entropy of the policy, (M, B) each."""
-    if not is_gaussian:
-        logp_all = torch.log_softmax(outputs, dim=-1)
+    if not heads.is_gaussian:
+        logp_all = heads.log_softmax(outputs)
         return (logp_all * actions).sum(dim=-1), -(logp_all.exp() * logp_all).sum(dim=-1)
     mean, log_std = _split(outputs)
     rows = -0.5 * ((actions - mean) / log_std.exp()) ** 2 - log_std - _HALF_LOG_TWO_PI
     return rows.sum(dim=-1), (log_std + 0.5 + _HALF_LOG_TWO_PI).sum(dim=-1)
 
 
-def log_probabilities(outputs: Tensor, actions: Tensor, *, is_gaussian: bool) -> Tensor:
+def log_probabilities(outputs: Tensor, actions: Tensor, *, heads: Heads) -> Tensor:
     """Return the log probability of the actions, (M, B); the arguments are those of `gradients`."""
-    return _logp_and_entropy(outputs, actions, is_gaussian=is_gaussian)[0]
+    return _logp_and_entropy(outputs, actions, heads=heads)[0]
 
 
-def _kl(old: Tensor, new: Tensor, *, is_gaussian: bool) -> Tensor:
+def _kl(old: Tensor, new: Tensor, *, heads: Heads) -> Tensor:
     """Return the KL divergence of the present policy from the one that drew the actions, (M, B)."""
-    if not is_gaussian:
-        old_logp = torch.log_softmax(old, dim=-1)
-        return (old_logp.exp() * (old_logp - torch.log_softmax(new, dim=-1))).sum(dim=-1)
+    if not heads.is_gaussian:
+        old_logp = heads.log_softmax(old)
+        return (old_logp.exp() * (old_logp - heads.log_softmax(new))).sum(dim=-1)
     old_mean, old_log_std = _split(old)
     mean, log_std = _split(new)
     squares = torch.exp(2 * old_log_std) + (old_mean - mean) ** 2

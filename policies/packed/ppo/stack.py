@@ -1,7 +1,7 @@
 """Train PPO for the members of a pack that share a tensor program: one vector of environments, one batched update.
 
-Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, R = T * N, D numbers per observation,
-A outputs of the policy.
+Shapes: M members, T vector steps, N sub-environments per member, S = M * N rows, R = T * N, W numbers per observation
+with its mask if there is one, D that networks see, A outputs of the policy.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import contextlib
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,15 +18,17 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from policies.acting.policy import largest_of_each
 from policies.envs.action_bounds import ToBounds
+from policies.envs.own_actions import sizes_of
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.vector import PackedEnvs
 from policies.packed.member import Member, MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo.gae import advantages_and_targets, standardise
 from policies.packed.ppo.group import Batch, PPOGroup
-from policies.packed.ppo.loss import LOG_STD_CLIP
-from policies.packed.sampling import Observations, one_hot
+from policies.packed.ppo.loss import LOG_STD_CLIP, Heads
+from policies.packed.sampling import Observations, mask_outputs, one_hot
 from policies.packed.shared import SharedByPPO
 from policies.packed.stack import Stack
 from policies.return_statistics import discounted_returns
@@ -37,18 +39,18 @@ Floats = NDArray[np.float32]
 class Fragment:
     """The results of T vector steps, as columns of shape (T, S, ...)."""
 
-    def __init__(self, num_steps: int, num_rows: int, num_inputs: int, num_outputs: int) -> None:
+    def __init__(self, num_steps: int, num_rows: int, num_observed: int, num_outputs: int) -> None:
         shape = (num_steps, num_rows)
-        self.observations = np.empty((*shape, num_inputs), dtype=np.float32)
+        self.observations = np.empty((*shape, num_observed), dtype=np.float32)
         self.outputs = np.empty((*shape, num_outputs), dtype=np.float32)
         self.actions: NDArray[Any] = np.empty(0)
-        """Whole numbers, (T, S), or continuous actions as the policy drew them, (T, S, num_actions)."""
+        """Whole numbers, (T, S) or (T, S, choices), or continuous actions as drawn, (T, S, num_actions)."""
         self.rewards, self.own_rewards = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         """The rewards to learn from, normalised for members with `normalize_rewards`, and the env's own, (T, S)."""
         self.terminated, self.ended = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
         self.cuts: list[tuple[int, int, Floats]] = []
         """The step, the row and the last observation of each truncated episode."""
-        self.last: Floats = np.empty((num_rows, num_inputs), dtype=np.float32)
+        self.last: Floats = np.empty((num_rows, num_observed), dtype=np.float32)
         """The observations that the next actions answer."""
 
 
@@ -62,12 +64,14 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         """The discounted returns of running episodes, (N,), of members that normalise rewards."""
         self._stream = torch.cuda.Stream() if device.startswith("cuda") else None  # type: ignore[no-untyped-call]
         space = envs.action_space
-        self._is_gaussian = isinstance(space, gym.spaces.Box)
+        self._heads = Heads(sizes_of(space))
+        self._is_gaussian = self._heads.is_gaussian
+        self._is_one_choice = isinstance(space, gym.spaces.Discrete)
+        self._num_actions = sum(self._heads.sizes)
+        """The values of all choices, or the components of continuous actions."""
         if isinstance(space, gym.spaces.Box):
             self._num_actions = math.prod(space.shape)
             self._to_bounds = ToBounds(space)
-        else:
-            self._num_actions = int(cast("gym.spaces.Discrete[Any]", space).n)
         self._num_outputs = self._num_actions * (2 if self._is_gaussian else 1)
 
     @override
@@ -89,13 +93,16 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
                 self._shared,
                 self._num_inputs,
                 self._num_outputs,
-                is_gaussian=self._is_gaussian,
+                heads=self._heads,
+                num_masked=self._num_masked,
                 device=self._device,
             )
             for group in groups
         ]
         normalizes = self._shared.normalize_observations
-        self._observations = Observations(self.members, self.envs.num_envs, normalizes=normalizes)
+        self._observations = Observations(
+            self.members, self.envs.num_envs, normalizes=normalizes, num_masked=self._num_masked
+        )
         self._stale = False
 
     def begin_iteration(self) -> None:
@@ -136,7 +143,8 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
 
     def _sample(self, num_steps: int) -> Fragment:
         envs, num_members, num_envs = self.envs, len(self.members), self.envs.num_envs
-        fragment = Fragment(num_steps, num_members * num_envs, self._num_inputs, self._num_outputs)
+        num_observed = self._num_masked + self._num_inputs
+        fragment = Fragment(num_steps, num_members * num_envs, num_observed, self._num_outputs)
         noise = self._draw_noise(num_steps)
         envs.begin(num_steps)
         bounds = np.cumsum([0, *(len(group.members) for group in self._groups)]).tolist()
@@ -147,6 +155,8 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             seen = self._observations.prepare(envs.observations)
             for group, start, stop in zip(self._groups, bounds, bounds[1:], strict=False):
                 outputs[step, start:stop] = group.act(seen[start:stop])
+            if self._num_masked:
+                mask_outputs(fragment.outputs[step], fragment.observations[step], self._num_masked)
             actions = self._choose(fragment.outputs[step], noise[step])
             chosen.append(actions)
             done = envs.step(self._to_env(actions))
@@ -189,7 +199,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         if not self._is_gaussian:
             np.maximum(noise, np.finfo(np.float32).tiny, out=noise)
             np.negative(np.log(noise, out=noise), out=noise)
-            if self._num_actions == 2:
+            if self._is_one_choice and self._num_actions == 2:
                 # With two actions only the difference counts.
                 noise = noise[..., 0] - noise[..., 1]
         return noise
@@ -199,6 +209,8 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         if self._is_gaussian:
             mean, log_std = outputs[:, : self._num_actions], outputs[:, self._num_actions :]
             return np.asarray(mean + np.exp(log_std.clip(-LOG_STD_CLIP, LOG_STD_CLIP)) * noise, dtype=np.float32)
+        if not self._is_one_choice:
+            return largest_of_each(outputs + noise, self._heads.sizes)
         if self._num_actions == 2:
             return np.asarray(outputs[:, 1] - outputs[:, 0] > noise, dtype=np.int64)
         return np.asarray((outputs + noise).argmax(axis=1), dtype=np.int64)
@@ -236,8 +248,11 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             gae_lambda=np.array([item.gae_lambda for item in hyperparams], dtype=np.float32)[repeat],
         )
         actions = fragment.actions[:, rows]
-        if not self._is_gaussian:
+        if self._is_one_choice:
             actions = one_hot(actions, self._num_actions)
+        elif not self._is_gaussian:
+            each = [one_hot(actions[..., place], size) for place, size in enumerate(self._heads.sizes)]
+            actions = np.concatenate(each, axis=-1)
         limits_values = any(item.vf_clip_range is not None for item in hyperparams)
         return Batch(
             observations=seen,
@@ -246,6 +261,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             advantages=_as_learnt(by_member(advantages), hyperparams),
             value_targets=by_member(targets),
             values=by_member(values) if limits_values else None,
+            masks=by_member(fragment.observations[:, rows, : self._num_masked]) if self._num_masked else None,
         )
 
     def _values(

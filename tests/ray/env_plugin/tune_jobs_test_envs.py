@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+from tune_jobs_test_actions import Forbidding, ForbiddingTwo, Reply
 
 # The block of seeds that belongs to one trial: those of its sub-environments.
 SEEDS_PER_TRIAL = 1024
@@ -310,6 +311,9 @@ def register() -> None:
         ("TestShades-v0", Shades, None),
         ("TestPrecise-v0", Precise, None),
         ("TestSecret-v0", Secret, None),
+        ("TestReply-v0", Reply, None),
+        ("TestForbidding-v0", Forbidding, None),
+        ("TestForbiddingTwo-v0", ForbiddingTwo, None),
     ):
         if env_id not in gym.registry:
             # Gymnasium's type asks for classes that take any keywords.

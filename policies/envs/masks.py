@@ -1,0 +1,377 @@
+"""Masks of actions: which of its choices an environment allows in its present state.
+
+A *mask* has a 1 for each value of each choice that is allowed, one choice after another, and a 0 for the others. It
+travels as the first numbers of what is observed (`MaskedBox`), so that it is wherever an observation is: in batches,
+replay memories, checkpoints' spaces, evaluations and videos. Networks see what is behind it.
+
+An environment says its mask in one of three places, all known by one name: as a member of its Dict observations, by a
+method, as Stable-Baselines3's contributions have it (`action_masks()`), or in the infos of reset and step.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from policies.envs.flat import FlatBox, needs_flattening
+from policies.envs.own_actions import sizes_of
+from policies.errors import EnvError, shortened
+
+ACTION_MASK = "action_mask"
+"""The key of an environment's arguments that names its mask, and the name of a mask that needs not be named."""
+METHOD = "action_masks"
+"""The method that needs not be named."""
+FORBIDDEN = float(np.finfo(np.float32).min)
+"""The logit, or the Q-value, of what is not allowed: as good as minus infinity, but no NaN comes of it."""
+
+Source = Literal["observation", "method", "info"]
+Setting = str | bool | None
+
+
+class MaskedBox(gym.spaces.Box):
+    """Vectors that begin with a mask.
+
+    Args:
+        seen: The space of what is behind the mask, which networks see.
+        sizes: How many values each choice of an action has.
+        original: The environment's own space; None: that is not known, as of stacked frames.
+        key: The member of the environment's Dict that is the mask; None: it does not come with the observation.
+
+    Attributes:
+        seen, sizes, original, key: The same.
+        num_masked: How many numbers a mask has.
+    """
+
+    def __init__(
+        self,
+        seen: gym.spaces.Box,
+        sizes: tuple[int, ...],
+        *,
+        original: gym.Space[Any] | None = None,
+        key: str | None = None,
+    ) -> None:
+        self.seen, self.sizes, self.original, self.key = seen, sizes, original, key
+        self.num_masked = sum(sizes)
+        mask = np.ones(self.num_masked, np.float32)
+        with np.errstate(over="ignore"):
+            low, high = (np.asarray(bound, np.float32) for bound in (seen.low, seen.high))
+        super().__init__(np.concatenate([0 * mask, low]), np.concatenate([mask, high]), dtype=np.float32)
+
+    @classmethod
+    def of(cls, original: gym.Space[Any], sizes: tuple[int, ...], key: str | None) -> MaskedBox:
+        """Return the space for an environment's own.
+
+        Raises:
+            ValueError: No vectors can be made of what is observed.
+        """
+        seen = original
+        if key is not None:
+            assert isinstance(original, gym.spaces.Dict)
+            seen = gym.spaces.Dict({name: space for name, space in original.spaces.items() if name != key})
+        made = FlatBox(seen) if needs_flattening(seen) else seen
+        assert isinstance(made, gym.spaces.Box)
+        if len(made.shape) != 1:
+            raise ValueError(f"images of shape {made.shape}")
+        return cls(made, sizes, original=original, key=key)
+
+    def joined(self, observation: Any, mask: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the vector for one observation of the environment's own and its mask.
+
+        Raises:
+            ValueError: The observation is not of the space.
+        """
+        seen = self.seen
+        numbers = seen.flat(observation) if isinstance(seen, FlatBox) else np.asarray(observation, np.float32)
+        if numbers.shape != seen.shape:
+            raise ValueError(f"an observation of shape {numbers.shape}, not {seen.shape}")
+        return np.concatenate([mask, numbers])
+
+    def joined_or_own(self, observations: Any, mask: Any) -> Any:
+        """Return vectors with masks: what is one, or a batch of them, as it is; else made of observations and masks.
+
+        Args:
+            observations: Vectors with masks; or, with `mask`, of what networks see; or one observation of the
+                environment's own, or a list of such.
+            mask: One for each observation; None: they are in the observations.
+
+        Raises:
+            ValueError: It is neither, or there is no mask.
+        """
+        if mask is None and self.key is not None:
+            if isinstance(observations, Mapping):
+                mask = self._mask_in(observations)
+            elif isinstance(observations, list) and observations and isinstance(observations[0], Mapping):
+                mask = [self._mask_in(one) for one in observations]
+        if mask is None:
+            if np.shape(observations)[-1:] != self.shape:
+                raise ValueError("there is no mask")
+            return observations
+        seen = self.seen
+        rows = seen.flat_or_own(observations) if isinstance(seen, FlatBox) else observations
+        # A mask that a vector has already is replaced.
+        vectors = np.asarray(rows, np.float32)[..., -seen.shape[0] :]
+        if vectors.ndim == 1:
+            return np.concatenate([self._checked(mask), vectors])
+        if len(mask) != len(vectors):
+            raise ValueError(f"there are {len(mask)} masks for {len(vectors)} observations")
+        return np.concatenate([np.stack([self._checked(one) for one in mask]), vectors], axis=-1)
+
+    def _mask_in(self, observation: Mapping[str, Any]) -> Any:
+        if self.key is None or self.key not in observation:
+            raise ValueError(f"an observation with no member {self.key!r}")
+        return observation[self.key]
+
+    def _checked(self, mask: Any) -> NDArray[np.float32]:
+        try:
+            return checked_mask(mask, self.sizes)
+        except MaskProblemError as error:
+            raise ValueError(f"{shortened(mask)} is the mask, {error}") from None
+
+    @override
+    def __repr__(self) -> str:
+        return f"{self.seen!r} behind a mask of {self.num_masked} actions"
+
+
+class MaskProblemError(ValueError):
+    """A value is no mask; the message fits behind the value."""
+
+
+def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return a mask as a vector of zeros and ones.
+
+    Args:
+        mask: Zeros and ones, or false and true, in any shape; or one such array for each choice.
+        sizes: How many values each choice has.
+
+    Raises:
+        MaskProblemError: It is something else, or a choice has no value that is allowed.
+    """
+    num = sum(sizes)
+    try:
+        parts = mask if isinstance(mask, tuple | list) else [mask]
+        values = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
+    except ValueError:
+        values = np.empty(0, dtype=object)
+    if values.dtype.kind not in "biuf" or values.size != num:
+        raise MaskProblemError(f"not {num} zeros and ones, one for each action")
+    if not ((values == 0) | (values == 1)).all():
+        raise MaskProblemError("not zeros and ones")
+    checked = values.astype(np.float32)
+    if len(sizes) == 1:
+        if not checked.any():
+            raise MaskProblemError("which forbids every action")
+        return checked
+    for number, allowed in enumerate(np.add.reduceat(checked, np.cumsum((0, *sizes[:-1])))):
+        if not allowed:
+            raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
+    return checked
+
+
+class MasksActions(gym.Wrapper[Any, Any, Any, Any]):
+    """Observes vectors that begin with the environment's mask.
+
+    Args:
+        env: Takes `Discrete` or `Choices`.
+        space: The space of the vectors.
+        source: Where the mask is.
+        name: The name of the member, the method or the info.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], space: MaskedBox, source: Source, name: str) -> None:
+        super().__init__(env)
+        self.observation_space = self.space = space
+        self.source, self.name = source, name
+        self._num_steps = 0
+        self._everything = np.ones(space.num_masked, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment.
+
+        Raises:
+            ValueError: Its observation or its mask is none.
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._num_steps = 0
+        return self._joined(observation, info, is_over=False), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment.
+
+        Raises:
+            ValueError: Its observation or its mask is none. Where an episode has terminated there may be no mask, or
+                one that forbids everything: nobody acts there.
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._num_steps += 1
+        return self._joined(observation, info, is_over=bool(terminated)), reward, terminated, truncated, info
+
+    def _joined(self, observation: Any, info: Any, *, is_over: bool) -> NDArray[np.float32]:
+        mask = self._mask(observation, info, is_over=is_over)
+        try:
+            return self.space.joined(observation, mask)
+        except ValueError as error:
+            raise ValueError(f"the environment returned {error}") from None
+
+    def _mask(self, observation: Any, info: Any, *, is_over: bool) -> NDArray[np.float32]:
+        when = (
+            f"after env step {self._num_steps} of an episode" if self._num_steps else "at the beginning of an episode"
+        )
+        value: Any = None
+        if self.source == "method":
+            value = self.env.get_wrapper_attr(self.name)()
+        else:
+            holder = observation if self.source == "observation" else info
+            try:
+                value = holder[self.name]
+            except (KeyError, TypeError, IndexError):
+                if is_over:
+                    return self._everything
+                known = sorted(map(str, holder)) if isinstance(holder, dict) else shortened(holder)
+                else_ = "" if self.source == "observation" else ", nor such a member of the observations, nor a method"
+                raise ValueError(f"there is no {self.place} {when}{else_}; there is {known}") from None
+        try:
+            return checked_mask(value, self.space.sizes)
+        except MaskProblemError as error:
+            if is_over:
+                return self._everything
+            shown = shortened(np.asarray(value).tolist() if isinstance(value, np.ndarray) else value)
+            raise ValueError(f"the environment gave {shown} as {self.place} {when}, {error}") from None
+
+    @property
+    def place(self) -> str:
+        """Where the mask comes from, in words."""
+        return f"{self.name}()" if self.source == "method" else f"{self.source}[{self.name!r}]"
+
+
+def num_masked(space: gym.Space[Any]) -> int:
+    """Return how many of the first numbers of an observation are a mask."""
+    return space.num_masked if isinstance(space, MaskedBox) else 0
+
+
+def seen_by_networks(space: gym.Space[Any]) -> gym.Space[Any]:
+    """Return the space of what networks see of an observation."""
+    return space.seen if isinstance(space, MaskedBox) else space
+
+
+def sample(env: gym.Env[Any, Any], space: gym.Space[Any], observation: Any) -> Any:
+    """Draw an action that is allowed, from a copy of an environment's action space, as plain a value as can be."""
+    observed = env.observation_space
+    if isinstance(observed, MaskedBox):
+        action = draw_allowed(space, np.asarray(observation)[: observed.num_masked], observed.sizes)
+    else:
+        action = space.sample()
+    # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
+    return action.item() if isinstance(action, np.generic) else action
+
+
+def draw_allowed(space: gym.Space[Any], mask: NDArray[Any], sizes: tuple[int, ...]) -> Any:
+    """Draw an action of a space, uniformly from what a mask allows."""
+    blocks = np.split(mask.astype(np.int8), np.cumsum(sizes)[:-1])
+    return space.sample(mask=blocks[0] if isinstance(space, gym.spaces.Discrete) else tuple(blocks))
+
+
+def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
+    """Return an environment that observes its mask before all else: itself if it has none, or none is wanted.
+
+    Args:
+        env: Takes the actions that policies give.
+        setting: The name of the mask; True: `action_mask`, or a method `action_masks`; None: the same, but not if it
+            were an info; False: what there may be is no mask.
+
+    Raises:
+        EnvError: The mask that is named cannot be one.
+    """
+    found = _find(env, setting)
+    if found is None:
+        return env
+    source, name = found
+    sizes, env_id = sizes_of(env.action_space), _name(env)
+    place = {"observation": "the member", "method": "the method", "info": "the info"}[source]
+    if not sizes:
+        if setting is None:
+            return env
+        raise EnvError(
+            f"{env_id} has {ACTION_MASK} {setting!r}, but its actions are no choices ({env.action_space}): only choices"
+            " can be forbidden.",
+            f"Leave env.{ACTION_MASK} out, or set it to false.",
+        )
+    hint = f"Mend the env, or set env.{ACTION_MASK}: false, and {place} {name!r} is no mask."
+    observed = env.observation_space
+    if source == "observation":
+        assert isinstance(observed, gym.spaces.Dict)
+        if problem := _member_problem(observed, name, sum(sizes)):
+            raise EnvError(f"{env_id} observes a mask of actions, {name!r}, {problem}.", hint)
+    try:
+        space = MaskedBox.of(observed, sizes, name if source == "observation" else None)
+    except ValueError as error:
+        if isinstance(observed, gym.spaces.Box):
+            raise EnvError(f"{env_id} has a mask of actions, {name!r}, but observes {error}: masks go with vectors.",
+                           f"Observe vectors, or set env.{ACTION_MASK}: false.") from error  # fmt: skip
+        # Said by who checks the environment.
+        return env
+    return MasksActions(env, space, source, name)
+
+
+def masks_actions(env: gym.Env[Any, Any]) -> MasksActions | None:
+    """Return the wrapper that observes an environment's mask; None: there is none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, MasksActions):
+            return env
+        env = env.env
+    return None
+
+
+def check_setting(setting: Any) -> Setting:
+    """Return what an environment's arguments say of its mask.
+
+    Raises:
+        EnvError: It is neither a name nor false.
+    """
+    if setting is None or isinstance(setting, bool) or (isinstance(setting, str) and setting):
+        return setting
+    raise EnvError(
+        f"{ACTION_MASK} is {setting!r}; it must be the name of the mask, true or false.",
+        "Give the name of a member of the observations, of a method, or of an info; leave it out for 'action_mask'.",
+    )
+
+
+def _find(env: gym.Env[Any, Any], setting: Setting) -> tuple[Source, str] | None:
+    """Return where the mask is, and its name."""
+    if setting is False:
+        return None
+    observed = env.observation_space
+    members = observed.spaces if isinstance(observed, gym.spaces.Dict) else {}
+    name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
+    if name in members:
+        return "observation", name
+    if env.has_wrapper_attr(method) and _needs_nothing(env.get_wrapper_attr(method)):
+        return "method", method
+    return None if setting is None else ("info", name)
+
+
+def _needs_nothing(method: Any) -> bool:
+    """Whether something is a method that needs no arguments; Taxi's `action_mask(state)` does."""
+    try:
+        inspect.signature(method).bind()
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _member_problem(observed: gym.spaces.Dict, name: str, num: int) -> str:
+    if len(observed.spaces) == 1:
+        return "and nothing else"
+    shape = observed[name].shape
+    if shape is not None and int(np.prod(shape)) == num:
+        return ""
+    return f"of {shortened(observed[name])}, but there are {num} actions to allow"
+
+
+def _name(env: gym.Env[Any, Any]) -> str:
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
