@@ -19,7 +19,7 @@ from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.proposal import next_point
 
 NUM_RUNS = 5
-METHODS = ("random", "tpe")
+METHODS = ("random", "tpe", "gp", "forest")
 """The methods that choose points for whole trainings."""
 
 Returns = Sequence[float | None]
