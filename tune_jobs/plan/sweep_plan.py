@@ -35,6 +35,7 @@ from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
 from tune_jobs.plan.points import num_points_of, num_trials_of, place_of_point, point_hyperparams, trial_id
 from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.chosen_point import outside_notes
+from tune_jobs.search.given_points import given_points
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.proposal import check_installed
 from tune_jobs.spec.engines import engine_named
@@ -140,7 +141,7 @@ def make_plan(
     records: Sequence[TrialRecord] = (),
     *,
     replications: Sequence[ReplicationRecord] = (),
-    chosen_points: Sequence[ChosenPointRecord] = (),
+    chosen_points: Sequence[ChosenPointRecord] | None = None,
     retry_failed: bool = False,
 ) -> SweepPlan:
     """Plan a sweep for a machine.
@@ -150,17 +151,19 @@ def make_plan(
         machine: What it runs on.
         records: The records of trials that exist already, which keep their engines.
         replications: More seeds of some points, oldest first.
-        chosen_points: Points that somebody chose, oldest first.
+        chosen_points: Points that somebody chose, oldest first; None: those of the sweep file, as for a new sweep.
         retry_failed: Whether the failed ones of them run again.
 
     Raises:
         EnvError: The environment isn't registered, can't be made, or doesn't fit the algorithm.
-        SpecError: A point's values contradict each other or the environment, there are too many trials, a class is in
-            a module that is not allowed, trials can't be packed though the sweep asks for it, or a new sweep searches
-            a hyperparameter that can't act, or lists one value in two forms.
+        SpecError: A point of the sweep file is wrong, values contradict each other or the environment, there are too
+            many trials, a class is in a module that is not allowed, trials can't be packed though the sweep asks for
+            it, or a new sweep searches a hyperparameter that can't act, or lists one value in two forms.
         CannotRunError: One trial needs more than the machine has, or the search method is not installed.
     """
     check_installed(spec.search.type)
+    if chosen_points is None:
+        chosen_points = given_points(spec)
     if not records:
         check_distinct(spec.algorithm, spec.space)
     check_env_args(spec)

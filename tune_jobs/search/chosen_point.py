@@ -21,7 +21,7 @@ from tune_jobs.spec.rules import check_takes_points
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 
-def checked_point(spec: SweepSpec, given: Mapping[str, Any]) -> dict[str, Any]:
+def checked_point(spec: SweepSpec, given: Mapping[str, Any], *, place: str = "point") -> dict[str, Any]:
     """Return a point that a person gave, in the order of the space, with values written as the space has them.
 
     A value may lie outside of its domain, if the algorithm takes it.
@@ -29,13 +29,14 @@ def checked_point(spec: SweepSpec, given: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         spec: The sweep.
         given: Values by the names of searched hyperparameters.
+        place: What messages call it.
 
     Raises:
         SpecError: The sweep takes no points, a name is not searched or is missing, or a value is not allowed; the
             message lists every problem.
     """
     check_takes_points(spec)
-    values: dict[str, Any] = to_plain(given, "point")
+    values: dict[str, Any] = to_plain(given, place)
     problems = [_unknown(spec, name) for name in values if name not in spec.space]
     point, wrong = {}, []
     for name, domain in spec.space.items():
@@ -49,7 +50,7 @@ def checked_point(spec: SweepSpec, given: Mapping[str, Any]) -> dict[str, Any]:
         problems = _idle(spec.space, point)
     if problems:
         told = problems[0] if len(problems) == 1 else "\n  ".join([f"{len(problems)} problems:", *problems])
-        raise SpecError(f"point: {told}", f"The sweep searches {domains_text(spec.space)}.")
+        raise SpecError(f"{place}: {told}", f"The sweep searches {domains_text(spec.space)}.")
     return point
 
 
@@ -103,6 +104,11 @@ def trial_of_point(spec: SweepSpec, point: Mapping[str, Any], trials: Sequence[T
     meant = _meaning(spec, point)
     known = (trial for trial in trials if trial.has_point and trial.point.keys() == point.keys())
     return next((trial for trial in known if trial.point == point or _meaning(spec, trial.point) == meant), None)
+
+
+def same_point(spec: SweepSpec, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two points have the same values, in whatever form."""
+    return one == other or (_meaning(spec, one) == _meaning(spec, other) is not None)
 
 
 def _meaning(spec: SweepSpec, point: Mapping[str, Any]) -> str | None:

@@ -54,6 +54,7 @@ _FORMS = {
     "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
     "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random, auto, gp, forest or tpe, or a mapping of its fields",
+    "points": "give a list of points, each a mapping of the searched hyperparameters to values",
     "confirm": "give none, true, or a mapping of its fields (top, seeds, max_share)",
     "objective": "give final, area, best or steps_to_threshold, a list of one of them and env_steps, or a mapping of "
     "its fields (type, threshold, cost)",

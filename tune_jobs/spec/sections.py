@@ -294,6 +294,11 @@ class SweepFields(Section):
     num_samples: PositiveWhole = Field(
         1, description="Random draws for each combination of the grids' values; with a search by a model: points."
     )
+    points: tuple[dict[str, Any], ...] = Field(
+        (),
+        description="Points of your own, tried before all others and beside num_samples: a list of mappings, each with "
+        "a value for each searched hyperparameter, which may lie outside of its domain.",
+    )
     seeds_per_point: PositiveWhole = Field(1, description="Trials per point, each with its own seed.")
     seed: Annotated[WholeNumber, Field(ge=0)] = Field(0, description="Sweep seed: fixes points and all other seeds.")
     stop: StopSpec = Field(default_factory=StopSpec, description="When a trial ends.")
@@ -327,6 +332,11 @@ class SweepFields(Section):
     def _only_what_is_said(self, about: AboutSpec) -> dict[str, str] | None:
         # In sweep.json null if nothing is: versions that don't know the field skip one that is null.
         return about.model_dump(exclude_defaults=True) or None
+
+    @field_serializer("points")
+    def _only_given_points(self, points: tuple[dict[str, Any], ...]) -> list[dict[str, Any]] | None:
+        # As for `about`.
+        return [dict(point) for point in points] or None
 
     def value_without(self, name: str) -> Any:
         """Return the value of a hyperparameter where it is not searched: the fixed one, or the default."""

@@ -21,6 +21,7 @@ from tune_jobs.plan.user_code import modules_of
 from tune_jobs.process.interruption import current
 from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.address import check_address
+from tune_jobs.search.given_points import given_points
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.closing import close_run
@@ -55,6 +56,7 @@ def write_new(
             git_commit=git_commit(),
             address=address,
             allowed_modules=modules_of(spec),
+            chosen_points=given_points(spec),
         )
     )
 
