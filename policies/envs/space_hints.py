@@ -5,11 +5,14 @@ The expressions lack only the imports of `gymnasium`, `numpy` and an env's own m
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+
+from policies.envs.flat import FlatBox
 
 _HOW = "Wrap it in a module of your own, as 'Spaces' in docs/guides/own-environment.md shows"
 _MAX_COMBINATIONS = 10_000
@@ -17,11 +20,32 @@ _MAX_COMBINATIONS = 10_000
 
 def observation_hint(env_id: str, space: gym.Space[Any]) -> str:
     """Suggest what makes vectors of observations of which `policies.envs.flat` makes none."""
+    taken = _taken_members(space)
+    if taken:
+        filtered = f"gymnasium.wrappers.FilterObservation({_make(env_id)}, {taken})"
+        return f"{_HOW}: `{filtered}` leaves out what cannot be taken."
     # Texts are: Gymnasium counts their letters.
-    if space.is_np_flattenable and 0 not in (space.shape or ()):
+    if _is_flattenable(space) and 0 not in (space.shape or ()):
         flat = f"gymnasium.wrappers.FlattenObservation({_make(env_id)})"
         return f"{_HOW}: `{flat}` makes vectors of them."
     return f"{_HOW}, in a gymnasium.ObservationWrapper that makes a vector of float32 of an observation."
+
+
+def _taken_members(space: gym.Space[Any]) -> list[str]:
+    """Return the members of Dict observations of which vectors can be made; empty: none, or it is no Dict."""
+    found = []
+    for name, member in space.spaces.items() if isinstance(space, gym.spaces.Dict) else ():
+        with contextlib.suppress(ValueError):
+            FlatBox(member)
+            found.append(name)
+    return found
+
+
+def _is_flattenable(space: gym.Space[Any]) -> bool:
+    try:
+        return space.is_np_flattenable
+    except NotImplementedError:  # a space of somebody's own need not say
+        return False
 
 
 def action_hint() -> str:
