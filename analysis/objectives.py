@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.records import TRAINING_LENGTH, IterationRecord, Objective, TrialRecord
+from analysis.records import IterationRecord, Objective, TrialRecord, length_of
 from analysis.statistics import area_under_curve, moderated_means
 
 _LEAST_BETWEEN = 1e-3
@@ -112,17 +112,6 @@ def rank_settings(
 def reached_goal(trial: TrialRecord) -> bool:
     """Whether a trial ended because it reached the return that its sweep stops at."""
     return (trial.stop_reason or "").startswith(_GOALS)
-
-
-def length_of(point: Mapping[str, Any], num_env_steps: int) -> int:
-    """Return the env steps that a point's trials have: its own if the length of training is searched, else all.
-
-    Args:
-        point: The searched values.
-        num_env_steps: The env steps that a trial of the sweep has at most.
-    """
-    own = point.get(TRAINING_LENGTH)
-    return min(own, num_env_steps) if isinstance(own, int) and own > 0 else num_env_steps
 
 
 def env_steps_of(trial: TrialRecord, num_env_steps: int) -> int:

@@ -38,6 +38,19 @@ Iteration = Count
 FINISHED: frozenset[TrialStatus] = frozenset({"completed", "failed", "stopped"})
 
 
+def length_of(point: Mapping[str, Any], num_env_steps: int) -> int:
+    """Return the env steps that a point's trials have: its own if the length of training is searched, else all.
+
+    Args:
+        point: The searched values.
+        num_env_steps: The env steps that a trial of the sweep has at most.
+    """
+    own = point.get(TRAINING_LENGTH)
+    # A whole number may be written as 2e4, and a multiple of a step is a float.
+    known = isinstance(own, int | float) and not isinstance(own, bool) and own >= 1
+    return min(int(own), num_env_steps) if known and math.isfinite(own) else num_env_steps
+
+
 def finite_or_none(value: float | None) -> float | None:
     """Return the value, or None if it is None, NaN or infinite."""
     return None if value is None or not math.isfinite(value) else float(value)

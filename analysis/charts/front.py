@@ -11,6 +11,7 @@ from analysis.charts.subject import Subject
 from analysis.front import front_of, untrained_return
 from analysis.objectives import SettingScores
 
+_FRONT = "the front"
 _MAX_DRAWN = 2_000
 _LEAST_RATIO = 30.0
 """From where on costs are drawn to a logarithmic scale: the greatest of the least."""
@@ -31,8 +32,7 @@ def make_charts(subject: Subject) -> list[Chart]:
     notes = [f"{_MAX_DRAWN:,} of {len(others):,} other settings are drawn."] if len(others) > _MAX_DRAWN else []
     lines = [_dots(subject, "other settings", "muted", [others[pick] for pick in picks])]
     lines += [_dots(subject, "may be on the front", "series-1", may_be, look="hollow")]
-    lines += [_front(subject, on_front, [item.cost for item in ranking])]
-    lines += [_dots(subject, "on the front", "series-0", on_front)]
+    lines += [_dots(subject, _FRONT, "series-0", on_front), _front(subject, on_front, [item.cost for item in ranking])]
     near = by_point[front.cheapest_near.point_index]
     lines += [_dots(subject, "the best", "accent", [ranking[0]])]
     if near is not ranking[0]:
@@ -60,7 +60,7 @@ def _front(subject: Subject, on_front: Sequence[SettingScores], costs: Sequence[
     y: list[Number] = [drawable(item.expected) for item in on_front]
     texts = [_text(subject, item) for item in on_front]
     return Line(
-        "the front", "series-0", (*x, max(costs)), (*y, y[-1]), is_stepped=True, texts=(*texts, "the dearest setting")
+        _FRONT, "series-0", (*x, max(costs)), (*y, y[-1]), is_stepped=True, texts=(*texts, "the dearest setting")
     )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from analysis.core_seconds import busy_seconds
 from analysis.objectives import reached_goal
 from analysis.page.source import Source
-from analysis.records import TrialRecord
+from analysis.records import TrialRecord, length_of
 from analysis.wording import counted, duration, number
 
 _ESTIMATED = (
@@ -70,12 +70,14 @@ def _saved(source: Source) -> str:
     ended = [trial for trial in source.trials if trial.status in ("completed", "stopped")]
     if not isinstance(cap, int) or not ended:
         return ""
-    whole = sum(max(cap, trial.num_env_steps) for trial in ended)
+    caps = {trial.trial_id: length_of(trial.point, cap) for trial in ended}
+    whole = sum(max(caps[trial.trial_id], trial.num_env_steps) for trial in ended)
+    length = f"{cap:,} env steps" if set(caps.values()) == {cap} else "the env steps that they were to have"
     by_scheduler = [trial for trial in ended if trial.status == "stopped"]
     by_goal = [trial for trial in ended if trial.status == "completed" and reached_goal(trial)]
     parts = [
-        f"{who} ended {counted(len(members), 'trial')} before {cap:,} env steps, which saved "
-        f"{_percent(sum(max(0, cap - trial.num_env_steps) for trial in members) / whole)}"
+        f"{who} ended {counted(len(members), 'trial')} before {length}, which saved "
+        f"{_percent(sum(max(0, caps[trial.trial_id] - trial.num_env_steps) for trial in members) / whole)}"
         for who, members in (("the scheduler", by_scheduler), ("reaching the goal", by_goal))
         if members
     ]

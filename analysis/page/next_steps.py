@@ -11,6 +11,7 @@ from analysis.best_records import SettingRecord
 from analysis.page.estimates import replicate_takes, takes
 from analysis.page.narrowed import narrowed_space
 from analysis.page.source import Source, point_text
+from analysis.records import TRAINING_LENGTH, length_of
 from analysis.wording import counted
 
 if TYPE_CHECKING:
@@ -83,7 +84,11 @@ def _narrowed(source: Source) -> Iterator[Step]:
     if narrowed == dict(space):
         return
     search = {name: _filled(spec[name]) for name in ("num_samples", "search", "scheduler") if spec.get(name)}
-    content = _trained(spec) | {"space": narrowed} | search | {"seed": _next_seed(spec)}
+    trained = _trained(spec)
+    if TRAINING_LENGTH in narrowed:
+        # The longest of the narrowed space may be another.
+        trained["stop"] = {name: value for name, value in trained.get("stop", {}).items() if name != "num_env_steps"}
+    content = trained | {"space": narrowed} | search | {"seed": _next_seed(spec)}
     why = (
         f"Where the best {len(good)} of {counted(len(ranked), 'setting')} lie and a little beyond, with another seed. "
         "Save it and launch it by its file's name."
@@ -98,8 +103,13 @@ def _setting(source: Source) -> Iterator[Step]:
     if settings is None or source.is_population or not source.is_trained:
         return
     spec, best = source.sweep.spec, settings.best
-    content = _trained(spec) | {
-        "hyperparams": {**source.sweep.section("hyperparams"), **best.point},
+    values = dict(best.point)
+    trained = _trained(spec)
+    if (length := values.pop(TRAINING_LENGTH, None)) is not None:
+        # It is no hyperparameter.
+        trained["stop"] = {**trained.get("stop", {}), "num_env_steps": length}
+    content = trained | {
+        "hyperparams": {**source.sweep.section("hyperparams"), **values},
         "seeds_per_point": _SEEDS_OF_A_SETTING,
         "seed": _next_seed(spec),
     }
@@ -120,6 +130,7 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     env = env if isinstance(env, Mapping) else {"id": str(env)}
     env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
     cap = source.sweep.section("stop").get("num_env_steps")
+    cap = length_of(best.point, cap) if isinstance(cap, int) else 100_000
     names = ("frame_stack", "pixels", "action_mask", "failure_penalty")
     changed = [name for name in names if env.get(name) not in (None, 1, False)]
     note = f" The env's {', '.join(changed)} are left out." if changed else ""
@@ -128,9 +139,7 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     for title, program in (
         (
             "The setting in Stable-Baselines3",
-            stable_baselines3_program(
-                values, env_id=env_id, env_args=env_args, num_env_steps=cap if isinstance(cap, int) else 100_000
-            ),
+            stable_baselines3_program(values, env_id=env_id, env_args=env_args, num_env_steps=cap),
         ),
         ("The setting in RLlib", rllib_program(values, env_id=env_id, env_args=env_args)),
     ):

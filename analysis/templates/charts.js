@@ -223,7 +223,7 @@
   }));
 
   const plotKeys = (chart) => [...new Map(chart.plots.flatMap((plot) => plot.lines).map((line) => [line.name, line])).values()]
-    .map((line) => ({ name: line.name, color: line.color, mark: line.look === "hollow" ? "hollow" : "line", toggles: true }));
+    .map((line) => ({ name: line.name, color: line.color, mark: { hollow: "hollow", dots: "dot" }[line.look] ?? "line", toggles: true }));
 
   // ---- Heat map and timeline
 

@@ -97,7 +97,9 @@ def test_the_page_and_its_chart_show_the_front() -> None:
     subject = Subject(made.sweep, made.trials, made.results, 195.0, source.importance)
     (chart,) = [chart for chart in make_charts(subject) if chart.section == "front"]
     assert isinstance(chart.data, Plots)
+    # The line of the front comes behind its dots.
     lines = {line.name: line for line in chart.data.plots[0].lines}
+    assert lines["the front"].is_stepped
     assert lines["the front"].x[:-1] == tuple(item.num_env_steps for item in found.points)
     assert lines["the front"].y[:-1] == tuple(item.expected for item in found.points)
     drawn = {name: len(line.x) for name, line in lines.items() if name in ("other settings", "may be on the front")}

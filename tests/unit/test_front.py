@@ -11,8 +11,8 @@ import pytest
 
 from analysis.front import NEAR, front_of, points_on_front, untrained_return
 from analysis.front_words import cheapest_near_text, front_rows, near_text, undecided_text
-from analysis.objectives import SettingScores, env_steps_of, length_of, score_of
-from analysis.records import TRAINING_LENGTH, IterationRecord, TrialRecord, TrialStatus
+from analysis.objectives import SettingScores, env_steps_of, score_of
+from analysis.records import TRAINING_LENGTH, IterationRecord, TrialRecord, TrialStatus, length_of
 from analysis.settings import judge_settings
 from tests.narrowing import present
 

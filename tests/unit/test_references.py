@@ -212,6 +212,7 @@ def test_every_key_of_a_sweep_file_that_is_named_is_one() -> None:
     known["hyperparams"] = known["space"] = {
         name for model in HYPERPARAMS_BY_ALGORITHM.values() for name in model.model_fields
     }
+    known["space"] = {*known["space"], "stop"}  # the length of training, stop.num_env_steps
     pattern = re.compile(rf"(?<![\w./])({'|'.join(known)})\.([a-z]\w*)")
     allowed = {"json", "items", "py", "values", "hiden_sizes"}
     wrong = {

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from analysis.points import searched_names, value_text
+from analysis.records import TRAINING_LENGTH
 from analysis.wording import bytes_text, counted
 from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
+from tune_jobs.spec.training_length import ends_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -42,7 +44,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
     rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
     rules += [] if stop.num_episodes is None else [counted(stop.num_episodes, "episode")]
     rules += [
-        counted(stop.num_env_steps, "env step"),
+        _length_rule(spec),
         counted(stop.num_iterations, "iteration"),
         f"{stop.time_s:g} s",
     ]
@@ -64,6 +66,14 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "seeds": f"sweep {spec.seed}; evaluation {span(plan.evaluation_seeds)}; "
         f"confirmation {span(plan.confirmation_seeds)}",
     }
+
+
+def _length_rule(spec: SweepSpec) -> str:
+    domain = spec.space.get(TRAINING_LENGTH)
+    ends = None if domain is None else ends_of(domain)
+    if ends is None or ends[0] == ends[1]:
+        return counted(spec.stop.num_env_steps, "env step")
+    return f"{ends[0]:,} to {counted(ends[1], 'env step')} (searched)"
 
 
 def _engine_fact(plan: SweepPlan) -> str:

@@ -30,23 +30,23 @@ _NUMBERS_PER_STEP = 12
 
 def max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     """Return the most env steps of one trial, which ends with the iteration in which it reaches its cap."""
-    iteration = _iteration_env_steps(spec, values)
+    iteration = _most_of_an_iteration(spec, values)
     return min(spec.stop.num_env_steps - 1 + iteration, spec.stop.num_iterations * iteration)
 
 
 def planned_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     """Return the env steps after which a trial ends at the latest; its last iteration may go beyond."""
-    return min(spec.stop.num_env_steps, spec.stop.num_iterations * _wanted_env_steps(values))
+    return min(spec.stop.num_env_steps, spec.stop.num_iterations * iteration_env_steps(values))
 
 
 def max_iterations(spec: SweepSpec, values: Hyperparams) -> int:
     """Return the most iterations of one trial."""
-    return min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / _wanted_env_steps(values)))
+    return min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / iteration_env_steps(values)))
 
 
-def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
+def _most_of_an_iteration(spec: SweepSpec, values: Hyperparams) -> int:
     """Return the most env steps of one iteration; all sub-environments step together, so the last step overshoots."""
-    wanted, num_runners = _wanted_env_steps(values), max(1, spec.resources.num_env_runners)
+    wanted, num_runners = iteration_env_steps(values), max(1, spec.resources.num_env_runners)
     if isinstance(values, DQNHyperparams):
         # An iteration ends with a sampling phase, in which each env runner makes its share of train_freq.
         return wanted - 1 + num_runners * (math.ceil(values.train_freq / num_runners) - 1 + values.num_envs)
@@ -54,7 +54,7 @@ def _iteration_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     return (math.ceil(wanted / together) + 1) * together
 
 
-def _wanted_env_steps(values: Hyperparams) -> int:
+def iteration_env_steps(values: Hyperparams) -> int:
     """Return the env steps that an iteration has at least."""
     return values.train_batch_size if isinstance(values, PPOHyperparams) else values.env_steps_per_iteration
 

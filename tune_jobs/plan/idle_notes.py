@@ -16,12 +16,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from analysis.points import lacks
+from analysis.records import TRAINING_LENGTH
 from policies.errors import SpecError
 from policies.hyperparams import DQNHyperparams, Hyperparams
 from policies.idle.find import NO_UPDATE, RULES, Limits, Rule, idle_rule
 from tune_jobs.plan.estimates import max_env_steps, max_iterations
 from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Domain, Grid, Layers, Listed, Range
+from tune_jobs.spec.training_length import as_trained
 
 if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
@@ -51,16 +53,18 @@ class _Points:
     def known(self) -> list[tuple[int, Hyperparams, Limits]]:
         """The index, the hyperparameters and the limits of each point that is known."""
         return [
-            (index, values, self.limits(values, is_packed=is_packed))
-            for index, (values, is_packed) in enumerate(zip(self.values, self.is_packed, strict=True))
+            (index, values, self.limits(values, as_trained(self.spec, point or {}), is_packed=is_packed))
+            for index, (values, point, is_packed) in enumerate(
+                zip(self.values, self.points, self.is_packed, strict=True)
+            )
             if values is not None
         ]
 
-    def limits(self, values: Hyperparams, *, is_packed: bool) -> Limits:
+    def limits(self, values: Hyperparams, spec: SweepSpec, *, is_packed: bool) -> Limits:
         """Return the limits of a trial with these hyperparameters."""
         return Limits(
-            num_env_steps=max_env_steps(self.spec, values),
-            num_iterations=max_iterations(self.spec, values),
+            num_env_steps=max_env_steps(spec, values),
+            num_iterations=max_iterations(spec, values),
             max_episode_steps=self.env.max_episode_steps,
             is_packed=is_packed,
         )
@@ -117,6 +121,8 @@ def _listed(names: Mapping[str, Any]) -> str:
 
 
 def _is_looked_at(spec: SweepSpec, name: str) -> bool:
+    if name == TRAINING_LENGTH:
+        return False  # what a training does depends on its length, always
     if spec.rl_module is not None and name.startswith("epsilon_"):
         return False  # the module is a user's own, and may explore as it likes
     return bool(RULES[spec.algorithm][name])
@@ -189,7 +195,7 @@ def _with_conditions_of(spec: SweepSpec, names: Iterable[str]) -> set[str]:
 
 
 def _first_rule(points: _Points, rules: Sequence[Rule], values: Hyperparams) -> tuple[Rule, str] | None:
-    limits = points.limits(values, is_packed=all(points.is_packed))
+    limits = points.limits(values, points.spec, is_packed=all(points.is_packed))
     for rule in sorted(rules, key=lambda rule: rule.of_value):
         if rule.holds(values, limits):
             return rule, rule.reason(values, limits)

@@ -8,13 +8,15 @@ from typing import Any
 from pydantic import ValidationError
 
 from analysis.numbering import first_index
-from analysis.records import ChosenPointRecord, ReplicationRecord
+from analysis.records import TRAINING_LENGTH, ChosenPointRecord, ReplicationRecord
 from policies.errors import SpecError
-from policies.hyperparams import Hyperparams, RandomHyperparams, make_hyperparams
+from policies.hyperparams import Hyperparams, PPOHyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
+from tune_jobs.plan.estimates import iteration_env_steps
 from tune_jobs.spec.draws import num_points
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.training_length import hyperparams_in
 
 
 def trial_id(index: int) -> str:
@@ -57,7 +59,7 @@ def point_hyperparams(
     """
     place = place_of_point(spec, point, point_index, replications)
     try:
-        values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **point})
+        values = make_hyperparams(spec.algorithm, {**spec.hyperparams, **hyperparams_in(point)})
     except ValidationError as error:
         problems = "; ".join(f"{dotted(detail['loc'])} {explain(detail)}".strip() for detail in details_of(error))
         raise SpecError(
@@ -66,6 +68,7 @@ def point_hyperparams(
             if point_index is None
             else "Correct hyperparams or space so that every combination is valid; --dry-run lists the points.",
         ) from error
+    _check_length(spec, point, values, place)
     if isinstance(values, RandomHyperparams) and spec.resources.num_env_runners:
         raise SpecError(
             f"resources.num_env_runners is {spec.resources.num_env_runners}, but the baseline {spec.algorithm} plays "
@@ -81,6 +84,26 @@ def point_hyperparams(
             "Lower num_envs or resources.num_env_runners.",
         )
     return values
+
+
+def _check_length(spec: SweepSpec, point: Mapping[str, Any], values: Hyperparams, place: str) -> None:
+    """Check that a point's own length of training is one: of another number of iterations than none."""
+    if TRAINING_LENGTH not in point:
+        return
+    length = int(point[TRAINING_LENGTH])
+    least, longest = iteration_env_steps(values), spec.stop.num_env_steps
+    if length < least:
+        name = "train_batch_size" if isinstance(values, PPOHyperparams) else "env_steps_per_iteration"
+        raise SpecError(
+            f"The values of {place} don't go together: {TRAINING_LENGTH} {length:,} is less than one iteration, which "
+            f"has {least:,} env steps ({name}), and a training has one at least.",
+            f"Raise the least length in space.{TRAINING_LENGTH}, or lower {name}.",
+        )
+    if length > longest:
+        raise SpecError(
+            f"{TRAINING_LENGTH} {length:,} of {place} is more than {longest:,}, the longest training of the sweep.",
+            "Give a shorter one, or launch a new sweep.",
+        )
 
 
 def place_of_point(

@@ -43,6 +43,7 @@ from tune_jobs.spec.hyperparam_problems import check_distinct
 from tune_jobs.spec.rules import idle_settings
 from tune_jobs.spec.seeds import confirmation_seeds, evaluation_seeds, trial_seeds
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.training_length import as_trained
 
 NUM_CONFIRMATION_EPISODES = 100
 MAX_TRIALS = 100_000
@@ -176,10 +177,11 @@ def make_plan(
     trials, engine_notes = _trials(spec, env, points, records, replications)
     are_packed = [_is_packed(trial) for trial in trials if trial.seed_index == 0]
     searched = [point for point, _ in points]
+    specs = [as_trained(spec, point or {}) for point in searched]
     idle = idle_notes(spec, env, [values for _, values in points], are_packed, searched, may_refuse=not records)
     sizes = _sizes(spec, points, known)
     to_run = _to_run(trials, records, retry_failed=retry_failed)
-    members = _members(to_run, points, _largest(sizes, lambda each: member_bytes(env, each)))
+    members = _members(to_run, points, _largest(sizes, specs, lambda _, each: member_bytes(env, each)))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
@@ -192,8 +194,9 @@ def make_plan(
         max_concurrent=concurrent,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
-        max_env_steps=_total(trials, _largest(sizes, lambda each: max_env_steps(spec, each))),
-        max_disk_bytes=_SWEEP_BYTES + _total(trials, _largest(sizes, lambda each: max_disk_bytes(spec, env, each))),
+        max_env_steps=_total(trials, _largest(sizes, specs, max_env_steps)),
+        max_disk_bytes=_SWEEP_BYTES
+        + _total(trials, _largest(sizes, specs, lambda own, each: max_disk_bytes(own, env, each))),
         env=env,
         machine=machine,
         notes=(
@@ -318,12 +321,14 @@ def _total(trials: Sequence[TrialPlan], of_points: Sequence[int]) -> int:
     return sum(of_points[trial.point_index] for trial in trials)
 
 
-def _largest(sizes: list[list[Hyperparams]], measure: Callable[[Hyperparams], int]) -> list[int]:
+def _largest(
+    sizes: list[list[Hyperparams]], specs: Sequence[SweepSpec], measure: Callable[[SweepSpec, Hyperparams], int]
+) -> list[int]:
     """Return the largest measure for each point; a list that is shared by many points is measured once."""
     known: dict[int, int] = {}
-    for values in sizes:
+    for values, own in zip(sizes, specs, strict=True):
         if id(values) not in known:
-            known[id(values)] = max(map(measure, values))
+            known[id(values)] = max(measure(own, each) for each in values)
     return [known[id(values)] for values in sizes]
 
 

@@ -34,6 +34,7 @@ from tune_jobs.ray_tune.scheduling import score_of
 from tune_jobs.ray_tune.tune_scheduler import METRIC
 from tune_jobs.spec.engines import engine_on_record
 from tune_jobs.spec.file import stored_spec
+from tune_jobs.spec.training_length import as_trained
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.logs import begin_log
 from tune_jobs.store.opening import open_sweep
@@ -107,7 +108,7 @@ class TaskReader:
             hyperparams=trial.hyperparams,
             env_id=spec.env.id,
             env_args=spec.env.wrapped_args,
-            stop=spec.stop,
+            stop=as_trained(spec, trial.point).stop,
             evaluation=spec.evaluation,
             checkpoints=spec.checkpoints,
             evaluation_seeds=self.sweep.evaluation_seeds,

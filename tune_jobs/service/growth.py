@@ -14,6 +14,7 @@ from tune_jobs.plan.points import num_points_of, num_trials_of
 from tune_jobs.service.config import Limits
 from tune_jobs.service.jobs import Job
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.training_length import hyperparams_in
 
 
 @dataclass(frozen=True)
@@ -84,5 +85,5 @@ def check_growth(
 def _hyperparams(spec: SweepSpec, trials: Sequence[TrialRecord], points: Sequence[dict[str, Any]]) -> list[Hyperparams]:
     """Return those of trials and points; without any, the fixed values."""
     own = [trial.hyperparams if trial.has_point else spec.hyperparams for trial in trials]
-    given = [*own, *({**spec.hyperparams, **point} for point in points)]
+    given = [*own, *({**spec.hyperparams, **hyperparams_in(point)} for point in points)]
     return [make_hyperparams(spec.algorithm, dict(values)) for values in given or [spec.hyperparams]]

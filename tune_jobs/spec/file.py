@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, get_args
 
 from pydantic import TypeAdapter
 
-from analysis.records import Cost, SweepRecord
+from analysis.records import TRAINING_LENGTH, Cost, SweepRecord
 from policies.arguments import checked
 from policies.errors import CheckpointError, SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
@@ -26,6 +26,7 @@ from tune_jobs.store.names import SWEEP_RECORD
 
 # The most bytes of a file, for the most characters that are read, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
+_LENGTH = "How long a training is, in env steps; stop.num_env_steps is left out."
 _SECTIONS_OF_TEXT = {"about": "title", "env": "id", "objective": "type", "scheduler": "type", "search": "type"}
 """Sections that may be written as one string, and the field that it stands for."""
 
@@ -160,6 +161,7 @@ def json_schema() -> dict[str, Any]:
             name: {"$ref": "#/$defs/Domain", "description": field.get("description", "")}
             for name, field in fixed["properties"].items()
         }
+        searched[TRAINING_LENGTH] = {"$ref": "#/$defs/Domain", "description": _LENGTH}
         then = {
             "hyperparams": {"anyOf": [{"$ref": f"#/$defs/{model.__name__}"}, {"type": "null"}]},
             "space": {"type": ["object", "null"], "properties": searched, "additionalProperties": False},
@@ -261,7 +263,7 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
             f"--set {override}: this is not an assignment",
             "Write --set a.b=value, such as --set stop.num_env_steps=50000.",
         )
-    *parents, last = path.split(".")
+    *parents, last = ["space", TRAINING_LENGTH] if path == f"space.{TRAINING_LENGTH}" else path.split(".")
     section = data
     for index, parent in enumerate(parents):
         child = section.get(parent)
@@ -288,6 +290,8 @@ def _is_known(path: str) -> bool:
     """Whether a sweep file may have a field of this path."""
     section, *names = path.split(".")
     if section in ("hyperparams", "space") and names:
+        if path == f"space.{TRAINING_LENGTH}":
+            return True
         return any(names[0] in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values())
     field = SweepSpec.model_fields.get(section)
     inner = getattr(field.annotation, "model_fields", {}) if field is not None else {}

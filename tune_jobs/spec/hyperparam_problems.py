@@ -13,6 +13,7 @@ from pydantic import (
     create_model,
 )
 
+from analysis.records import TRAINING_LENGTH
 from policies.errors import SpecError, shortened
 from policies.foreign_names import answer_for_others, answer_to
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
@@ -21,6 +22,13 @@ from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.spec.domains import Domain, Listed, Range
 from tune_jobs.spec.list_forms import list_to_write, text_of_several
 from tune_jobs.spec.problems import SPEC_HINT, Problem
+from tune_jobs.spec.sections import StopSpec
+
+_LENGTHS = dict.fromkeys(
+    ("num_env_steps", "stop", TRAINING_LENGTH),
+    f"To search how long a training is, write space: {{{TRAINING_LENGTH}: ...}}; to fix it, stop.num_env_steps.",
+)
+"""What to write for names by which the length of training may be called."""
 
 
 def hyperparam_problems(
@@ -40,7 +48,9 @@ def hyperparam_problems(
     problems = []
     for section, names in (("hyperparams", hyperparams), ("space", space)):
         problems += [
-            Problem(f"{section}.{name}", _unknown_hyperparam(algorithm, name)) for name in names if name not in fields
+            Problem(f"{section}.{name}", _unknown_hyperparam(algorithm, name))
+            for name in names
+            if name not in fields and not (section == "space" and name == TRAINING_LENGTH)
         ]
     for name, value in hyperparams.items():
         if name in fields:
@@ -49,7 +59,7 @@ def hyperparam_problems(
             text = f"is fixed at {value!r} but also searched in space.{name}: take it out of one of them"
             problems.append(Problem(f"hyperparams.{name}", text))
     for name, domain in space.items():
-        if name in fields:
+        if name in fields or name == TRAINING_LENGTH:
             problems += _domain_problems(algorithm, name, domain)
     return problems
 
@@ -84,6 +94,8 @@ def in_one_form(algorithm: Algorithm, name: str, value: Any) -> str:
 
 
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
+    if name in _LENGTHS:
+        return f"{algorithm} has no hyperparameter {name!r}. {_LENGTHS[name]}"
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
     have = "have" if len(others) > 1 else "has"
@@ -163,6 +175,7 @@ def _same_kind(raw: Any, checked: Any) -> bool:
 @functools.cache
 def _alone(algorithm: Algorithm, name: str) -> type[BaseModel]:
     """Return a model of one hyperparameter; the plan makes the checks across several of them, for each point."""
-    field = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields[name]
+    fields = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    field = StopSpec.model_fields["num_env_steps"] if name == TRAINING_LENGTH else fields[name]
     model: type[BaseModel] = create_model("Alone", **{name: (field.annotation, field)})  # type: ignore[call-overload]
     return model

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from analysis.records import TRAINING_LENGTH
 from policies.errors import shortened
 from tune_jobs.spec.domains import DOMAIN_KINDS
 
@@ -56,7 +57,8 @@ def text_of_no_domain(name: str, value: Any) -> str | None:
             )
         return f"{shortened(value)} is a bare list: write {{grid: {_written(value)}}} {_TO_TRY}"
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return f"{value!r} is one value: fix it under hyperparams, or write {{grid: [{value!r}]}}"
+        where = f"as {name}" if name == TRAINING_LENGTH else "under hyperparams"
+        return f"{value!r} is one value: fix it {where}, or write {{grid: [{value!r}]}}"
     return None
 
 

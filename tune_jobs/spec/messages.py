@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from analysis.records import TRAINING_LENGTH
 from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from policies.suggestions import did_you_mean
@@ -38,7 +39,7 @@ def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
             domains[name] = adapter.validate_python(value)
         except ValidationError:
             continue  # it is among the problems already; only its name is left to check
-    known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    known = {*HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields, TRAINING_LENGTH}
     unknown = {name: None for name in space if name not in known} if isinstance(space, Mapping) else {}
     given = fixed if isinstance(fixed, Mapping) else {}
     problems = hyperparam_problems(algorithm, given, domains)

@@ -26,6 +26,7 @@ from tune_jobs.spec.messages import problems_of
 from tune_jobs.spec.problems import Problem, WrongSpecError
 from tune_jobs.spec.rules import search_problems, why_none
 from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
+from tune_jobs.spec.training_length import length_problems, with_longest
 
 
 class SweepSpec(SweepFields):
@@ -37,7 +38,8 @@ class SweepSpec(SweepFields):
         # In YAML a section whose lines are all commented out is null.
         if not isinstance(data, Mapping):
             return data
-        return {key: value for key, value in data.items() if value is not None or key not in cls.model_fields}
+        given = {key: value for key, value in data.items() if value is not None or key not in cls.model_fields}
+        return with_longest(given)
 
     @model_validator(mode="wrap")
     @classmethod
@@ -71,7 +73,7 @@ def check_sweep_name(name: str) -> str:
 
 def _section_problems(spec: SweepFields) -> list[Problem]:
     """Return the settings that contradict each other."""
-    problems = [Problem(path, text) for path, text in search_problems(spec)]
+    problems = [Problem(path, text) for path, text in (*search_problems(spec), *length_problems(spec))]
     grace, cap, resources = spec.scheduler.grace_env_steps, spec.stop.num_env_steps, spec.resources
     if spec.scheduler.type != "none" and grace is not None and grace >= cap:
         text = f"{grace} is not less than stop.num_env_steps, {cap}: no trial would ever be ended early"

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.numbering import planned_places
-from analysis.records import FINISHED, ChosenPointRecord, SweepRecord, TrialRecord
+from analysis.records import FINISHED, TRAINING_LENGTH, ChosenPointRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Hyperparams
 from tune_jobs.plan.machine import Machine
@@ -107,7 +107,11 @@ def check_same_trials(store: Sweep, plan: SweepPlan) -> None:
         trial = planned.get(record.trial_id)
         # A point that a search method chose depends on the trials that had ended then, which may be more by now.
         same = trial is not None and (
-            not trial.has_point or _same_values(trial.hyperparams, record.first_hyperparams, known)
+            not trial.has_point
+            or (
+                trial.point.get(TRAINING_LENGTH) == record.point.get(TRAINING_LENGTH)
+                and _same_values(trial.hyperparams, record.first_hyperparams, known)
+            )
         )
         if trial is None or trial.seed != record.seed or not same:
             raise CannotRunError(

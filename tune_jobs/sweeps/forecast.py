@@ -12,6 +12,7 @@ from analysis.records import FINISHED, TrialRecord
 from policies.hyperparams import make_hyperparams
 from tune_jobs.plan.estimates import planned_env_steps
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.training_length import as_trained
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ def caps_of(spec: SweepSpec, trials: Sequence[TrialRecord]) -> dict[str, int]:
 def _cap(spec: SweepSpec, trial: TrialRecord) -> int:
     try:
         # Before the search method has chosen the point, its values are the defaults.
-        return planned_env_steps(spec, make_hyperparams(spec.algorithm, dict(trial.hyperparams)))
+        values = make_hyperparams(spec.algorithm, dict(trial.hyperparams))
+        return planned_env_steps(as_trained(spec, trial.point), values)
     except ValidationError:
         # Of a record that another version has written.
         return spec.stop.num_env_steps
