@@ -47,8 +47,9 @@ def length_of(point: Mapping[str, Any], num_env_steps: int) -> int:
     """
     own = point.get(TRAINING_LENGTH)
     # A whole number may be written as 2e4, and a multiple of a step is a float.
-    known = isinstance(own, int | float) and not isinstance(own, bool) and own >= 1
-    return min(int(own), num_env_steps) if known and math.isfinite(own) else num_env_steps
+    if isinstance(own, int | float) and not isinstance(own, bool) and 1 <= own < math.inf:
+        return min(int(own), num_env_steps)
+    return num_env_steps
 
 
 def finite_or_none(value: float | None) -> float | None:
