@@ -1,4 +1,4 @@
-"""The length of training as a searched value: `space: {stop.num_env_steps: {choice: [20_000, 50_000]}}` (decision 44).
+"""The length of training as a searched value, `stop.num_env_steps` in the space (decision 44).
 
 It is no hyperparameter: no algorithm sees it. It is in a point under `TRAINING_LENGTH`, beside the hyperparameters, and
 becomes the trial's own `stop.num_env_steps`. The sweep's `stop.num_env_steps` is the longest that the domain gives.
