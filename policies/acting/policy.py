@@ -125,16 +125,21 @@ class Policy(ABC):
 
     def act_on_row(self, observation: NDArray[Any]) -> Action:
         """Return the greedy action for one vector or image, as environments of `policies.envs.make` take it."""
-        if type(self).act is not Policy.act or type(self).act_on_rows is not Policy.act_on_rows:
-            return cast("Action", self.act(observation))
+        if type(self).act is not Policy.act:
+            # A class of somebody's own, which acts as it says, in the environment's own form.
+            action = self.act(observation)
+            return self.action_space.given_for(action) if is_made(self.action_space) else cast("Action", action)
         (action,) = self._act_batch(np.asarray(observation, dtype=np.float32)[None])
         return int(action) if isinstance(self.action_space, gym.spaces.Discrete) else cast("NDArray[Any]", action)
 
     def act_on_rows(self, observations: NDArray[Any]) -> NDArray[Any]:
         """Return the greedy actions, shape (num,) or (num, action_dim), for vectors or images of shape (num, ...)."""
         if type(self).act is not Policy.act:
-            # A class of somebody's own, which acts as it says.
-            return np.asarray(self.act(observations))
+            # A class of somebody's own, which acts as it says, in the environment's own form.
+            actions = self.act(observations)
+            if is_made(space := self.action_space):
+                actions = [space.given_for(action) for action in actions]
+            return np.asarray(actions)
         return self._act_batch(np.asarray(observations, dtype=np.float32))
 
     def _wanted(self) -> str:

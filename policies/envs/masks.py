@@ -10,6 +10,7 @@ method, as Stable-Baselines3's contributions have it (`action_masks()`), or in t
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -153,11 +154,14 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
         MaskProblemError: It is something else, or a choice has no value that is allowed.
     """
     num = sum(sizes)
-    try:
-        parts = mask if isinstance(mask, tuple | list) else [mask]
-        values = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
-    except ValueError:
-        values = np.empty(0, dtype=object)
+    if isinstance(mask, np.ndarray):
+        values = mask.reshape(-1)
+    else:
+        try:
+            parts = mask if isinstance(mask, tuple | list) else [mask]
+            values = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
+        except ValueError:
+            values = np.empty(0, dtype=object)
     if values.dtype.kind not in "biuf" or values.size != num:
         raise MaskProblemError(f"not {num} zeros and ones, one for each action")
     if not ((values == 0) | (values == 1)).all():
@@ -167,10 +171,17 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
         if not checked.any():
             raise MaskProblemError("which forbids every action")
         return checked
-    for number, allowed in enumerate(np.add.reduceat(checked, np.cumsum((0, *sizes[:-1])))):
-        if not allowed:
-            raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
+    allowed = np.add.reduceat(checked, _starts(sizes))
+    if not allowed.all():
+        number = int(np.flatnonzero(allowed == 0)[0])
+        raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
     return checked
+
+
+@functools.cache
+def _starts(sizes: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return where each choice begins in a mask."""
+    return np.cumsum((0, *sizes[:-1]))
 
 
 class MasksActions(gym.Wrapper[Any, Any, Any, Any]):

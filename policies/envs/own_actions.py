@@ -46,18 +46,24 @@ class Choices(gym.spaces.MultiDiscrete):
 
     def __init__(self, original: gym.Space[Any]) -> None:
         self.original = original
-        self._parts = [(space, _sizes_of(space, keys)) for keys, space in leaves(original, ())]
-        self.sizes = tuple(size for _, sizes in self._parts for size in sizes)
+        self._parts = [(keys, space, _sizes_of(space, keys)) for keys, space in leaves(original, ())]
+        self.sizes = tuple(size for *_, sizes in self._parts for size in sizes)
         _check_total(sum(self.sizes), original)
         super().__init__(np.array(self.sizes, np.int64))
 
     def own(self, choices: NDArray[Any]) -> Any:
         """Return an action as the environment takes it."""
         values, start = [], 0
-        for space, sizes in self._parts:
+        for _, space, sizes in self._parts:
             values.append(_own_choices(space, choices[start : start + len(sizes)]))
             start += len(sizes)
         return _nested(self.original, values)
+
+    def given_for(self, own: Any) -> NDArray[np.int64]:
+        """Return what a policy gives for an action as the environment takes it; the inverse of `own`."""
+        starts = [np.ravel(getattr(space, "start", 0)) for _, space, _ in self._parts]
+        values = [np.ravel(_member(own, keys)) - start for (keys, *_), start in zip(self._parts, starts, strict=True)]
+        return np.concatenate(values).astype(np.int64)
 
     @override
     def __repr__(self) -> str:
@@ -102,6 +108,11 @@ class Numbers(gym.spaces.Box):
             values.append(_own_numbers(space, numbers[start:stop].reshape(space.shape)))
             start = stop
         return _nested(self.original, values)
+
+    def given_for(self, own: Any) -> NDArray[Any]:
+        """Return what a policy gives for an action as the environment takes it; the inverse of `own`."""
+        numbers = [np.ravel(_member(own, keys)) for keys, _ in leaves(self.original, ())]
+        return np.concatenate(numbers).astype(self.dtype)
 
     @override
     def __repr__(self) -> str:
@@ -227,6 +238,12 @@ def _own_numbers(space: gym.spaces.Box, numbers: NDArray[Any]) -> NDArray[Any]:
     own: NDArray[Any] = np.where(rounded < 0.5 * space.low + 0.5 * space.high, space.low, space.high)
     own[inside] = rounded[inside].astype(space.dtype)
     return own.astype(space.dtype)
+
+
+def _member(own: Any, keys: tuple[Any, ...]) -> Any:
+    for key in keys:
+        own = own[key]
+    return own
 
 
 def _nested(space: gym.Space[Any], values: Sequence[Any]) -> Any:

@@ -17,9 +17,10 @@ from gymnasium import spaces
 from policy_factory import make_portable
 
 from policies.acting.baselines import ConstantPolicy
+from policies.acting.evaluate import evaluate_policy
 from policies.acting.live import watch_episode
 from policies.acting.load import load_policy
-from policies.acting.policy import RandomPolicy
+from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.envs.action_bounds import ToBounds
 from policies.envs.make import check_env, make_env, make_vector_env
 from policies.envs.own_actions import Choices, Numbers, is_taken, made_of, own_actions
@@ -68,6 +69,8 @@ def test_every_action_is_one_of_the_choices(kind: str) -> None:
     assert not made.start.any()
     owns = [made.own(np.array(choices)) for choices in itertools.product(*map(range, sizes))]
     assert all(space.contains(own) for own in owns)
+    given = [made.given_for(own).tolist() for own in owns]
+    assert given == [list(choices) for choices in itertools.product(*map(range, sizes))]
     assert len({pickle.dumps(own) for own in owns}) == np.prod(sizes)
 
 
@@ -90,7 +93,9 @@ def test_every_vector_is_an_action_and_its_bounds_are_the_spaces(kind: str) -> N
     for size in (0.5, 1.0, 30.0, 1e30):
         for _ in range(20):
             drawn = (size * rng.normal(size=made.shape)).astype(np.float32)
-            assert space.contains(made.own(to_bounds(drawn)))
+            own = made.own(to_bounds(drawn))
+            assert space.contains(own)
+            assert pickle.dumps(made.own(made.given_for(own))) == pickle.dumps(own)
     least, most = (spaces.flatten(space, made.own(to_bounds(np.full(made.shape, side)))) for side in (-9.0, 9.0))
     for found, bound in ((least, made.low), (most, made.high)):
         is_finite = np.isfinite(bound)
@@ -169,6 +174,25 @@ def test_a_policy_acts_in_the_envs_own_form(kind: str, tmp_path: Path) -> None:
     if isinstance(policy.action_space, Choices):
         logits = np.split(policy.outputs(observations), np.cumsum(policy.action_space.sizes)[:-1], axis=1)
         assert rows.tolist() == np.stack([block.argmax(axis=1) for block in logits], axis=1).tolist()
+
+
+@pytest.mark.parametrize("kind", ["multi-discrete", "tuple of choices", "dict of numbers"])
+def test_a_class_of_somebodys_own_acts_in_that_form_too(kind: str, tmp_path: Path) -> None:
+    env_args = {"kind": kind}
+    policy = saved_policy(kind, tmp_path)
+
+    class Own(NetworkPolicy):
+        def act(self, observations: Any, mask: Any = None) -> Any:
+            return super().act(observations, mask)
+
+    own = Own(policy.portable)
+    # The environment refuses an action that is not in its own space.
+    assert evaluate_policy(own, env_id="TestReply-v0", env_args=env_args, seeds=range(4)) == evaluate_policy(
+        policy, env_id="TestReply-v0", env_args=env_args, seeds=range(4)
+    )
+    _, steps = watch_episode(own, "TestReply-v0", env_args, 1)
+    _, others = watch_episode(policy, "TestReply-v0", env_args, 1)
+    assert [step.action for step in steps] == [step.action for step in others]
 
 
 def test_baselines_have_such_actions_too() -> None:
