@@ -52,7 +52,7 @@ def column(name: str, values: Sequence[Any], space: Mapping[str, Any]) -> Column
     numbers = [float(value) for value in values if is_number(value) and math.isfinite(value)]
     is_numeric = len(numbers) == len([value for value in values if value is not None]) > 0
     is_listed = kind in ("", *LISTED_KINDS)
-    is_short = kind in LISTED_KINDS and len(set(numbers)) <= _MAX_LISTED
+    is_short = kind in (*LISTED_KINDS, "power_of_two") and len(set(numbers)) <= _MAX_LISTED
     if not is_numeric or is_short or (is_listed and None in values):
         return _categories(name, values, space)
     if kind == NEAR_ONE and max(numbers) < 1:
@@ -80,6 +80,8 @@ def _categories(name: str, values: Sequence[Any], space: Mapping[str, Any]) -> C
     order = list(dict.fromkeys([*(label for label in listed if label in tried), *tried]))
     if all(is_number(value) for value in tried.values()):
         order.sort(key=lambda label: float(tried[label]))
+    elif kind_of(space.get(name)) == "layers" and all(isinstance(value, list | tuple) for value in tried.values()):
+        order.sort(key=lambda label: (len(tried[label]), list(map(str, tried[label]))))
     places = {label: index for index, label in enumerate(order)}
     return Column(Axis(name, "category", tuple(order)), tuple(places[_label(value)] for value in values))
 

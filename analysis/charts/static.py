@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDTH = 9.0
+_PALE = 0.12
 _COLUMNS = 3
 _PANEL_HEIGHT = 2.9
 _LABEL_CHARS = 24
@@ -158,12 +160,24 @@ def _draw_parallel(trials: Trials) -> Figure:
     score = columns[-1]
     drawn = [index for index in trials.shown if trials.scores[index] is not None]
     drawn.sort(key=lambda index: trials.scores[index] or 0.0)
-    # A line passes by the axis of what does not act in its trial.
     known = [[(at, each, each.values[index]) for at, each in enumerate(columns)] for index in drawn]
     lines = [[(at, place(each, value)) for at, each, value in line if value is not None] for line in known]
+    steps = [list(itertools.pairwise(line)) for line in lines]
+    # Over the axis of what does not act in its trial, a line is pale.
+    runs = [[[one, two] for one, two in line if two[0] - one[0] == 1] for line in steps]
+    gaps = [[[one, two] for one, two in line if two[0] - one[0] > 1] for line in steps]
     styles = ["-" if trials.endings[index] == "whole" else "--" for index in drawn]
     paints = [_ramp(place(score, score.values[index])) for index in drawn]
-    axes.add_collection(LineCollection(lines, colors=paints, linestyles=styles, linewidths=0.8, alpha=0.6))
+    for parts, alpha in ((gaps, _PALE), (runs, 0.6)):
+        axes.add_collection(
+            LineCollection(
+                [part for line in parts for part in line],
+                colors=[paint for line, paint in zip(parts, paints, strict=True) for _ in line],
+                linestyles=[style for line, style in zip(parts, styles, strict=True) for _ in line],
+                linewidths=0.8,
+                alpha=alpha,
+            )
+        )
     axes.set_xlim(-0.2, len(columns) - 0.8)
     axes.set_ylim(-0.05, 1.05)
     style_axes(axes, xlabel="", ylabel="")

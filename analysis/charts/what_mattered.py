@@ -16,6 +16,7 @@ from analysis.wording import counted, return_text
 
 _MAX_BINS = 5
 _MIN_TRIALS = 2
+_PALE = " Where a line is pale, it passes by what does not act in its trial."
 
 
 def make_charts(subject: Subject) -> list[Chart]:
@@ -42,7 +43,7 @@ def make_charts(subject: Subject) -> list[Chart]:
         "mattered",
         "All hyperparameters at once",
         "Each line is a trial, coloured by its score; drag along an axis to choose a range, which the table of all "
-        "trials then keeps to.",
+        f"trials then keeps to.{_PALE if any(None in column.values for column in trials.columns) else ''}",
         None if why_no_lines else Parallel(trials),
         why_no_lines,
         (*marks, *shown_note(trials)),

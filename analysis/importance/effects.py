@@ -94,7 +94,7 @@ def _levels(parts: Sequence[Part], outcome: Floats) -> list[Level]:
 
 def _parts(item: Searched) -> list[Part]:
     """Return each level's label, its value and its points; a value that is too rare for a row of its own has none."""
-    if not item.is_numeric:
+    if not item.is_numeric or item.kind == "power_of_two":
         keys, key_of = np.array(item.keys), dict(zip(map(repr, item.values), item.keys, strict=True))
         found = [
             (

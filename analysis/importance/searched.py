@@ -78,7 +78,8 @@ class Searched:
         """The values that points have, each once: in the order of the sweep file, else as they come."""
         tried = {_key(value): value for value in self.acting_values}
         order = [_key(value) for value in self.arguments if self.kind in ("grid", "choice")]
-        return tuple(tried[key] for key in dict.fromkeys([*order, *tried]) if key in tried)
+        found = tuple(tried[key] for key in dict.fromkeys([*order, *tried]) if key in tried)
+        return tuple(sorted(found)) if self.kind == "power_of_two" and all(map(is_number, found)) else found
 
     @property
     def is_constant(self) -> bool:
@@ -177,7 +178,8 @@ def _layers(name: str, domain: Any, points: Sequence[Mapping[str, Any]]) -> list
         sizes = point.get(name, ())
         number = {f"{name}.number": len(sizes)} if sizes else {}
         parts.append(number | {f"{name}.{index}": size for index, size in enumerate(sizes, start=1)})
-    domains = {part: given.get("sizes") for part in searched_names(parts)} | {f"{name}.number": None}
+    numbers = {"choice": sorted({len(sizes) for sizes in lists})}
+    domains = {part: given.get("sizes") for part in searched_names(parts)} | {f"{name}.number": numbers}
     return [_searched(part, domains[part], parts, is_conditional=True) for part in searched_names(parts)]
 
 

@@ -122,10 +122,20 @@
 
   const halo = () => ({ textBorderColor: color("card"), textBorderWidth: 3 });
 
+  // A trial's line in pieces: pale where it passes by the axes of what does not act in it.
+  function pieces(columns, i) {
+    const dims = columns.map((_, dim) => dim).filter((dim) => columns[dim].values[i] !== null);
+    const runs = [[]];
+    for (const dim of dims) (runs.at(-1).length && dim - runs.at(-1).at(-1) > 1 ? runs[runs.push([]) - 1] : runs.at(-1)).push(dim);
+    const gaps = runs.slice(1).map((run, at) => [runs[at].at(-1), run[0]]);
+    const of = (part) => columns.map((column, dim) => (part.includes(dim) ? column.values[i] : null));
+    return [...gaps.map((part) => ({ value: of(part), isPale: true })),
+      ...runs.filter((part) => part.length > 1).map((part) => ({ value: of(part), isPale: false }))];
+  }
+
   function parallel(chart) {
     const columns = [...trials.columns, { axis: trials.score, values: trials.scores }];
     const ends = extent(trials.scores);
-    // A line passes by an axis of what does not act in its trial.
     const drawn = trials.shown.filter((i) => trials.scores[i] !== null)
       .sort((one, two) => trials.scores[one] - trials.scores[two]);
     const option = (narrow) => ({
@@ -142,11 +152,11 @@
         areaSelectStyle: { width: 18, borderColor: color("ink"), color: color("muted"), opacity: 0.35 },
       })),
       tooltip: { formatter: (at) => trialTip(at.data.trial) },
-      series: [{ type: "parallel", inactiveOpacity: 0.04, activeOpacity: 0.9, data: drawn.map((i) => ({
-        trial: i, value: columns.map((column) => column.values[i]),
-        lineStyle: { color: alongRamp(trials.score, ends, trials.scores[i]), opacity: drawn.length > 150 ? 0.4 : 0.7, width: 1.4,
-          type: trials.endings[i] === "whole" ? "solid" : "dashed" },
-      })) }],
+      series: [{ type: "parallel", inactiveOpacity: 0.04, activeOpacity: 0.9, data: drawn.flatMap((i) => pieces(columns, i).map((piece) => ({
+        trial: i, value: piece.value,
+        lineStyle: { color: alongRamp(trials.score, ends, trials.scores[i]), width: 1.4,
+          opacity: piece.isPale ? 0.15 : drawn.length > 150 ? 0.4 : 0.7, type: trials.endings[i] === "whole" ? "solid" : "dashed" },
+      }))) }],
     });
     const after = (drawing) => drawing.on("axisareaselected", () => {
       const ranges = drawing.getModel().queryComponents({ mainType: "parallelAxis" }).map((axis) => axis.activeIntervals);

@@ -1,6 +1,7 @@
 """A point of one's own, on the page: a field for each searched hyperparameter, filled with the best trial's values."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from live_service import Live, serving
@@ -12,6 +13,15 @@ from synthetic_sweep import make_sweep
 
 pytestmark = IN_A_BROWSER
 SPACE = {"lr": {"loguniform": [1e-5, 1e-1]}, "hidden_sizes": {"grid": [[32], [64]]}, "num_epochs": {"randint": [2, 9]}}
+CONDITIONAL = {
+    "replay": {"choice": ["uniform", "prioritized"]},
+    "prioritized_alpha": {"uniform": [0.01, 1.0], "when": {"replay": "prioritized"}},
+    "hidden_sizes": {"layers": {"number": [1, 3], "sizes": {"choice": [16, 32, 64]}}},
+}
+SOME_LACK_ONE: list[dict[str, Any]] = [
+    {"replay": "uniform", "hidden_sizes": [32, 16]},
+    {"replay": "prioritized", "prioritized_alpha": 0.5, "hidden_sizes": [16]},
+]
 POINTS = [
     {"lr": 1e-5, "hidden_sizes": [32], "num_epochs": 3},
     {"lr": 3.25e-3, "hidden_sizes": [64], "num_epochs": 5},
@@ -23,6 +33,8 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     storage = tmp_path_factory.mktemp("page") / "sweeps"
     made = make_sweep(name="mine", points=POINTS, with_best=False, max_steps=20_000)
     write_sweep(storage, made, spec={"space": SPACE, "seeds_per_point": 1})
+    made = make_sweep(name="conditional", points=SOME_LACK_ONE, with_best=False, max_steps=20_000)
+    write_sweep(storage, made, spec={"space": CONDITIONAL, "seeds_per_point": 1, "algorithm": "dqn"})
     plain = make_sweep(name="plain", points=[{}], with_best=False, max_steps=5_000)
     write_sweep(storage, plain, spec={"space": {}})
     with serving(storage) as found:
@@ -85,3 +97,32 @@ def test_the_dialog_is_accessible_and_fits(page: Page, width: int, theme: str) -
     box = page.run("return document.querySelector('dialog').getBoundingClientRect().toJSON()")
     assert box["left"] >= 0
     assert box["right"] <= width
+
+
+def test_what_does_not_act_is_neither_asked_for_nor_sent(page: Page, live: Live) -> None:
+    page.open("#/sweeps/conditional")
+    page.says(".trials-card", "2 trials")
+    # Nothing stands in the cell of what does not act.
+    texts = page.run(
+        "return [...document.querySelectorAll('.trials-card tbody tr')]"
+        ".map((row) => [...row.cells].map((cell) => cell.innerText.trim()))"
+    )
+    empty = {each: {row.count("") for row in texts if each in row} for each in ("prioritized", "uniform")}
+    assert len(empty["prioritized"]) == 1
+    assert empty["uniform"] == {number + 1 for number in empty["prioritized"]}
+    page.button("More").click()
+    page.button("Add a point…").click()
+    is_idle = "return document.querySelector('#field-point-prioritized_alpha').closest('.field').hidden"
+    assert page.run(is_idle)
+    Select(page.one("dialog #field-point-replay")).select_by_visible_text("prioritized")
+    assert page.one("dialog #field-point-prioritized_alpha").get_attribute("value") == "0.505"
+    Select(page.one("dialog #field-point-replay")).select_by_visible_text("uniform")
+    assert page.run(is_idle)
+    sizes = page.one("dialog #field-point-hidden_sizes")
+    assert sizes.get_attribute("value") == "32, 16"
+    sizes.clear()
+    sizes.send_keys("64, 32, 16")
+    page.button("Add and train", "dialog").click()
+    page.wait("return document.querySelector('.dialog') === null")
+    (job,) = live.service.queue.jobs(sweep="conditional")
+    assert job.arguments == {"point": {"replay": "uniform", "hidden_sizes": [64, 32, 16]}}

@@ -42,9 +42,9 @@ export class Completion {
       .map((value) => ({ text: String(value), insert: String(value), about: "" }));
     // A domain of the search is a mapping of one key.
     for (const item of path[0] === "space" ? alternatives : []) {
-      const keys = Object.keys(item.properties ?? {});
+      const keys = kindsIn(item);
       if (keys.length === 1) {
-        items.push({ text: keys[0], insert: `{${keys[0]}: []}`, back: 2, about: item.description ?? "" });
+        items.push({ text: keys[0], insert: `{${keys[0]}: ${keys[0] === "layers" ? "{}" : "[]"}}`, back: 2, about: item.description ?? "" });
       }
     }
     const found = items.filter((item) => item.text.startsWith(typed) && item.text !== typed);
@@ -86,7 +86,7 @@ export class Completion {
   // Whether a key opens a block of further keys, which begins on a line of its own.
   isMapping(schema) {
     const kinds = this.alternatives(schema).filter((item) => item.type !== "null");
-    const isBlock = (item) => [item.type].flat().includes("object") && Object.keys(item.properties ?? {}).length !== 1;
+    const isBlock = (item) => [item.type].flat().includes("object") && kindsIn(item).length !== 1;
     return kinds.length > 0 && kinds.every(isBlock);
   }
 
@@ -96,6 +96,9 @@ export class Completion {
     return [described?.description, known && `Default: ${JSON.stringify(schema.default)}.`].filter(Boolean).join(" ");
   }
 }
+
+// A domain has one key, its kind, beside its condition.
+const kindsIn = (schema) => Object.keys(schema.properties ?? {}).filter((key) => key !== "when");
 
 function listedValues(schema) {
   if (schema.enum) return schema.enum;

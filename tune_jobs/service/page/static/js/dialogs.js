@@ -3,6 +3,7 @@ import { el, setText } from "./dom.js";
 
 // A field: { name, label, type: "number" | "text" | "textarea" | "checkbox" | "select", value, min, max, hint }; a number may
 // have a `step`, 1 if left out, and a select has `options`: { text, value }, of which the value may be anything.
+// A field with `acts(values)` is asked for only where the others' values make that true.
 function fieldOf(spec) {
   const id = `field-${spec.name}`;
   const hint = spec.hint ? el("small", { id: `${id}-hint` }, spec.hint) : null;
@@ -60,12 +61,13 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
   const submit = el("button", { type: "submit", class: isDangerous ? "danger" : "primary" }, label);
   const cancel = el("button", { type: "button" }, "Cancel");
   const heading = el("h2", { id: "dialog-title" }, title);
+  const rows = fields.map(fieldOf);
   const form = el(
     "form",
     { method: "dialog" },
     heading,
     text ? el("p", { class: "quiet" }, text) : null,
-    ...fields.map(fieldOf),
+    ...rows,
     told,
     problem,
     el("div", { class: "buttons" }, cancel, submit),
@@ -95,6 +97,18 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
       submit.disabled = false;
     }
   });
+  const showActing = () => {
+    const values = valuesOf(form, fields);
+    fields.forEach((spec, index) => {
+      if (!spec.acts) return;
+      const isIdle = !spec.acts(values);
+      rows[index].hidden = isIdle;
+      // A field that nobody sees must not keep the form from being sent.
+      form.elements[spec.name].disabled = isIdle;
+    });
+  };
+  for (const event of ["input", "change"]) form.addEventListener(event, showActing);
+  showActing();
   const retell = () => setText(told, form.checkValidity() ? tell(valuesOf(form, fields)) : "");
   if (tell) form.addEventListener("input", retell);
   document.body.append(dialog);

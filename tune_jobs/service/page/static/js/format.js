@@ -20,6 +20,8 @@ export function significant(value, digits = 4) {
     const [mantissa, exponent] = value.toExponential(digits - 1).split("e");
     return `${Number(mantissa)}e${Number(exponent)}`;
   }
+  // 0.99987 is not 1, which fewer digits would say.
+  if (Number(text) === 1 && value < 1) return String(Number(value.toFixed(1 - Math.floor(Math.log10(1 - value)))));
   return String(Number(text));
 }
 
@@ -30,6 +32,10 @@ export function settingText(value, digits = 4) {
   if (typeof value === "number") return significant(value, digits);
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
+
+// The value of a point; empty where it does not act. Of a point that is not chosen yet nothing is known.
+export const valueText = (point, name) =>
+  name in point ? settingText(point[name]) : Object.keys(point).length ? "" : NONE;
 
 export const pointText = (point, digits = 3) =>
   Object.entries(point ?? {})

@@ -1,10 +1,11 @@
 // How many trials come of what is asked for, as the service counts them.
+import { numCombinations } from "./domains.js";
 import { counted } from "./format.js";
 
 // Points of one more sample: a draw for each combination of the grids; models propose from those too.
 function pointsPerSample(spec) {
   if ((spec.search?.type ?? "random") !== "random") return 1;
-  return Object.values(spec.space ?? {}).reduce((product, domain) => product * (domain.grid?.length ?? 1), 1);
+  return numCombinations(spec.space ?? {});
 }
 
 export function toldExtension(spec, numSamples) {

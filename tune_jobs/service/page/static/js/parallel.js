@@ -175,22 +175,32 @@ export class Parallel {
     this.stroke(context, [near], 2.5);
   }
 
+  // A line is pale where it passes by the axes of what does not act in its trial.
   stroke(context, trials, width) {
+    const alpha = context.globalAlpha;
     context.lineWidth = width;
+    this.trace(context, trials, false);
+    context.globalAlpha = 0.25 * alpha;
+    this.trace(context, trials, true);
+    context.globalAlpha = alpha;
+  }
+
+  trace(context, trials, isOverGaps) {
     context.beginPath();
     for (const trial of trials) {
-      let isBegun = false;
-      for (const axis of this.axes) {
+      let last = null;
+      this.axes.forEach((axis, index) => {
         const value = axis.valueOf(trial);
-        if (value === null) {
-          isBegun = false;
-        } else if (isBegun) {
-          context.lineTo(axis.left, topOf(axis.place(value)));
+        if (value === null) return;
+        const [left, top] = [axis.left, topOf(axis.place(value))];
+        if (last !== null && index - last.index > 1 === isOverGaps) {
+          if (isOverGaps) context.moveTo(last.left, last.top);
+          context.lineTo(left, top);
         } else {
-          context.moveTo(axis.left, topOf(axis.place(value)));
-          isBegun = true;
+          context.moveTo(left, top);
         }
-      }
+        last = { index, left, top };
+      });
     }
     context.stroke();
   }

@@ -24,6 +24,7 @@ export function axesOf(searchedOnes, trials) {
 function axisOf({ name, kind, values }, found) {
   const isNumeric = found.length > 0 && found.every((value) => typeof value === "number");
   if (kind === "listed" || !isNumeric) return listedAxis(name, [...values, ...found]);
+  if (kind === "near one" && found.every((value) => value < 1)) return rangeAxis(name, kind, found);
   return rangeAxis(name, kind === "log" && found.every((value) => value > 0) ? "log" : "linear", found);
 }
 
@@ -58,9 +59,8 @@ function listedAxis(name, values) {
 
 function rangeAxis(name, kind, values) {
   let [low, high] = values.reduce(([a, b], value) => [Math.min(a, value), Math.max(b, value)], [Infinity, -Infinity]);
-  if (low === high) [low, high] = kind === "log" ? [low / 2, high * 2] : [low - 1, high + 1];
-  const by = kind === "log" ? Math.log10 : (value) => value;
-  const back = kind === "log" ? (value) => 10 ** value : (value) => value;
+  const { by, back, ticks, around } = SCALES[kind];
+  if (low === high) [low, high] = around(low);
   const place = (value) => (by(value) - by(low)) / (by(high) - by(low));
   const valueAt = (at) => back(by(low) + at * (by(high) - by(low)));
   return {
@@ -69,7 +69,7 @@ function rangeAxis(name, kind, values) {
     place,
     valueAt,
     text: (value) => settingText(value, 3),
-    ticks: (kind === "log" ? logTicks(low, high) : linearTicks(low, high)).map((value) => ({
+    ticks: ticks(low, high).map((value) => ({
       text: settingText(value, 3),
       at: place(value),
     })),
@@ -85,7 +85,19 @@ function rangeAxis(name, kind, values) {
   };
 }
 
-const rounded = (value) => Number(value.toPrecision(4));
+const SCALES = {
+  linear: { by: (value) => value, back: (at) => at, ticks: linearTicks, around: (value) => [value - 1, value + 1] },
+  log: { by: Math.log10, back: (at) => 10 ** at, ticks: logTicks, around: (value) => [value / 2, value * 2] },
+  // 0.9, 0.99 and 0.999 lie equally apart.
+  "near one": {
+    by: (value) => -Math.log10(1 - value),
+    back: (at) => 1 - 10 ** -at,
+    ticks: (low, high) => logTicks(1 - high, 1 - low).map((distance) => Number((1 - distance).toPrecision(12))),
+    around: (value) => [1 - 2 * (1 - value), 1 - (1 - value) / 2],
+  },
+};
+
+const rounded = (value) => Number(value.toPrecision(value > 0.99 && value < 1 ? 8 : 4));
 
 function logTicks(low, high) {
   const decades = [];

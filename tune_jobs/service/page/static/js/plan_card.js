@@ -1,6 +1,6 @@
 // The plan beside the sweep file: what would run, or what is wrong.
 import { el, setAttribute, setText } from "./dom.js";
-import { bytes, count, counted, returnText, settingText } from "./format.js";
+import { bytes, count, counted, returnText, valueText } from "./format.js";
 
 const FIRST_POINTS = 6;
 
@@ -114,7 +114,7 @@ function pointsTable(plan) {
   const names = [...new Set(points.flatMap((trial) => Object.keys(trial.point)))];
   if (!names.length) return [];
   const shown = points.slice(0, FIRST_POINTS);
-  const numeric = (name) => points.every((trial) => typeof trial.point[name] === "number");
+  const numeric = (name) => points.every((trial) => ["number", "undefined"].includes(typeof trial.point[name]));
   return [
     el(
       "div",
@@ -145,7 +145,7 @@ function pointsTable(plan) {
             el(
               "tr",
               {},
-              names.map((name) => el("td", { class: numeric(name) ? "number" : null }, settingText(trial.point[name]))),
+              names.map((name) => el("td", { class: numeric(name) ? "number" : null }, valueText(trial.point, name))),
             ),
           ),
         ),

@@ -1,4 +1,5 @@
 // What is known of one sweep: its summary, its sweep file, its trials and their curves.
+import { isLog, kindOf, LISTED, NEAR_ONE } from "./domains.js";
 import { axesOf } from "./parallel_axes.js";
 
 const FIELDS = [
@@ -22,8 +23,6 @@ const FIELDS = [
   "pid",
   "num_failures",
 ].join(",");
-const LOG_DOMAINS = ["loguniform", "qloguniform", "lograndint", "qlograndint"];
-const LISTED = ["grid", "choice"];
 
 export class SweepData {
   // `source` is where it comes from: a ServerSource or a FileSource.
@@ -119,7 +118,7 @@ export class SweepData {
       ...[...inPoints].filter((name) => !(name in space)),
     ];
     const isNumber = (name) => this.trials.every((trial) => ["number", "undefined"].includes(typeof trial.point[name]));
-    return names.map((name) => ({ name, isNumber: isNumber(name), ...kindOf(space[name]) }));
+    return names.map((name) => ({ name, isNumber: isNumber(name), ...scaleOf(space[name]) }));
   }
 
   get hasSeveralSeeds() {
@@ -153,8 +152,9 @@ export class SweepData {
   }
 }
 
-function kindOf(domain) {
-  const type = domain && typeof domain === "object" ? Object.keys(domain)[0] : null;
-  if (type === null || LISTED.includes(type)) return { kind: "listed", values: type === null ? [] : domain[type] };
-  return { kind: LOG_DOMAINS.includes(type) ? "log" : "linear", values: [] };
+function scaleOf(domain) {
+  const type = kindOf(domain);
+  if (type === null || type === "layers") return { kind: "listed", values: [] };
+  if (LISTED.includes(type)) return { kind: "listed", values: domain[type] };
+  return { kind: isLog(type) ? "log" : type === NEAR_ONE ? "near one" : "linear", values: [] };
 }

@@ -1,5 +1,5 @@
 // The columns of the table of trials, which the filter and the sorting know by the same names.
-import { count, duration, NONE, returnText, settingText } from "./format.js";
+import { count, duration, NONE, returnText, settingText, valueText } from "./format.js";
 
 const collator = new Intl.Collator("en", { numeric: true });
 
@@ -13,7 +13,7 @@ export function columnsOf(searched, hasSeveralSeeds) {
       label: name,
       isNumber,
       value: (row) => plain(row.point[name]),
-      text: (row) => (name in row.point ? settingText(row.point[name]) : NONE),
+      text: (row) => valueText(row.point, name),
     })),
     column("training_return", "training return", (row) => row.training_return, returnText, true),
     column("num_env_steps", "env steps", (row) => row.num_env_steps, count, true),
