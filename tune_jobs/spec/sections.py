@@ -340,7 +340,9 @@ class SweepFields(Section):
 
     def value_without(self, name: str) -> Any:
         """Return the value of a hyperparameter where it is not searched: the fixed one, or the default."""
-        field = HYPERPARAMS_BY_ALGORITHM[self.algorithm].model_fields[name]
+        field = HYPERPARAMS_BY_ALGORITHM[self.algorithm].model_fields.get(name)
+        if field is None:  # the length of training, the only other name that is searched
+            return self.stop.num_env_steps
         return self.hyperparams.get(name, field.get_default(call_default_factory=True))
 
     @property
