@@ -11,6 +11,7 @@ Streams derived from the seed of a sweep, by `spawn_key` of `numpy.random.SeedSe
 | (4, trial, change) | population based training: how a trial's change number `change` changes its values |
 | (5, point) | search method tpe: its sampler |
 | (6, point) | other search methods that have a model: what they draw for it, and where they look |
+| (7, point) | searches of two objectives: what one weighs beside the other |
 
 Points are counted there without those that somebody chose, so that these change no other.
 
@@ -35,7 +36,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-_POINT, _TRAINING, _EVALUATION, _CONFIRMATION, _MUTATION, _TPE, _MODEL = range(7)
+_POINT, _TRAINING, _EVALUATION, _CONFIRMATION, _MUTATION, _TPE, _MODEL, _WEIGHT = range(8)
 """The first elements of spawn keys: for a new stream, take the next number and add a row to the table above."""
 
 
@@ -93,6 +94,11 @@ def tpe_seed(sweep_seed: int, point_index: int) -> int:
 def model_draws(sweep_seed: int, point_index: int) -> np.random.Generator:
     """Return the generator of a search method that proposes a point by a model."""
     return np.random.default_rng(_spawned(sweep_seed, _MODEL, point_index))
+
+
+def objective_weights(sweep_seed: int, point_index: int) -> np.random.Generator:
+    """Return the generator of the weight that one of two objectives has when a point is proposed."""
+    return np.random.default_rng(_spawned(sweep_seed, _WEIGHT, point_index))
 
 
 # From a trial's seed.

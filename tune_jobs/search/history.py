@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from analysis.objectives import env_steps_of
 from analysis.records import FINISHED, TrialRecord
 from analysis.selection import score_trial
 from tune_jobs.search.chosen_point import outside
@@ -32,6 +33,8 @@ class KnownPoint:
     """Its values by the names of the space."""
     scores: tuple[float | None, ...] = ()
     """What its ended seeds reached, higher is better, in reward units; None: that seed failed or was never scored."""
+    env_steps: tuple[int, ...] = ()
+    """What a training took, one for each of the scores; see `analysis.objectives.env_steps_of`. Empty: not known."""
     is_running: bool = False
     """Whether at least one of its seeds has not ended."""
     level: int | None = None
@@ -65,6 +68,7 @@ def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownP
             KnownPoint(
                 point=members[0].point,
                 scores=tuple(map(_score, ended)),
+                env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps) for record in ended),
                 is_running=len(ended) < len(members),
                 level=_level(spec, members),
             )

@@ -29,6 +29,7 @@ from policies.errors import CannotRunError
 from tune_jobs.search.asking import Check, Method, Question
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.parts import Parts
+from tune_jobs.search.two_objectives import weighed
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -79,6 +80,8 @@ def check_installed(method: str) -> None:
 def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check) -> dict[str, Any]:
     """Choose the next point of a sweep by its search method.
 
+    Where the sweep asks for score and cost, the methods are told of both (`two_objectives`).
+
     The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, the point
     is the random one of its index.
 
@@ -92,8 +95,11 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: 
         SpecError: None of many proposals is valid.
         CannotRunError: What the method needs is not installed.
     """
+    known = known_points(spec, records)
+    if spec.objective.cost is not None:
+        known = weighed(known, drawn_index, spec.seed)
     return next_point(
-        spec.search.type, spec.space, known_points(spec, records), drawn_index, seed=spec.seed,
+        spec.search.type, spec.space, known, drawn_index, seed=spec.seed,
         num_startup_trials=spec.search.num_startup_trials, check=check,
     )  # fmt: skip
 

@@ -92,22 +92,17 @@ def idle_settings(spec: SweepFields) -> list[str]:
 
 
 def _cost_notes(spec: SweepFields) -> list[str]:
-    """Return the notes on a cost that says little, or that the search method does not look at."""
+    """Return the note on a cost in which settings can't differ."""
     if spec.objective.cost is None:
         return []
-    notes = []
-    if TRAINING_LENGTH not in spec.space and spec.stop.training_return is None and spec.stop.evaluation_return is None:
-        notes.append(
-            "objective asks for env_steps, but all trainings are to be as long: search their length, as in space: "
-            f"{{{TRAINING_LENGTH}: {{choice: [20_000, 50_000]}}}}, or end them at a goal (stop.training_return, "
-            "stop.evaluation_return)."
-        )
-    if spec.search.type != "random":
-        notes.append(
-            f"search.type {spec.search.type} proposes points by their scores alone; env_steps count when settings are "
-            "compared."
-        )
-    return notes
+    if TRAINING_LENGTH in spec.space or (spec.stop.training_return, spec.stop.evaluation_return) != (None, None):
+        return []
+    text = (
+        "objective asks for env_steps, but all trainings are to be as long: search their length, as in space: "
+        f"{{{TRAINING_LENGTH}: {{choice: [20_000, 50_000]}}}}, or end them at a goal (stop.training_return, "
+        "stop.evaluation_return)."
+    )
+    return [text]
 
 
 def check_extendable(spec: SweepFields) -> None:

@@ -1,0 +1,56 @@
+"""Score and cost as one number, which a search method is told as the score where the sweep asks for both.
+
+A model of one number looks for one best point, and a front has many. So for each point that is asked for, score and
+cost are weighed anew, by a weight that is drawn: over many points all of the front is searched, by any method.
+
+Source:
+    Knowles 2006, "ParEGO: A Hybrid Algorithm With On-Line Landscape Approximation for Expensive Multiobjective
+    Optimization Problems", equation 2 with its rho of 0.05: the larger of the weighted losses, and a little of their
+    sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from policies import random_streams
+from tune_jobs.search.history import KnownPoint
+
+_RHO = 0.05
+
+
+def weighed(known: Sequence[KnownPoint], index: int, seed: int) -> list[KnownPoint]:
+    """Return known points with one number for score and cost as their scores, higher is better.
+
+    Scores and costs are counted in shares of their range among the ended seeds. A seed without a score has none.
+
+    Args:
+        known: Points with scores and costs.
+        index: The index of the point that is asked for: its weight belongs to it.
+        seed: The sweep's seed.
+    """
+    pairs = [
+        (score, cost)
+        for point in known
+        for score, cost in zip(point.scores, point.env_steps, strict=True)
+        if score is not None
+    ]
+    if not pairs:
+        return list(known)
+    best, least = max(score for score, _ in pairs), min(cost for _, cost in pairs)
+    # Divided first, as the difference of two scores may be too large for a float.
+    scores = (best / 2 - min(score for score, _ in pairs) / 2) or 1.0
+    costs = (max(cost for _, cost in pairs) - least) or 1
+    weight = float(random_streams.objective_weights(seed, index).random())
+
+    def number(score: float | None, cost: int) -> float | None:
+        if score is None:
+            return None
+        losses = weight * ((best / 2 - score / 2) / scores), (1.0 - weight) * ((cost - least) / costs)
+        return -(max(losses) + _RHO * sum(losses))
+
+    return [
+        replace(point, scores=tuple(number(*pair) for pair in zip(point.scores, point.env_steps, strict=True)))
+        for point in known
+    ]
