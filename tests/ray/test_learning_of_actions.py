@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from trials import make_task, run_trial
 
 from policies.acting.evaluate import Evaluator
 from policies.acting.load import load_policy
+from policies.errors import EnvError
 from policies.portable.file import save_policy
 from tune_jobs.spec.sections import EvaluationSpec, StopSpec
 
@@ -102,4 +104,44 @@ def test_a_trial_of_rllibs_learns_it(algorithm: str, case: str, tmp_path: Path) 
     progress = run_trial(task_of(tmp_path, algorithm, case), engine)
     engine.close()
     assert progress.status == "completed", progress
-    check(load_policy(tmp_path / progress.checkpoints[-1].path), case)
+    checkpoint = tmp_path / progress.checkpoints[-1].path
+    check(load_policy(checkpoint), case)
+    if case == "mask of two choices":
+        from tune_jobs.training.registry import engine_of_checkpoint, restore_checkpoint
+
+        # RLlib's own files hold the spaces too. A restore compares the weights.
+        algorithm = restore_checkpoint(checkpoint, engine_of_checkpoint(checkpoint))
+        algorithm.train()
+        assert [return_ for return_, _ in algorithm.env_runner.pop_finished_episodes()]
+        algorithm.stop()
+
+
+FORBIDS_ALL = (
+    r"TestForbidding-v0 raised an error in step\(\): ValueError: the environment gave \[0, 0, 0, 0\] as "
+    r"observation\['action_mask'\] after env step 2 of an episode, which forbids every action"
+)
+
+
+def task_gone_wrong(folder: Path) -> TrialTask:
+    return make_task(folder, "ppo", env_id="TestForbidding-v0", env_args={"goes_wrong": "nothing"}, **VALUES["ppo"])
+
+
+def test_a_mask_that_forbids_everything_fails_the_member_of_a_pack_with_the_step(tmp_path: Path) -> None:
+    from tune_jobs.training.packed import PackedEngine
+
+    engine = PackedEngine()
+    engine.add(task_gone_wrong(tmp_path), None)
+    (found,) = engine.train_iteration().values()
+    assert isinstance(found, EnvError)
+    assert re.search(FORBIDS_ALL, found.message)
+    engine.close()
+
+
+def test_a_mask_that_forbids_everything_fails_a_trial_of_rllibs_with_the_step(tmp_path: Path) -> None:
+    from tune_jobs.training.rllib import RLlibEngine
+
+    engine = RLlibEngine()
+    engine.build(task_gone_wrong(tmp_path), None)
+    with pytest.raises(EnvError, match=FORBIDS_ALL):
+        engine.train_iteration()
+    engine.close()
