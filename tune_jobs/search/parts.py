@@ -72,7 +72,8 @@ def size_of(name: str, index: int) -> str:
 
 def _parts(name: str, domain: Domain) -> dict[str, Any]:
     if not isinstance(domain, Layers):
-        return {name: domain}
+        # A random point of a model's has a value of each name, too.
+        return {name: domain.model_copy(update={"when": None})}
     fewest, most = domain.layers.number
     number = RandInt(randint=(fewest, most + 1))
     return {number_of(name): number} | {size_of(name, index): domain.sizes for index in range(most)}
