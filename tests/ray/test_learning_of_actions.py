@@ -110,10 +110,10 @@ def test_a_trial_of_rllibs_learns_it(algorithm: str, case: str, tmp_path: Path) 
         from tune_jobs.training.registry import engine_of_checkpoint, restore_checkpoint
 
         # RLlib's own files hold the spaces too. A restore compares the weights.
-        algorithm = restore_checkpoint(checkpoint, engine_of_checkpoint(checkpoint))
-        algorithm.train()
-        assert [return_ for return_, _ in algorithm.env_runner.pop_finished_episodes()]
-        algorithm.stop()
+        restored = restore_checkpoint(checkpoint, engine_of_checkpoint(checkpoint))
+        restored.train()
+        assert [return_ for return_, _ in restored.env_runner.pop_finished_episodes()]
+        restored.stop()
 
 
 FORBIDS_ALL = (
