@@ -222,6 +222,23 @@ class ChosenPointRecord(Record):
     point: dict[str, Any] = Field(description="Its values of the searched hyperparameters.")
 
 
+class PriorPointRecord(Record):
+    """A point of an earlier sweep, as the model of a later one is told it."""
+
+    point: dict[str, Any] = Field(description="Its values of what the later sweep searches.")
+    share: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        description="The share of its sweep's points that it is better than; null: a seed of it failed."
+    )
+
+
+class PriorRecord(Record):
+    """An earlier sweep that a search begins with, as it was when the sweep was created."""
+
+    sweep: str = Field(description="Its name.")
+    env_id: str = Field(description="The environment that it trained in.")
+    points: tuple[PriorPointRecord, ...] = Field(description="Its points that the later sweep could have.")
+
+
 class JobRecord(Record):
     """The job of a Ray cluster that drives a sweep, or was asked to."""
 
@@ -251,6 +268,7 @@ class SweepRecord(Record):
     waiting: WaitRecord | None = Field(None, description="The nodes it waits for; if nothing runs it: waited, in vain.")
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
+    prior: tuple[PriorRecord, ...] = Field((), description="What its search began with, of earlier sweeps.")
 
     def section(self, name: str) -> Mapping[str, Any]:
         """Return a section of the sweep file, empty where a record lacks it or has something else there.

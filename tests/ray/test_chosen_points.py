@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from test_sweeps import assert_results_without_gaps, launch, make_spec, snapshot
 
-from analysis.records import TrialRecord
+from analysis.records import PriorRecord, TrialRecord
 from tests.narrowing import present
 from tune_jobs.ray_tune import searcher
 from tune_jobs.search.asking import Check
@@ -68,9 +68,11 @@ def test_tpe_goes_on_behind_it_with_its_own_draws_and_is_told_of_it(
     spec = load_spec(given)
     told: list[tuple[int, list[str]]] = []
 
-    def watched(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check) -> dict[str, Any]:
+    def watched(
+        spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check, prior: Sequence[PriorRecord]
+    ) -> dict[str, Any]:
         told.append((drawn_index, [record.trial_id for record in records if record.status == "completed"]))
-        return propose_point(spec, records, drawn_index, check)
+        return propose_point(spec, records, drawn_index, check, prior)
 
     monkeypatch.setattr(searcher, "propose_point", watched)
     launch(tmp_path, given)

@@ -15,7 +15,7 @@ import gymnasium as gym
 from pydantic import TypeAdapter
 
 from analysis.numbering import planned_places
-from analysis.records import FINISHED, ChosenPointRecord, ReplicationRecord, TrialPlan, TrialRecord
+from analysis.records import FINISHED, ChosenPointRecord, PriorRecord, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
 from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo
@@ -37,6 +37,7 @@ from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.chosen_point import outside_notes
 from tune_jobs.search.given_points import given_points
 from tune_jobs.search.points import largest_hyperparams, planned_points
+from tune_jobs.search.prior import prior_notes
 from tune_jobs.search.proposal import check_installed
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.hyperparam_problems import check_distinct
@@ -75,6 +76,8 @@ class SweepPlan:
     machine: Machine
     notes: tuple[str, ...] = ()
     """Notes on settings that may not be meant, and on trials that are not packed."""
+    prior: tuple[PriorRecord, ...] = ()
+    """What the search of a new sweep begins with, of earlier sweeps."""
     packs: PackPlan | None = None
     """The packs of the packed trials that have not ended; None: there are none."""
 
@@ -89,7 +92,7 @@ class SweepPlan:
 
     def to_json(self) -> dict[str, Any]:
         """Return the plan as JSON-like data, without the environment's spaces."""
-        apart = ("trials", "env", "machine", "packs")
+        apart = ("trials", "env", "machine", "packs", "prior")
         data = {name: value for name, value in vars(self).items() if name not in apart}
         env = {"id": self.env.env_id, "args": self.env.env_args, "threshold": self.env.threshold}
         return data | {
@@ -143,6 +146,7 @@ def make_plan(
     *,
     replications: Sequence[ReplicationRecord] = (),
     chosen_points: Sequence[ChosenPointRecord] | None = None,
+    prior: Sequence[PriorRecord] = (),
     retry_failed: bool = False,
 ) -> SweepPlan:
     """Plan a sweep for a machine.
@@ -153,6 +157,7 @@ def make_plan(
         records: The records of trials that exist already, which keep their engines.
         replications: More seeds of some points, oldest first.
         chosen_points: Points that somebody chose, oldest first; None: those of the sweep file, as for a new sweep.
+        prior: What the search of a new sweep begins with.
         retry_failed: Whether the failed ones of them run again.
 
     Raises:
@@ -205,8 +210,10 @@ def make_plan(
             *idle,
             *engine_notes,
             *outside_notes(spec, chosen_points),
+            *prior_notes(spec, prior),
         ),
         packs=packs,
+        prior=tuple(prior),
     )
 
 

@@ -65,7 +65,9 @@ class PointChooser:
             self._write(point_index, records, known[0].point)
             return
         drawn = drawn_index(point_index, self._sweep.chosen_points)
-        point = propose_point(spec, records, drawn, lambda point: self._hyperparams(point, point_index))
+        point = propose_point(
+            spec, records, drawn, lambda point: self._hyperparams(point, point_index), self._sweep.prior
+        )
         self._write(point_index, records, point)
 
     def _hyperparams(self, point: Mapping[str, Any], point_index: int) -> Hyperparams:

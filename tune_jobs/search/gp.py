@@ -28,6 +28,10 @@ _MOST_FITTED, _MOST_GIVEN = 120, 240
 """The most points that settings are found by, and that the process is given."""
 
 
+_MARGIN = 0.1
+"""How much better than the best a score has to be to count as improvement, where all scores have a variance of 1."""
+
+
 def propose(question: Question, check: Check) -> dict[str, Any]:
     """Answer by a Gaussian process; see `tune_jobs.search.asking.Method`.
 
@@ -42,7 +46,7 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     posterior = Posterior(settings, cube.group_of_column, seen, cube.columns(awaited))
     # What runs is expected to be as good as the model says: to be equal to it is no improvement.
     expected = posterior.mean_at_given()
-    best = float(expected.max())
+    best = float(expected.max()) + _MARGIN
     near = np.concatenate([units, awaited])[np.argsort(-expected, kind="stable")[:10]]
 
     def promise(columns: Floats) -> Floats:

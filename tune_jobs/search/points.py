@@ -39,7 +39,8 @@ def planned_points(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] =
 def _drawn_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
     if not spec.search.has_model:
         return list(draw_points(spec.space, spec.num_samples, spec.seed))
-    num_random = min(spec.search.num_startup_trials, spec.num_samples)
+    # With a prior the model may propose from the first on; one point is known, from which sizes are estimated.
+    num_random = min(1 if spec.prior else spec.search.num_startup_trials, spec.num_samples)
     known = [draw_point(spec.space, index, spec.seed) for index in range(num_random)]
     return [*known, *[None] * (spec.num_samples - num_random)]
 

@@ -24,11 +24,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from analysis.records import TrialRecord
+from analysis.records import PriorRecord, TrialRecord
 from policies.errors import CannotRunError
 from tune_jobs.search.asking import Check, Method, Question
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.parts import Parts
+from tune_jobs.search.prior import with_prior
 from tune_jobs.search.two_objectives import weighed
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_point
@@ -77,7 +78,13 @@ def check_installed(method: str) -> None:
         )
 
 
-def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check) -> dict[str, Any]:
+def propose_point(
+    spec: SweepSpec,
+    records: Sequence[TrialRecord],
+    drawn_index: int,
+    check: Check,
+    prior: Sequence[PriorRecord] = (),
+) -> dict[str, Any]:
     """Choose the next point of a sweep by its search method.
 
     Where the sweep asks for score and cost, the methods are told of both (`two_objectives`).
@@ -90,6 +97,7 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: 
         records: The records of all its trials.
         drawn_index: The index of the point to choose, among those that nobody chose.
         check: Raises SpecError for a point whose values contradict each other; then another is proposed.
+        prior: What the search began with. Its points count as ended.
 
     Raises:
         SpecError: None of many proposals is valid.
@@ -99,7 +107,7 @@ def propose_point(spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: 
     if spec.objective.cost is not None:
         known = weighed(known, drawn_index, spec.seed)
     return next_point(
-        spec.search.type, spec.space, known, drawn_index, seed=spec.seed,
+        spec.search.type, spec.space, with_prior(known, prior), drawn_index, seed=spec.seed,
         num_startup_trials=spec.search.num_startup_trials, check=check,
     )  # fmt: skip
 

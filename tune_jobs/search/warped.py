@@ -47,18 +47,27 @@ def warped(known: Sequence[KnownPoint]) -> Warped:
     Args:
         known: Points that have ended.
     """
-    keys = [_key(point) for point in known]
-    order = {key: place for place, key in enumerate(sorted(set(keys)))}
-    places = np.array([order[key] for key in keys], dtype=np.int64)
-    counts = np.bincount(places, minlength=len(order))
-    # The mean rank of those that are equal, from 0.5 to n - 0.5.
-    shares = ((np.cumsum(counts) - counts / 2) / max(1, len(keys)))[places]
-    table = np.array(keys, dtype=np.float64).reshape(-1, 2)
+    shares = shares_of(known)
+    table = np.array([_key(point) for point in known], dtype=np.float64).reshape(-1, 2)
     scores = _with_distances(_normal_quantiles(shares), table, shares)
     scores = scores - scores.mean()
     if (deviation := float(scores.std())) > 0:
         scores = scores / deviation
     return _with_seeds(known, scores)
+
+
+def shares_of(known: Sequence[KnownPoint]) -> Floats:
+    """Return the share of points that each is better than, where half of those that are equal to it count.
+
+    Args:
+        known: As for `warped`.
+    """
+    keys = [_key(point) for point in known]
+    order = {key: place for place, key in enumerate(sorted(set(keys)))}
+    places = np.array([order[key] for key in keys], dtype=np.int64)
+    counts = np.bincount(places, minlength=len(order))
+    shares: Floats = ((np.cumsum(counts) - counts / 2) / max(1, len(keys)))[places]
+    return shares
 
 
 def _key(point: KnownPoint) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name
 from tune_jobs.spec.yaml import parse_yaml
 from tune_jobs.store.contract import Storage
 from tune_jobs.sweeps.drive import write_new
+from tune_jobs.sweeps.prior import read_priors
 
 
 class DoesNotFitError(CannotRunError):
@@ -196,7 +197,7 @@ class Submitter:
                 "Choose one that the service's operator allows (serve --env).",
             )
         try:
-            plan = make_plan(spec, self._machine(spec))
+            plan = make_plan(spec, self._machine(spec), prior=read_priors(spec, self._config.storage, by_name=True))
         except CannotRunError as error:
             raise DoesNotFitError(error.message, error.hint) from error
         limits = self._config.limits

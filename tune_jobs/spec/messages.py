@@ -56,6 +56,7 @@ _FORMS = {
     "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random, auto, gp, forest or tpe, or a mapping of its fields",
     "points": "give a list of points, each a mapping of the searched hyperparameters to values",
+    "prior": "give the name or the place of a sweep, or a list of them",
     "confirm": "give none, true, or a mapping of its fields (top, seeds, max_share)",
     "objective": "give final, area, best or steps_to_threshold, a list of one of them and env_steps, or a mapping of "
     "its fields (type, threshold, cost)",

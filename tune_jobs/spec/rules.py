@@ -42,6 +42,11 @@ def search_problems(spec: SweepFields) -> Found:
     found: Found = []
     if spec.search.has_model:
         found += _model_problems(spec)
+    elif spec.prior:
+        text = f"is for a model, and search.type is {spec.search.type}: set search: auto, or leave prior out"
+        found.append(("prior", text))
+    if twice := [sweep for index, sweep in enumerate(spec.prior) if sweep in spec.prior[:index]]:
+        found.append(("prior", f"names {twice[0]!r} twice: name it once"))
     if spec.scheduler.type in ("pbt", "hyperband") and spec.resources.max_concurrent is not None:
         text = (
             f"{spec.resources.max_concurrent} cannot be used with scheduler.type {spec.scheduler.type}, which pauses "
@@ -166,7 +171,7 @@ def _model_problems(spec: SweepFields) -> Found:
             "hyperband": f"hyperband waits for whole groups of trials, {method} starts one after another: use asha",
         }
         found.append(("search.type", f"{method} cannot be used with scheduler.type {why[spec.scheduler.type]}"))
-    if spec.space and spec.num_samples <= spec.search.num_startup_trials:
+    if spec.space and not spec.prior and spec.num_samples <= spec.search.num_startup_trials:
         text = (
             f"{spec.num_samples} is not more than search.num_startup_trials, {spec.search.num_startup_trials}: all "
             f"points would be random. With {method}, num_samples is the number of points, and grids are lists to "

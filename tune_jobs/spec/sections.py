@@ -227,6 +227,11 @@ def _from_text(key: str) -> BeforeValidator:
     return BeforeValidator(expand)
 
 
+def _one_or_several(value: Any) -> Any:
+    """Let a list of one text be written as the text."""
+    return (value,) if isinstance(value, str) else value
+
+
 def _two_objectives(value: Any) -> Any:
     """Let `objective` be written as a score, or as a score and its cost: `[return, env_steps]`."""
     if isinstance(value, str):
@@ -305,6 +310,11 @@ class SweepFields(Section):
     search: Annotated[SearchSpec, _from_text("type")] = Field(
         default_factory=SearchSpec, description="Search method: random, auto, gp, forest or tpe, or a mapping."
     )
+    prior: Annotated[tuple[str, ...], BeforeValidator(_one_or_several)] = Field(
+        (),
+        description="Earlier sweeps, by name or place, whose points the model begins with: of the same algorithm and "
+        "space, and of any environment. They are copied when the sweep is created.",
+    )
     scheduler: Annotated[SchedulerSpec, _from_text("type")] = Field(
         default_factory=SchedulerSpec, description="Early stopping: its type, or a mapping."
     )
@@ -332,6 +342,11 @@ class SweepFields(Section):
     def _only_what_is_said(self, about: AboutSpec) -> dict[str, str] | None:
         # In sweep.json null if nothing is: versions that don't know the field skip one that is null.
         return about.model_dump(exclude_defaults=True) or None
+
+    @field_serializer("prior")
+    def _only_given_sweeps(self, prior: tuple[str, ...]) -> list[str] | None:
+        # As for `about`.
+        return list(prior) or None
 
     @field_serializer("points")
     def _only_given_points(self, points: tuple[dict[str, Any], ...]) -> list[dict[str, Any]] | None:

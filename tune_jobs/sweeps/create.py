@@ -16,6 +16,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.drive import machine_here, write_new
+from tune_jobs.sweeps.prior import read_priors
 from tune_jobs.sweeps.storage import choose_store, create_store, folder_at, shown_place
 
 
@@ -58,7 +59,8 @@ def write_created(spec: SweepSpec, name: str | None, stem: str, storage: str, ad
     if address is not None:
         check_form(address)
     choose_store(name, stem, storage)
-    plan = make_plan(spec, machine_here() if address is None else _smallest_machine(spec, address))
+    machine = machine_here() if address is None else _smallest_machine(spec, address)
+    plan = make_plan(spec, machine, prior=read_priors(spec, storage))
     store = create_store(name, stem, storage)
     try:
         with store.lock():

@@ -57,6 +57,7 @@ def write_new(
             address=address,
             allowed_modules=modules_of(spec),
             chosen_points=given_points(spec),
+            prior=plan.prior,
         )
     )
 

@@ -11,6 +11,7 @@ from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.drive import connected
+from tune_jobs.sweeps.prior import read_priors
 from tune_jobs.sweeps.storage import choose_store, stem_of, storage_place
 
 
@@ -32,11 +33,11 @@ def planned(
         spec = spec.model_copy(update={"name": name})
     store = choose_store(spec.name, stem_of(source), storage_place(storage))
     if address is None:
-        plan = make_plan(spec, local_machine())
+        plan = make_plan(spec, local_machine(), prior=read_priors(spec, storage))
         with store.rehearsal():
             return spec, plan
     with connected(address, None) as connection:
-        plan = make_plan(spec, connection.machine)
+        plan = make_plan(spec, connection.machine, prior=read_priors(spec, storage))
         with store.rehearsal() as rehearsed:
             plan = plan.with_notes(_check_nodes(rehearsed.place, modules_of(spec), spec.resources.num_gpus))
         return spec, plan

@@ -27,6 +27,7 @@ from tune_jobs.sweeps.drive import connected, machine_here, settled, write_new
 from tune_jobs.sweeps.exports import dataframe, export, figure, study
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.policies import best, evaluate, restore, video
+from tune_jobs.sweeps.prior import read_priors
 from tune_jobs.sweeps.reproduce import reproduce
 from tune_jobs.sweeps.results import importance, report, trials
 from tune_jobs.sweeps.stages import run_sweep
@@ -180,11 +181,12 @@ def _launch_here(
     choose_store(*names)
     # Planned here and not only on the cluster, so that a bad env or point is found before Ray starts.
     machine = machine_here() if address is None else None
-    plan = make_plan(spec, machine) if machine is not None else None
+    prior = read_priors(spec, storage)
+    plan = make_plan(spec, machine, prior=prior) if machine is not None else None
     with contextlib.ExitStack() as stack:
         if plan is None:
             connection = stack.enter_context(connected(address, None))
-            plan = make_plan(spec, connection.machine)
+            plan = make_plan(spec, connection.machine, prior=prior)
         store = create_store(*names)
         try:
             stack.enter_context(store.lock())

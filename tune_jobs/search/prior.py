@@ -1,0 +1,119 @@
+"""What a search begins with: the points of earlier sweeps, made comparable by their ranks within their own.
+
+Returns of other environments, budgets and stop rules are of other scales. So a point of an earlier sweep is kept as the
+share of that sweep's points that it is better than, and counts like the new sweep's own point of the same rank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
+from analysis.wording import counted
+from policies.errors import SpecError, shortened
+from tune_jobs.search.chosen_point import outside
+from tune_jobs.search.history import KnownPoint, known_points
+from tune_jobs.search.warped import shares_of
+from tune_jobs.spec.conditions import Conditions
+from tune_jobs.spec.sweep_spec import SweepSpec
+
+_ENOUGH = 10
+"""How many own scores tell what their scale is."""
+
+
+def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequence[TrialRecord]) -> PriorRecord:
+    """Return what an earlier sweep tells the model of a new one.
+
+    Args:
+        spec: The new sweep.
+        name: The name of the earlier one.
+        earlier: Its spec.
+        trials: Its trials; those that have not ended tell nothing.
+
+    Raises:
+        SpecError: It is of another algorithm or another space, its trials changed their values, or none of its points
+            could be one of the new sweep.
+    """
+    _check_the_same(spec, name, earlier)
+    ended = [point for point in known_points(earlier, trials) if not point.is_running]
+    kept = []
+    for known, share in zip(ended, shares_of(ended), strict=True):
+        point = _seen_by(spec, earlier, known)
+        if point is not None:
+            kept.append(PriorPointRecord(point=point, share=None if known.score is None else float(share)))
+    if not kept:
+        why = f"none of its {counted(len(ended), 'ended point')} lies in this space" if ended else "no point has ended"
+        raise SpecError(f"prior: sweep {name} tells nothing, as {why}.", "Widen the space, or leave it out.")
+    return PriorRecord(sweep=name, env_id=earlier.env.id, points=tuple(kept))
+
+
+def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
+    different = []
+    if earlier.algorithm != spec.algorithm:
+        different.append(f"its algorithm is {earlier.algorithm}, and not {spec.algorithm}")
+    different += [
+        f"{name} is searched here, and neither searched nor fixed there"
+        for name in spec.space
+        if name not in earlier.space and name not in earlier.hyperparams
+    ]
+    different += [f"{name} is searched there, and not here" for name in earlier.space if name not in spec.space]
+    if earlier.scheduler.type == "pbt":
+        different.append("it is a population, whose trials change their values while they train")
+    if different:
+        raise SpecError(
+            f"prior: sweep {sweep} is none that this search could begin with: {'; '.join(different)}.",
+            "Leave it out, or search what it searched.",
+        )
+
+
+def _seen_by(spec: SweepSpec, earlier: SweepSpec, known: KnownPoint) -> dict[str, Any] | None:
+    """Return a point with the names of the new sweep; None: it could not have that point."""
+    values = {name: earlier.hyperparams[name] for name in spec.space if name in earlier.hyperparams} | dict(known.point)
+    acting = Conditions(spec.space).acting(values)
+    if not acting <= values.keys():
+        return None
+    point = {name: values[name] for name in spec.space if name in acting}
+    return None if outside(spec.space, point) else point
+
+
+def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> list[KnownPoint]:
+    """Return points as a model is told them, those of earlier sweeps first, on one scale.
+
+    While few of the sweep's own points are known, which tell nothing of their scale, they too count by their ranks
+    among themselves. Later an earlier sweep's point has the score of the own point of the same rank.
+
+    Args:
+        known: The sweep's own points.
+        prior: What its search began with.
+    """
+    if not prior:
+        return list(known)
+    earlier = [item for each in prior for item in each.points]
+    ended = [point for point in known if not point.is_running]
+    scores = [point.score for point in ended if point.score is not None and point.level is None]
+    if len(scores) >= _ENOUGH:
+        values = [None if item.share is None else float(np.quantile(scores, item.share)) for item in earlier]
+        own = list(known)
+    else:
+        values = [item.share for item in earlier]
+        shares = iter(map(float, shares_of(ended)))
+        own = [
+            point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known
+        ]
+    return [*(KnownPoint(item.point, (value,)) for item, value in zip(earlier, values, strict=True)), *own]
+
+
+def _share_of(point: KnownPoint, share: float) -> float | None:
+    return None if point.score is None else share
+
+
+def prior_notes(spec: SweepSpec, prior: Sequence[PriorRecord]) -> tuple[str, ...]:
+    """Return the plan's notes on what a search begins with."""
+    notes = []
+    for each in prior:
+        other = "" if each.env_id == spec.env.id else f", of {shortened(each.env_id)}, by their ranks there"
+        notes.append(f"The model begins with {counted(len(each.points), 'point')} of sweep {each.sweep}{other}.")
+    return tuple(notes)
