@@ -32,11 +32,15 @@ def sweep_fields() -> str:
     fields = {name: field if field.get("default", "") is None else _without_null(field)
               for name, field in schema["properties"].items()}  # fmt: skip
     sections = {name: section for name, field in fields.items() if (section := _section(field)) is not None}
-    links = {section: f"mapping, [below](#{name})" for name, section in sections.items()}
+    # A section may have one itself, whose heading is its path.
+    for name, section in list(sections.items()):
+        inner = definitions[section].get("properties", {})
+        sections |= {f"{name}.{key}": deeper for key, field in inner.items() if (deeper := _section(field)) is not None}
+    links = {section: f"mapping, [below](#{name.replace('.', '')})" for name, section in sections.items()}
     parts = [_fields({**schema, "properties": fields}, links)]
     for name, section in sections.items():
         inner = definitions[section]
-        parts.append(f"## {name}\n\n{inner['description']}\n\n{_fields(inner)}")
+        parts.append(f"## {name}\n\n{inner['description']}\n\n{_fields(inner, links)}")
     return "\n\n".join(parts)
 
 

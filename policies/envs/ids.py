@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, parse_env_id
 
+from policies.envs.atari import INSTALL, is_atari_id
 from policies.envs.modules import import_module_allowed
 from policies.envs.plugins import load_env_plugins
 from policies.errors import EnvError, SpecError
@@ -58,10 +59,10 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
     if found is None:
         reasons = "".join(f" {problem}" for problem in problems)
         guess = _nearest_ids(env_id, gym.registry)
-        raise EnvError(
-            f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}",
-            "Correct the id, or install the package that registers it.",
-        )
+        hint = "Correct the id, or install the package that registers it."
+        if is_atari_id(env_id) and not any(map(is_atari_id, gym.registry)):
+            guess, hint = " It is a game of the Arcade Learning Environment, which is not installed.", INSTALL
+        raise EnvError(f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}", hint)
     return found, gym.registry[found]
 
 

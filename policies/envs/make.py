@@ -20,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from policies.envs import calls
+from policies.envs import atari, calls
 from policies.envs.calls import Call
 from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
@@ -37,6 +37,7 @@ from policies.envs.own_actions import (
     sizes_of,
     takes_own_actions,
 )
+from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.wrappers import FailurePenalty, ObservationWrappers
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ALLOWED_MODULES",
+    "ATARI_TRAINING",
     "FAILURE_PENALTY",
     "EnvInfo",
     "check_env",
@@ -57,7 +59,7 @@ __all__ = [
 ]
 
 # These stand in an env runner's `env_config` beside the env's arguments, never among them.
-FAILURE_PENALTY, ALLOWED_MODULES = "failure_penalty", "allowed_modules"
+FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES = "failure_penalty", "atari_training", "allowed_modules"
 # Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and the keys of env runners
 # from above.
 _RESERVED_ARGS = frozenset(
@@ -70,6 +72,7 @@ _RESERVED_ARGS = frozenset(
         "vector_kwargs",
         "wrappers",
         FAILURE_PENALTY,
+        ATARI_TRAINING,
         ALLOWED_MODULES,
     }
 )
@@ -130,8 +133,8 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
             max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
-            has_vector_entry_point=not (wrappers.pixels or is_flattened(env) or takes_own_actions(env) or mask)
-            and _takes_vector_entry_point(spec, kwargs),
+            has_vector_entry_point=not (wrappers.observes_images or is_flattened(env) or takes_own_actions(env) or mask)
+            and takes_vector_entry_point(spec, kwargs),
             failure=failure_rule(env_id, spec, env.metadata, kwargs),
             mask=None if mask is None else mask.place,
         )
@@ -173,14 +176,19 @@ def make_env(
     try:
         with calls.inside(Call.CONSTRUCTOR):
             # The passive checker only prints warnings, at each env made, and slows every step.
-            env = gym.make(spec, disable_env_checker=True, **kwargs)
-        return calls.watch_env(wrappers.wrap(env))
+            env = gym.make(spec, disable_env_checker=True, **_game_args(env_id, spec, kwargs, wrappers))
+        return calls.watch_env(wrappers.wrap(env, {**spec.kwargs, **kwargs}))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
 
 
 def make_vector_env(
-    env_id: str, env_args: Mapping[str, Any] | None, num_envs: int, *, failure_penalty: float | None = None
+    env_id: str,
+    env_args: Mapping[str, Any] | None,
+    num_envs: int,
+    *,
+    failure_penalty: float | None = None,
+    atari_training: Mapping[str, bool] | None = None,
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Make a vector environment: the env's own vectorised version if it has one, else a loop over envs.
 
@@ -193,6 +201,8 @@ def make_vector_env(
         num_envs: Number of sub-environments.
         failure_penalty: Reward of steps that end by failure, for training alone: the outermost wrapper is then a
             `FailurePenalty`. None: the env's own reward.
+        atari_training: The arguments of an `AtariTraining`, for training alone: it is then the outermost wrapper. The
+            env's arguments must have `atari`. None: the games as they are.
 
     Raises:
         EnvError: In the same cases as `make_env`; or there is a penalty, and the env has no failure.
@@ -202,17 +212,24 @@ def make_vector_env(
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
-            env = None if wrappers.pixels or wrappers.action_mask else _own_vector_env(spec, num_envs, kwargs)
+            own = not (wrappers.observes_images or wrappers.action_mask)
+            env = own_vector_env(spec, num_envs, kwargs) if own else None
             if env is None:
                 if wrappers.pixels:
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
+                given = {**spec.kwargs, **kwargs}
                 env = gym.make_vec(
                     spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
-                    wrappers=(wrappers.wrap_pixels, wrappers.wrap_mask, flattened, PlainSteps), **kwargs,
+                    wrappers=(
+                        lambda game: wrappers.wrap_images(game, given), wrappers.wrap_mask, flattened, PlainSteps,
+                    ),
+                    **_game_args(env_id, spec, kwargs, wrappers),
                 )  # fmt: skip
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
+    if atari_training is not None:
+        return atari.AtariTraining(env, **atari_training)
     if failure_penalty is None:
         return env
     inner: Any = env.unwrapped
@@ -229,6 +246,11 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
         wrappers = ObservationWrappers.take_from(kwargs)
         _check_args(env_id, spec, kwargs)
     return env_id, spec, kwargs, wrappers
+
+
+def _game_args(env_id: str, spec: EnvSpec, kwargs: dict[str, Any], wrappers: ObservationWrappers) -> dict[str, Any]:
+    """Return the constructor's arguments, as the wrappers need them."""
+    return kwargs if wrappers.atari is None else wrappers.atari.game_args(env_id, _creator(env_id, spec), kwargs)
 
 
 def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
@@ -294,38 +316,6 @@ def _check_limit(env_id: str, limit: Any) -> None:
             f"The env argument 'max_episode_steps' of {env_id} is {limit!r}; it must be a whole number >= 1.",
             "Correct it, or leave it out to keep the env's own limit.",
         )
-
-
-def _own_vector_env(
-    spec: EnvSpec, num_envs: int, env_args: dict[str, Any]
-) -> gym.vector.VectorEnv[Any, Any, Any] | None:
-    """Make the env's own vectorised version; None: it has none, or one whose spaces are not as policies need them."""
-    if not _takes_vector_entry_point(spec, env_args):
-        return None
-    env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **env_args)
-    if not needs_flattening(env.single_observation_space) and is_taken(env.single_action_space):
-        return env
-    close_env(env)
-    return None
-
-
-def _takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
-    """Whether the env has a vectorised version that takes these arguments and the time limit, and resets as ours."""
-    # A vector entry point would leave out wrappers of the registry entry, and a time limit it does not take.
-    if spec.vector_entry_point is None or spec.additional_wrappers:
-        return False
-    kwargs = {**spec.kwargs, **env_args}
-    if spec.max_episode_steps is not None:
-        kwargs.setdefault("max_episode_steps", spec.max_episode_steps)
-    try:
-        entry_point = spec.vector_entry_point
-        creator = entry_point if callable(entry_point) else load_env_creator(entry_point)
-        inspect.signature(creator).bind(num_envs=1, **kwargs)
-        # A loop over envs resets in the next step, as is expected here; the mode may also be given as a string.
-        mode = (getattr(creator, "metadata", None) or {}).get("autoreset_mode", gym.vector.AutoresetMode.NEXT_STEP)
-        return bool(gym.vector.AutoresetMode(mode) is gym.vector.AutoresetMode.NEXT_STEP)
-    except (ImportError, AttributeError, TypeError, ValueError):
-        return False
 
 
 def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:

@@ -9,6 +9,8 @@ its trials alike. An installed package is trusted to run its code; what a sweep 
 from __future__ import annotations
 
 import functools
+import importlib
+import importlib.util
 from importlib import metadata
 
 from gymnasium.envs import registration
@@ -17,6 +19,8 @@ from policies.errors import said_by
 
 GROUP = "gymnasium.envs"
 _NO_NAMESPACE = "__root__"
+_REGISTER_WHEN_IMPORTED = {"ale_py": "ale-py"}
+"""Packages without such an entry point that register their environments when they are imported, with their names."""
 
 
 @functools.cache
@@ -34,9 +38,17 @@ def load_env_plugins() -> tuple[str, ...]:
             entry_point.load()()
         except Exception as error:  # noqa: BLE001 (then only its own environments are missing)
             package = entry_point.dist.name if entry_point.dist is not None else entry_point.value
-            problems.append(
-                f"The package {package} could not register its own: {type(error).__name__}: {said_by(error)}."
-            )
+            problems.append(_could_not(package, error))
         finally:
             registration.current_namespace = before
+    for module, package in _REGISTER_WHEN_IMPORTED.items():
+        try:
+            if importlib.util.find_spec(module) is not None:
+                importlib.import_module(module)
+        except Exception as error:  # noqa: BLE001 (as above)
+            problems.append(_could_not(package, error))
     return tuple(problems)
+
+
+def _could_not(package: str, error: Exception) -> str:
+    return f"The package {package} could not register its own: {type(error).__name__}: {said_by(error)}."

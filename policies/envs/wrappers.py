@@ -1,8 +1,9 @@
 """Wrappers that change observations, and one that changes the rewards of training.
 
 Frames and pixels belong to the environment: the observations are the same in training, evaluation and videos.
-So they travel in the env arguments, under the reserved keys `frame_stack` and `pixels`, and so does the name of the
-mask of actions, `action_mask`. The failure penalty belongs to training alone, and is never among the env arguments.
+So they travel in the env arguments, under the reserved keys `frame_stack` and `pixels`, and so do `atari`
+(`policies.envs.atari`) and the name of the mask of actions, `action_mask`. The failure penalty belongs to training
+alone, and is never among the env arguments.
 
 Words: a *frame* is one observation; an *image* is of shape (rows, columns, channels).
 """
@@ -19,10 +20,12 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from policies.envs.atari import ATARI, AtariFrames
 from policies.envs.failures import FailureRule
 from policies.envs.flat import flattened
 from policies.envs.masks import ACTION_MASK, MaskedBox, Setting, check_setting, masked, num_masked
 from policies.envs.own_actions import with_own_actions
+from policies.envs.training_view import TrainingView
 from policies.errors import EnvError
 
 FRAME_STACK, PIXELS = "frame_stack", "pixels"
@@ -35,11 +38,17 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True)
 class ObservationWrappers:
-    """The wrappers that an environment gets around its time limit: pixels, its mask of actions, frames."""
+    """The wrappers that an environment gets around its time limit: pixels or Atari's, its mask of actions, frames."""
 
     frame_stack: int = 1
     pixels: bool = False
     action_mask: Setting = None
+    atari: AtariFrames | None = None
+
+    @property
+    def observes_images(self) -> bool:
+        """Whether an environment observes images by one of these wrappers."""
+        return self.pixels or self.atari is not None
 
     @classmethod
     def take_from(cls, env_args: dict[str, Any]) -> ObservationWrappers:
@@ -54,22 +63,28 @@ class ObservationWrappers:
             raise EnvError(f"{FRAME_STACK} is {frames!r}; it must be a whole number >= 1.", "1 stacks nothing.")
         if not isinstance(pixels, bool):
             raise EnvError(f"{PIXELS} is {pixels!r}; it must be true or false.", "Set it to true, or leave it out.")
-        if pixels and mask:
+        atari = AtariFrames.take_from(env_args)
+        if mask and (pixels or atari is not None):
+            which = f"{PIXELS} true" if pixels else f"{ATARI} is set"
             raise EnvError(
-                f"{ACTION_MASK} is {mask!r} and {PIXELS} true: masks go with vectors, not with images.",
-                f"Leave {PIXELS} out, or set {ACTION_MASK}: false.",
+                f"{ACTION_MASK} is {mask!r} and {which}: masks go with vectors, not with images.",
+                f"Leave {PIXELS if pixels else ATARI} out, or set {ACTION_MASK}: false.",
             )
-        return cls(frames, pixels, mask)
+        return cls(frames, pixels, mask, atari)
 
-    def wrap(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    def wrap(self, env: gym.Env[Any, Any], env_args: Mapping[str, Any]) -> gym.Env[Any, Any]:
         """Return an environment with these wrappers; for pixels, it must have been made with a render mode.
 
         It takes actions as policies give them, and what it observes is made vectors, or images.
 
+        Args:
+            env: The environment.
+            env_args: The arguments of its constructor, with those of its registry entry.
+
         Raises:
             EnvError: It has not the mask that is named.
         """
-        env = flattened(self.wrap_mask(self.wrap_pixels(env)))
+        env = flattened(self.wrap_mask(self.wrap_images(env, env_args)))
         return StackFrames(env, self.frame_stack) if self.frame_stack > 1 else env
 
     def wrap_mask(self, env: gym.Env[Any, Any]) -> Any:
@@ -78,10 +93,12 @@ class ObservationWrappers:
         Raises:
             EnvError: It has not the mask that is named.
         """
-        return masked(with_own_actions(env), False if self.pixels else self.action_mask)
+        return masked(with_own_actions(env), False if self.observes_images else self.action_mask)
 
-    def wrap_pixels(self, env: gym.Env[Any, Any]) -> Any:
-        """Return an environment that observes pixels, if they are wanted, else the environment itself."""
+    def wrap_images(self, env: gym.Env[Any, Any], env_args: Mapping[str, Any]) -> Any:
+        """Return an environment that observes images, if they are wanted, else the environment itself."""
+        if self.atari is not None:
+            return self.atari.wrap(env, env_args)
         return ObservePixels(env) if self.pixels else env
 
     def wrap_vector(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> gym.vector.VectorEnv[Any, Any, Any]:
@@ -90,7 +107,12 @@ class ObservationWrappers:
 
 
 def with_wrappers(
-    env_args: Mapping[str, Any], *, frame_stack: int, pixels: bool, action_mask: Setting = None
+    env_args: Mapping[str, Any],
+    *,
+    frame_stack: int,
+    pixels: bool,
+    action_mask: Setting = None,
+    atari: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """Return env arguments with the reserved keys of those wrappers that change something."""
     wrapped = dict(env_args)
@@ -100,6 +122,8 @@ def with_wrappers(
         wrapped[PIXELS] = True
     if action_mask is not None:
         wrapped[ACTION_MASK] = action_mask
+    if atari is not None:
+        wrapped[ATARI] = dict(atari)
     return wrapped
 
 
@@ -253,22 +277,17 @@ def _push(stack: NDArray[Any], frames: NDArray[Any], num_masked: int) -> NDArray
     return np.concatenate([mask, stack[..., num_masked + new.shape[-1] :], new], axis=-1)
 
 
-class FailurePenalty(gym.vector.VectorWrapper):
-    """Replaces the reward of a step that ends an episode by failure; for training alone.
-
-    `unpenalized_rewards` are the environment's own rewards of the last step, shape (num_envs,). Reported returns are
-    their sums.
-    """
+class FailurePenalty(TrainingView):
+    """Replaces the reward of a step that ends an episode by failure; for training alone."""
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], rule: FailureRule, penalty: float) -> None:
         super().__init__(env)
         self.rule, self.penalty = rule, float(penalty)
-        self.unpenalized_rewards: NDArray[Any] = np.zeros(env.num_envs)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all sub-environments."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
-        self.unpenalized_rewards = rewards
+        self.own_rewards = rewards
         # A vectorised version may give whole numbers, in which the penalty would lose its decimals.
         dtype = np.result_type(rewards.dtype, np.float32)
         penalized = np.where(self.rule.failed(rewards, terminated), self.penalty, rewards).astype(dtype)

@@ -13,7 +13,7 @@ from typing import Any
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.algorithms.ppo import PPOConfig
 
-from policies.envs.make import ALLOWED_MODULES, FAILURE_PENALTY
+from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY
 from policies.envs.modules import allowed_modules
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.networks.rl_modules import module_spec
@@ -32,6 +32,7 @@ def build_algorithm_config(
     num_env_runners: int = 0,
     num_gpus: float = 0.0,
     failure_penalty: float | None = None,
+    atari_training: dict[str, bool] | None = None,
     rl_module: str | None = None,
 ) -> AlgorithmConfig:
     """The RLlib config of one trial; `.build_algo()` makes the Algorithm.
@@ -45,12 +46,15 @@ def build_algorithm_config(
         num_gpus: GPUs of the learner; 0: it runs on the CPU.
         failure_penalty: Reward of steps that end by failure, which the learner gets but returns leave out; None: the
             env's own reward.
+        atari_training: The arguments of `AtariTraining`, which the learner alone sees; None: the games as they are.
         rl_module: `module:Class` of an RLModule of the user's own, in an allowed module; None: ours.
     """
     config = _ppo(hyperparams) if isinstance(hyperparams, PPOHyperparams) else _dqn(hyperparams)
     env_config = dict(env_args or {})
     if failure_penalty is not None:
         env_config[FAILURE_PENALTY] = failure_penalty
+    if atari_training is not None:
+        env_config[ATARI_TRAINING] = atari_training
     if modules := allowed_modules():
         # Env runners in processes of their own do not have the allowed modules yet.
         env_config[ALLOWED_MODULES] = modules

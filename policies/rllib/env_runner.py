@@ -10,7 +10,6 @@ Array shapes: T vector steps, N sub-environments.
 
 from __future__ import annotations
 
-import uuid
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,16 +27,16 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from policies.envs.action_bounds import ToBounds
 from policies.envs.checked import CheckedEnvs
-from policies.envs.make import ALLOWED_MODULES, FAILURE_PENALTY, make_vector_env
+from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY, make_vector_env
 from policies.envs.modules import allow_modules
 from policies.envs.spaces import observation_dtype
-from policies.envs.wrappers import FailurePenalty
+from policies.envs.training_view import TrainingView
 from policies.parents import end_with_parent
 from policies.replay import NStep, Transitions
 from policies.rllib.ruined import check_outputs
+from policies.rllib.streams import OWN_ENDS, OWN_REWARDS, Stream, own_ends_of, own_rewards_of
 
 _WEIGHTS_SEQ_NO = "weights_seq_no"
-_UNPENALIZED = "unpenalized_rewards"
 _REWARDS_SPACE = gym.spaces.Box(float("-inf"), float("inf"), (), np.float32)
 
 
@@ -53,32 +52,12 @@ class Sample:
     """The number of episodes that ended."""
 
 
-def _returned(fragment: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return the env's own rewards, whose sums are the returns, without the learner's failure penalty."""
-    return fragment.get(_UNPENALIZED, fragment["rewards"])
-
-
 def _checked(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Return a vector environment whose values are checked; a failure penalty stays the outermost wrapper."""
-    if not isinstance(env, FailurePenalty):
+    """Return a vector environment whose values are checked; what training alone sees stays the outermost wrapper."""
+    if not isinstance(env, TrainingView):
         return CheckedEnvs(env, env_id)
     env.env = CheckedEnvs(env.env, env_id)
     return env
-
-
-class _Stream:
-    """The running episode of one sub-environment, which continues from one fragment to the next."""
-
-    def __init__(self) -> None:
-        self.start()
-
-    def start(self) -> None:
-        """Begin a new episode."""
-        self.episode_id = uuid.uuid4().hex
-        self.num_steps = 0
-        self.episode_return = 0.0
-        # The last rows of the previous chunk, for RLlib's lookback buffers: column -> (lookback, ...).
-        self.tail: dict[str, NDArray[Any]] = {}
 
 
 def _is_actor() -> bool:
@@ -96,7 +75,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     def __init__(self, **kwargs: Any) -> None:
         self.env: Any = None
         self.finished_episodes: list[tuple[float, int]] = []
-        self._streams: list[_Stream] = []
+        self._streams: list[Stream] = []
         self._obs: NDArray[Any] | None = None
         self._seed_override: int | None = None
         self._just_ended: NDArray[np.bool_] | None = None
@@ -130,9 +109,11 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             env_args = dict(self.config.env_config.items())
         # The settings that build_algorithm_config adds beside the env's arguments.
         allow_modules(env_args.pop(ALLOWED_MODULES, ()))
-        penalty = env_args.pop(FAILURE_PENALTY, None)
+        penalty, atari_training = env_args.pop(FAILURE_PENALTY, None), env_args.pop(ATARI_TRAINING, None)
         num_envs = self.config.num_envs_per_env_runner
-        env = make_vector_env(self.config.env, env_args, num_envs, failure_penalty=penalty)
+        env = make_vector_env(
+            self.config.env, env_args, num_envs, failure_penalty=penalty, atari_training=atari_training
+        )
         self.env = DictInfoToList(_checked(env, self.config.env))
         self.num_envs = self.env.num_envs
         space = self.env.single_action_space
@@ -152,7 +133,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         observations, _ = self.env.env.reset(seed=seed)
         self._obs = self._as_seen(observations)
         self._just_ended = np.zeros(self.num_envs, dtype=np.bool_)
-        self._streams = [_Stream() for _ in range(self.num_envs)]
+        self._streams = [Stream() for _ in range(self.num_envs)]
         if self._n_step is not None:
             self._n_step.forget()
         # Drop the chunks of episodes that will never end now.
@@ -217,8 +198,8 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
     def _follow_episodes(self, fragment: dict[str, NDArray[Any]]) -> None:
         """Collect the returns of whole episodes, as `_cut` does for episode objects."""
         stepped = fragment["stepped"]
-        rewards = np.where(stepped, _returned(fragment), 0.0)
-        ended = np.logical_or(fragment["terminated"], fragment["truncated"])
+        rewards = np.where(stepped, own_rewards_of(fragment), 0.0)
+        ended = own_ends_of(fragment)
         for index, stream in enumerate(self._streams):
             start = 0
             for stop in [*(np.flatnonzero(ended[:, index]) + 1), len(rewards)]:
@@ -267,8 +248,11 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                     "truncated": truncated,
                     "stepped": ~self._just_ended,
                 }
-                if isinstance(env, FailurePenalty):
-                    row[_UNPENALIZED] = env.unpenalized_rewards
+                if isinstance(env, TrainingView):
+                    row[OWN_REWARDS] = env.own_rewards
+                    if env.lost_lives is not None:
+                        row[OWN_ENDS] = np.logical_or(terminated, truncated)
+                        row["terminated"] = np.logical_or(terminated, env.lost_lives)
                 # NEXT_STEP autoreset: the step after an episode's last one only resets; it is no env step.
                 num_steps += int(row["stepped"].sum())
                 self._just_ended = np.logical_or(terminated, truncated)
@@ -330,17 +314,21 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
 
     def _cut(self, fragment: dict[str, NDArray[Any]]) -> tuple[list[SingleAgentEpisode], list[SingleAgentEpisode]]:
         """Cut (T, N) columns into episode chunks: the ended ones in order of their end, then the running ones."""
-        done: list[tuple[int, int, SingleAgentEpisode, tuple[float, int]]] = []
+        done: list[tuple[int, int, SingleAgentEpisode, tuple[float, int] | None]] = []
         ongoing: list[SingleAgentEpisode] = []
         length = len(fragment["stepped"])
-        ended = np.logical_or(fragment["terminated"], fragment["truncated"])
+        ended, own_ends = np.logical_or(fragment["terminated"], fragment["truncated"]), own_ends_of(fragment)
         for index, stream in enumerate(self._streams):
             start = 0
             for end in np.flatnonzero(ended[:, index]):
                 start += not fragment["stepped"][start, index]
                 chunk = self._chunk(fragment, stream, index, start, int(end) + 1)
-                done.append((int(end), index, chunk, (stream.episode_return, stream.num_steps)))
-                stream.start()
+                is_whole = own_ends[end, index]
+                done.append((int(end), index, chunk, (stream.episode_return, stream.num_steps) if is_whole else None))
+                if is_whole:
+                    stream.start()
+                else:
+                    stream.start_next_life()
                 start = int(end) + 1
             if start < length:
                 start += not fragment["stepped"][start, index]
@@ -349,17 +337,17 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
                 ongoing.append(chunk)
                 self._keep_tail(stream, chunk)
         done.sort(key=lambda item: item[:2])
-        self.finished_episodes.extend(whole for *_, whole in done)
+        self.finished_episodes.extend(whole for *_, whole in done if whole is not None)
         return [chunk for _, _, chunk, _ in done], ongoing
 
     def _chunk(
-        self, fragment: dict[str, NDArray[Any]], stream: _Stream, index: int, start: int, stop: int
+        self, fragment: dict[str, NDArray[Any]], stream: Stream, index: int, start: int, stop: int
     ) -> SingleAgentEpisode:
         """Return the steps [start, stop) of one sub-environment as an episode chunk, with the last chunk's lookback."""
         columns = {
             key: values[start : stop + (key == "obs"), index]
             for key, values in fragment.items()
-            if key not in ("stepped", "terminated", "truncated", _UNPENALIZED)
+            if key not in ("stepped", "terminated", "truncated", OWN_REWARDS, OWN_ENDS)
         }
         num_steps = stop - start
         columns[_WEIGHTS_SEQ_NO] = np.full(num_steps, self._weights_seq_no, dtype=np.int64)
@@ -380,14 +368,15 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             extra_model_outputs={key: InfiniteLookbackBuffer(values, lookback) for key, values in columns.items()},
             terminated=bool(fragment["terminated"][stop - 1, index]),
             truncated=bool(fragment["truncated"][stop - 1, index]),
-            t_started=stream.num_steps,
+            t_started=stream.num_learner_steps,
             len_lookback_buffer=lookback,
         )
         stream.num_steps += num_steps
-        stream.episode_return += float(_returned(fragment)[start:stop, index].sum(dtype=np.float64))
+        stream.num_learner_steps += num_steps
+        stream.episode_return += float(own_rewards_of(fragment)[start:stop, index].sum(dtype=np.float64))
         return episode
 
-    def _keep_tail(self, stream: _Stream, chunk: SingleAgentEpisode) -> None:
+    def _keep_tail(self, stream: Stream, chunk: SingleAgentEpisode) -> None:
         horizon = int(self.config.episode_lookback_horizon)
         if horizon == 0:
             return

@@ -19,6 +19,8 @@ NOT_IMPORTED = {
     "psycopg": "SQLAlchemy loads it for PostgreSQL",
     "check-jsonschema": "it carries the schema of compose files",
     "kubernetes-validate": "it carries Kubernetes' schemas",
+    "ale-py": "policies/envs/plugins.py imports it by its name",
+    "opencv-python-headless": "Gymnasium's preprocessing of Atari games loads it",
     "build": "the tests build the wheel by `python -m build`",
     "optuna-dashboard": "a command, beside which the page is measured",
     "mkdocs-material": "the theme of the site",

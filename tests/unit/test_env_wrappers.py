@@ -239,7 +239,7 @@ def test_a_failure_gets_the_penalty_and_the_own_rewards_are_kept() -> None:
     seen = []
     for _ in range(4):
         _, rewards, _, _, _ = env.step(np.zeros(2, np.int64))
-        seen.append((rewards[0], env.unpenalized_rewards[0]))
+        seen.append((rewards[0], env.own_rewards[0]))
     # The third step only resets.
     assert seen == [(2.0, 2.0), (-7.0, 2.0), (0.0, 0.0), (2.0, 2.0)]
 
@@ -253,7 +253,7 @@ def test_a_truncated_cartpole_has_not_failed_and_keeps_its_vectorised_physics() 
         # Half of the carts are pushed one way for ever, half are balanced for twelve steps.
         _, rewards, terminated, truncated, _ = env.step(np.where(np.arange(8) < 4, 1, step % 2))
         assert np.array_equal(rewards == -100, terminated)
-        assert set(cast("Any", env).unpenalized_rewards) <= {0.0, 1.0}
+        assert set(cast("Any", env).own_rewards) <= {0.0, 1.0}
         fell += int(terminated.sum())
         ran_out += int((truncated & ~terminated).sum())
     assert fell

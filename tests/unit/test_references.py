@@ -41,7 +41,7 @@ ELSEWHERE = {
     # a user's own, and a user's mistakes
     "Net", "maze", "my_nets", "my_plots", "plot_all", "epochs",
     # parts of file names, colours and commands
-    "rrggbb", "p00", "bench", "dq", "language", "lunarlander", "docs", "design", "md",
+    "rrggbb", "p00", "bench", "dq", "language", "lunarlander", "docs", "design", "md", "pong", "Breakout",
 }  # fmt: skip
 BLOCK = re.compile(r"```.*?```", re.DOTALL)
 ENDINGS = {"py", "yaml", "json", "jsonl", "log", "txt", "csv", "safetensors", "html", "mp4", "gif", "damaged"}

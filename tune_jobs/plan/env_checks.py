@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from policies.acting.baselines import BASELINES
+from policies.envs.atari import ATARI
 from policies.envs.failures import check_failure_penalty
 from policies.envs.make import EnvInfo
 from policies.envs.masks import ACTION_MASK, seen_by_networks
@@ -21,6 +22,8 @@ from policies.portable.file import action_problem
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _EXAMPLE = "[[16, 8, 4], [32, 4, 2]]"
+# Those of Mnih et al. 2015.
+_EXAMPLE_FOR_ATARI = "[[32, 8, 4], [64, 4, 2], [64, 3, 1]]"
 
 
 def check_env_args(spec: SweepSpec) -> None:
@@ -29,7 +32,7 @@ def check_env_args(spec: SweepSpec) -> None:
     Raises:
         SpecError: There is one.
     """
-    for name in (FRAME_STACK, PIXELS, ACTION_MASK, "failure_penalty"):
+    for name in (FRAME_STACK, PIXELS, ATARI, ACTION_MASK, "failure_penalty"):
         if name in spec.env.args:
             raise SpecError(
                 f"env.args.{name} is {spec.env.args[name]!r}, but {name} is not an argument of an env's constructor.",
@@ -108,7 +111,8 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
                 raise SpecError(
                     f"{env.env_id} has images of shape {shape} as observations, but {place} is null: a network for "
                     "images begins with convolutions.",
-                    f"Set {place} to [channels, kernel, stride] of each layer, such as {_EXAMPLE}.",
+                    f"Set {place} to [channels, kernel, stride] of each layer, such as "
+                    f"{_EXAMPLE if spec.env.atari is None else _EXAMPLE_FOR_ATARI}.",
                 )
             continue
         if not env.observes_images:

@@ -1,4 +1,4 @@
-"""Estimate upper bounds of a trial's env steps, of what it writes to disk, and of its memory in a pack."""
+"""Estimate upper bounds of a trial's env steps, of what it writes to disk, and of its memory."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import itertools
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import sizes_of
+from policies.envs.spaces import observation_dtype
 from policies.hyperparams import DQNHyperparams, Hyperparams, PPOHyperparams, RandomHyperparams
 from policies.portable.convolution import output_shape
 
@@ -68,22 +71,25 @@ def max_disk_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
     return (kept + 1) * checkpoint + iterations * _ITERATION_BYTES
 
 
-def member_bytes(env: EnvInfo, values: Hyperparams) -> int:
-    """Estimate the memory of one trial in a pack, in bytes: weights, train batch and replay memory."""
-    observation = math.prod(env.observation_space.shape or ())
-    total = _num_weights(env, values) * _COPIES_OF_WEIGHTS
+def trial_bytes(env: EnvInfo, values: Hyperparams) -> int:
+    """Estimate the memory of one trial, in bytes: weights, train batch and replay memory, without its process's own."""
+    # Images stay bytes.
+    itemsize = np.dtype(observation_dtype(env.observation_space)).itemsize
+    observation = math.prod(env.observation_space.shape or ()) * itemsize
+    hidden = 0 if isinstance(values, RandomHyperparams) else 2 * sum(values.hidden_sizes) * _BYTES_PER_NUMBER
+    total = _num_weights(env, values) * _COPIES_OF_WEIGHTS * _BYTES_PER_NUMBER
     if isinstance(values, PPOHyperparams):
-        step = _COPIES_OF_BATCH * (observation + _NUMBERS_PER_STEP) + 2 * sum(values.hidden_sizes)
+        step = _COPIES_OF_BATCH * (observation + _NUMBERS_PER_STEP * _BYTES_PER_NUMBER) + hidden
         total += values.train_batch_size * step
     elif isinstance(values, DQNHyperparams):
         # The observations before and after, the action (8 bytes), reward and discount.
-        transition = 2 * observation + 4
-        total += values.train_batch_size * (_COPIES_OF_BATCH * transition + 2 * sum(values.hidden_sizes))
+        transition = 2 * observation + 4 * _BYTES_PER_NUMBER
+        total += values.train_batch_size * (_COPIES_OF_BATCH * transition + hidden)
         total += (0 if values.replay == "none" else values.replay_capacity) * transition
         if values.replay == "prioritized":
             # A tree of sums, two nodes of 8 bytes per transition, whose number is rounded up to a power of 2.
-            total += 4 * (1 << (values.replay_capacity - 1).bit_length())
-    return total * _BYTES_PER_NUMBER
+            total += 16 * (1 << (values.replay_capacity - 1).bit_length())
+    return total
 
 
 def _num_weights(env: EnvInfo, values: Hyperparams) -> int:

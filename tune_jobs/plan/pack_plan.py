@@ -26,7 +26,7 @@ few at once, the sweep takes longer, but its proposals are better informed.
 """
 
 # The other half is for the processes themselves, for other programs, and for what the estimate leaves out.
-_SHARE_OF_MEMORY = 0.5
+SHARE_OF_MEMORY = 0.5
 
 _OTHERS = "other trials need the idle CPUs"
 
@@ -114,7 +114,7 @@ def _by_memory(
     note = (
         f"Packs are planned smaller: {wanted[0]} x {wanted[1]} trials at once may take "
         f"{bytes_text(wanted[0] * sum(largest))} of memory, and half of what {machine.source} has available is "
-        f"{bytes_text(machine.memory_bytes * _SHARE_OF_MEMORY if machine.memory_bytes else 0)}. "
+        f"{bytes_text(machine.memory_bytes * SHARE_OF_MEMORY if machine.memory_bytes else 0)}. "
         f"{num_packs} x {slots} trials run at once."
     )
     return num_packs, slots, (note,)
@@ -122,7 +122,7 @@ def _by_memory(
 
 def _budget(machine: Machine, num_packs: int, cpus: float) -> float | None:
     share = machine.memory_per_process(num_packs, cpus)
-    return None if share is None else share * _SHARE_OF_MEMORY
+    return None if share is None else share * SHARE_OF_MEMORY
 
 
 def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most: int) -> tuple[int, str]:

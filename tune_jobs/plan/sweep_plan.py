@@ -28,9 +28,10 @@ from policies.hyperparams import Hyperparams
 from tune_jobs.plan.concurrency import max_concurrent
 from tune_jobs.plan.engine_choice import PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
-from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, member_bytes
+from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, trial_bytes
 from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.memory import lowered_by_memory
 from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
 from tune_jobs.plan.points import num_points_of, num_trials_of, place_of_point, point_hyperparams, trial_id
 from tune_jobs.plan.user_code import check_rl_module
@@ -186,7 +187,10 @@ def make_plan(
     idle = idle_notes(spec, env, [values for _, values in points], are_packed, searched, may_refuse=not records)
     sizes = _sizes(spec, points, known)
     to_run = _to_run(trials, records, retry_failed=retry_failed)
-    members = _members(to_run, points, _largest(sizes, specs, lambda _, each: member_bytes(env, each)))
+    memory = _largest(sizes, specs, lambda _, each: trial_bytes(env, each))
+    members = _members(to_run, points, memory)
+    alone = max((memory[trial.point_index] for trial in to_run if not _is_packed(trial)), default=0)
+    concurrent, memory_notes = lowered_by_memory(machine, alone, concurrent, cpus=float(spec.cpus_per_trial))
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
@@ -209,6 +213,7 @@ def make_plan(
             *idle_settings(spec),
             *idle,
             *engine_notes,
+            *memory_notes,
             *outside_notes(spec, chosen_points),
             *prior_notes(spec, prior),
         ),

@@ -116,6 +116,7 @@ class TaskReader:
             num_gpus=spec.resources.num_gpus,
             iteration_timeout_s=spec.iteration_timeout_s,
             failure_penalty=spec.env.failure_penalty,
+            atari_training=None if spec.env.atari is None else spec.env.atari.training,
             rl_module=spec.rl_module,
             changes=trial.changes,
             in_step=spec.scheduler.waits_for_others and trial.seed_index < spec.seeds_per_point,

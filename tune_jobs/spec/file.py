@@ -186,6 +186,7 @@ def json_schema() -> dict[str, Any]:
     names = {"type": "string", "enum": [*texts["enum"], *get_args(Cost)]}
     pair = {"type": "array", "items": names, "minItems": 2, "maxItems": 2, "uniqueItems": True}
     properties["objective"]["anyOf"] = [texts, pair, mapping]
+    definitions["EnvSpec"]["properties"]["atari"]["anyOf"].append({"type": "boolean"})
     for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
         # A section whose lines are all commented out is null.
         told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}

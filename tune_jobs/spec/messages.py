@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
@@ -53,6 +54,8 @@ _FORMS = {
     "name": f"use {NAME_RULE}",
     "rl_module": "write module:Class",
     "env": "give a Gymnasium id such as CartPole-v1, or a mapping of id and args",
+    "env.atari": "give true, or a mapping of its fields (frame_skip, noop_max, screen_size, terminal_on_life_loss, "
+    "clip_rewards)",
     "about": "give a text, or a mapping of its fields (title, source, shows, expected, env_steps, time, description)",
     "search": "give random, auto, gp, forest or tpe, or a mapping of its fields",
     "points": "give a list of points, each a mapping of the searched hyperparameters to values",
@@ -117,7 +120,9 @@ def _section(location: Sequence[int | str]) -> type[BaseModel]:
         return LayersFields  # the only domain with fields
     model: Any = SweepFields
     for part in location:
-        model = model.model_fields[str(part)].annotation
+        annotation = model.model_fields[str(part)].annotation
+        # One that may be null is a union with None.
+        model = next((one for one in get_args(annotation) if one is not NoneType), annotation)
     found: type[BaseModel] = model
     return found
 

@@ -217,12 +217,30 @@ def needs_of(spec: SweepFields) -> dict[Need, str]:
     runners = spec.resources.num_env_runners
     found: dict[Need, tuple[bool, str]] = {
         "rl_module": (spec.rl_module is not None, f"rl_module is {spec.rl_module}"),
-        "convolutions": (spec.env.pixels, "env.pixels is true"),
+        "convolutions": (
+            spec.env.pixels or spec.env.atari is not None,
+            "env.pixels is true" if spec.env.atari is None else "env.atari is set",
+        ),
         "env_runners": (runners > 0, f"resources.num_env_runners is {runners}"),
         "copies": (spec.scheduler.type == "pbt", "scheduler.type is pbt"),
         "pauses": (spec.scheduler.type == "hyperband", "scheduler.type is hyperband"),
     }
     return {need: setting for need, (is_needed, setting) in found.items() if is_needed}
+
+
+def env_problems(spec: SweepFields) -> Found:
+    """Return what is wrong with the wrappers of a sweep's environment."""
+    if spec.env.atari is None:
+        return []
+    found: Found = []
+    if spec.env.pixels:
+        found.append(("env.pixels", "true cannot be used with env.atari, which observes images already: leave it out"))
+    if spec.env.failure_penalty is not None:
+        text = (
+            f"{spec.env.failure_penalty:g} cannot be used with env.atari, whose lost lives are ends without a penalty"
+        )
+        found.append(("env.failure_penalty", f"{text}: leave it out"))
+    return found
 
 
 def why_none(engine: Engine, spec: SweepFields) -> str | None:

@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     field_serializer,
+    model_serializer,
 )
 
 from analysis.records import Cost, Objective
 from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
+from tune_jobs.spec.atari import AtariSpec, atari_from_a_flag
 from tune_jobs.spec.domain_kinds import Number, WholeNumber
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import ENGINES
+from tune_jobs.spec.fields import Flag, NonNegativeWhole, PositiveNumber, PositiveWhole, Section
 from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
 SearchType = Literal["random", "auto", "gp", "forest", "tpe"]
@@ -35,18 +37,6 @@ NAME_PATTERN = r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}"
 _LARGEST_REWARD = 3.4e38
 """The largest number of 32 bits; training computes in 32 bits, where anything larger is infinite."""
 NAME_RULE = "up to 100 letters, digits, '_', '-' and '.', beginning with none of the last two"
-
-Flag = Annotated[bool, Field(strict=True)]
-"""true or false, but no string or number in their place."""
-PositiveWhole = Annotated[WholeNumber, Field(ge=1)]
-NonNegativeWhole = Annotated[WholeNumber, Field(ge=0)]
-PositiveNumber = Annotated[Number, Field(gt=0)]
-
-
-class Section(BaseModel):
-    """A part of a sweep: it cannot be changed, and refuses unknown fields."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class AboutSpec(Section):
@@ -78,6 +68,11 @@ class EnvSpec(Section):
         "info of reset and step. true: a member action_mask, the method that MaskablePPO asks for, or an info "
         "action_mask. null: the first two, if there is one. false: what there is, is no mask.",
     )
+    atari: Annotated[AtariSpec | None, BeforeValidator(atari_from_a_flag)] = Field(
+        None,
+        description="true, or a mapping: the standard preprocessing of an Atari game. Evaluations and reported returns "
+        "are of whole games, with the game's own rewards. null: none.",
+    )
     failure_penalty: Annotated[Number, Field(ge=-_LARGEST_REWARD, le=_LARGEST_REWARD)] | None = Field(
         None,
         description="Reward of the step in which the env ends by failure, such as the pole's fall. Training sees it, "
@@ -90,7 +85,21 @@ class EnvSpec(Section):
         # Imported here because the command line reads and prints sweep files without Gymnasium.
         from policies.envs.wrappers import with_wrappers
 
-        return with_wrappers(self.args, frame_stack=self.frame_stack, pixels=self.pixels, action_mask=self.action_mask)
+        return with_wrappers(
+            self.args,
+            frame_stack=self.frame_stack,
+            pixels=self.pixels,
+            action_mask=self.action_mask,
+            atari=None if self.atari is None else self.atari.frames,
+        )
+
+    @model_serializer(mode="wrap")
+    def _only_if_set(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Versions that don't know the field read sweeps that don't use it.
+        content: dict[str, Any] = handler(self)
+        if self.atari is None:
+            content.pop("atari", None)
+        return content
 
 
 class StopSpec(Section):

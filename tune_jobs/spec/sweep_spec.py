@@ -24,7 +24,7 @@ from tune_jobs.spec.engines import find_engine
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.messages import problems_of
 from tune_jobs.spec.problems import Problem, WrongSpecError
-from tune_jobs.spec.rules import search_problems, why_none
+from tune_jobs.spec.rules import env_problems, search_problems, why_none
 from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
 from tune_jobs.spec.training_length import length_problems, with_longest
 
@@ -73,7 +73,8 @@ def check_sweep_name(name: str) -> str:
 
 def _section_problems(spec: SweepFields) -> list[Problem]:
     """Return the settings that contradict each other."""
-    problems = [Problem(path, text) for path, text in (*search_problems(spec), *length_problems(spec))]
+    found = (*env_problems(spec), *search_problems(spec), *length_problems(spec))
+    problems = [Problem(path, text) for path, text in found]
     grace, cap, resources = spec.scheduler.grace_env_steps, spec.stop.num_env_steps, spec.resources
     if spec.scheduler.type != "none" and grace is not None and grace >= cap:
         text = f"{grace} is not less than stop.num_env_steps, {cap}: no trial would ever be ended early"

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from analysis.records import TRAINING_LENGTH, length_of
 from tune_jobs.spec.domains import Domain, Listed, Range
-from tune_jobs.spec.sections import PositiveWhole
+from tune_jobs.spec.fields import PositiveWhole
 
 if TYPE_CHECKING:
     from tune_jobs.spec.sections import SweepFields

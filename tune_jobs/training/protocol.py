@@ -29,7 +29,7 @@ class TrialTask:
     hyperparams: dict[str, Any]
     env_id: str
     env_args: dict[str, Any]
-    """The env's arguments, with `frame_stack` and `pixels` if the spec sets them."""
+    """The env's arguments, with `frame_stack`, `pixels` and `atari` if the spec sets them."""
     stop: StopSpec
     evaluation: EvaluationSpec
     checkpoints: CheckpointSpec
@@ -39,6 +39,8 @@ class TrialTask:
     iteration_timeout_s: float = 600.0
     failure_penalty: float | None = None
     """The failure penalty, for training only; see `EnvSpec`."""
+    atari_training: dict[str, bool] | None = None
+    """What training alone sees of an Atari game; see `AtariSpec`."""
     rl_module: str | None = None
     """`module:Class` of a user's own RLModule; None: ours."""
     changes: tuple[ChangeRecord, ...] = ()

@@ -99,6 +99,7 @@ class RLlibEngine:
             num_env_runners=task.num_env_runners,
             num_gpus=task.num_gpus,
             failure_penalty=task.failure_penalty,
+            atari_training=task.atari_training,
             rl_module=task.rl_module,
         )
         config.env_runners(env_runner_cls=EnvRunner)

@@ -1,0 +1,47 @@
+"""Which environments have a vectorised version of their own that does what a loop over them would do."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+
+from policies.envs.atari import is_of_emulator
+from policies.envs.faults import close_env
+from policies.envs.flat import needs_flattening
+from policies.envs.own_actions import is_taken
+
+
+def own_vector_env(
+    spec: EnvSpec, num_envs: int, env_args: dict[str, Any]
+) -> gym.vector.VectorEnv[Any, Any, Any] | None:
+    """Make the env's own vectorised version; None: it has none, or one whose spaces are not as policies need them."""
+    if not takes_vector_entry_point(spec, env_args):
+        return None
+    env = gym.make_vec(spec, num_envs=num_envs, vectorization_mode="vector_entry_point", **env_args)
+    if not needs_flattening(env.single_observation_space) and is_taken(env.single_action_space):
+        return env
+    close_env(env)
+    return None
+
+
+def takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
+    """Whether the env has a vectorised version that takes these arguments and the time limit, and resets as ours."""
+    # A vector entry point would leave out wrappers of the registry entry, and a time limit it does not take. That of
+    # Atari's emulator (ale-py 0.12) observes stacked frames and clips rewards, which the env itself does not.
+    if spec.vector_entry_point is None or spec.additional_wrappers or is_of_emulator(spec.entry_point):
+        return False
+    kwargs = {**spec.kwargs, **env_args}
+    if spec.max_episode_steps is not None:
+        kwargs.setdefault("max_episode_steps", spec.max_episode_steps)
+    try:
+        entry_point = spec.vector_entry_point
+        creator = entry_point if callable(entry_point) else load_env_creator(entry_point)
+        inspect.signature(creator).bind(num_envs=1, **kwargs)
+        # A loop over envs resets in the next step, as is expected here; the mode may also be given as a string.
+        mode = (getattr(creator, "metadata", None) or {}).get("autoreset_mode", gym.vector.AutoresetMode.NEXT_STEP)
+        return bool(gym.vector.AutoresetMode(mode) is gym.vector.AutoresetMode.NEXT_STEP)
+    except (ImportError, AttributeError, TypeError, ValueError):
+        return False

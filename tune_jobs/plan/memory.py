@@ -1,0 +1,43 @@
+"""Lower how many trials run at once, each in a process of its own, to what fits into memory; packs have other rules.
+
+What takes memory is the replay memory of DQN: 100,000 transitions of Atari's images are 5.6 GB.
+"""
+
+from __future__ import annotations
+
+from analysis.wording import bytes_text, counted
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.pack_plan import SHARE_OF_MEMORY
+
+
+def lowered_by_memory(
+    machine: Machine, num_bytes: float, concurrent: int, *, cpus: float
+) -> tuple[int, tuple[str, ...]]:
+    """Return how many trials run at once, and a note where memory limits them.
+
+    Args:
+        machine: The machine that they run on.
+        num_bytes: The memory of the largest trial.
+        concurrent: How many its CPUs and GPUs, and the sweep, allow.
+        cpus: CPUs of each trial.
+    """
+
+    def share(at_once: int) -> float:
+        return (machine.memory_per_process(at_once, cpus) or 0.0) * SHARE_OF_MEMORY
+
+    if machine.memory_bytes is None or num_bytes <= share(concurrent):
+        return concurrent, ()
+    what = f"one trial may take {bytes_text(num_bytes)} of memory"
+    lower = "hyperparams.replay_capacity is what lowers it."
+    if machine.nodes:
+        # Trials that wait may begin on nodes that join, whatever is planned here.
+        note = f"{counted(concurrent, 'trial')} at once get {bytes_text(share(concurrent))} of memory each, but {what}"
+        return concurrent, (f"{note}: set resources.max_concurrent; {lower}",)
+    at_once = next((number for number in range(concurrent, 1, -1) if share(number) >= num_bytes), 1)
+    if num_bytes > share(1):
+        note = f"Trials run one at a time: {what}, more than half of what {machine.source} has available,"
+    else:
+        runs = "runs" if at_once == 1 else "run"
+        note = f"{counted(at_once, 'trial')} instead of {concurrent} {runs} at once: {what}"
+        note += f", and half of what {machine.source} has available is"
+    return at_once, (f"{note} {bytes_text(share(1))}; {lower}",)
