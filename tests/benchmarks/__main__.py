@@ -6,16 +6,19 @@ Run it on a machine that does nothing else.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from tests.benchmarks import dqn, objects, ppo, workload
+from tests.benchmarks import dqn, objects, populations, ppo, workload
 from tests.benchmarks.cluster import rows as cluster
 from tests.benchmarks.service import rows as service
 
-_PARTS = ("ppo", "many", "dqn", "service", "objects", "cluster", "largest")
+_TOGETHER = ("ppo", "many", "dqn", "populations", "service", "objects")
+_PARTS = (*_TOGETHER, "cluster", "largest")
+"""`cluster` takes an hour, with 10,000 trials and a cluster of its own; `largest` is the last of those alone."""
 
 
 def main() -> None:
@@ -30,29 +33,27 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=10_000, help="of the cluster's largest sweep, of 3 s each")
     parser.add_argument("--save", type=Path, help="a file for what the cluster's sweeps cost; see cluster/model.py")
     options = parser.parse_args()
-    rows = []
-    if options.only in (None, "ppo"):
-        rows += ppo.rows(options) + ppo.command_rows()
-    if options.only in (None, "many"):
-        rows += ppo.many_rows(options.env_steps)
-    if options.only in (None, "dqn"):
-        rows += dqn.rows(options.repeats, options.dqn_env_steps, peers=not options.no_peers)
-    if options.only in (None, "service"):
-        rows += service.rows(options.repeats, options.hours)
-    if options.only in (None, "objects"):
-        rows += objects.rows(options.repeats)
-    if options.only == "cluster":
-        # An hour with 10,000 trials, and a cluster of its own: not among the others.
-        rows += cluster.rows(options.repeats, options.trials, options.save)
-    if options.only == "largest":
-        # The last of those alone, in a third of that.
-        rows += cluster.largest(options.trials, options.save)
+    rows = [row for part in ([options.only] if options.only else _TOGETHER) for row in _rows(part, options)]
     table = Table(title=f"{ppo.machine_name()}, medians of {options.repeats}")
     for column in ("figure", "measured", "at most / at least"):
         table.add_column(column)
     for row in rows:
         table.add_row(*row)
     Console().print(table)
+
+
+def _rows(part: str, options: argparse.Namespace) -> list[ppo.Row]:
+    measures: dict[str, Callable[[], list[ppo.Row]]] = {
+        "ppo": lambda: ppo.rows(options) + ppo.command_rows(),
+        "many": lambda: ppo.many_rows(options.env_steps),
+        "dqn": lambda: dqn.rows(options.repeats, options.dqn_env_steps, peers=not options.no_peers),
+        "populations": lambda: populations.rows(options),
+        "service": lambda: service.rows(options.repeats, options.hours),
+        "objects": lambda: objects.rows(options.repeats),
+        "cluster": lambda: cluster.rows(options.repeats, options.trials, options.save),
+        "largest": lambda: cluster.largest(options.trials, options.save),
+    }
+    return measures[part]()
 
 
 if __name__ == "__main__":

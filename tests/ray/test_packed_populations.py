@@ -18,6 +18,7 @@ from policies.errors import CheckpointError
 from tune_jobs.ray_tune.hyperband import HyperBand
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+from tune_jobs.training.pack_loop import MemberReport
 
 pytestmark = pytest.mark.ray
 
@@ -85,6 +86,12 @@ def test_a_copy_goes_on_from_what_the_better_one_has_saved_there_and_trains_with
     # Nobody else was opened a second time: who waits goes on where it is.
     assert sorted(name for name, _ in packs.begun()) == ["t0000"] * 3 + ["t0001", "t0002", "t0003"]
     assert not (packs.store.folder / "trials" / "t0000" / "copied").exists()
+
+
+def test_who_waits_is_saved_there_whatever_its_score_and_its_checkpoints_are(tmp_path: Path) -> None:
+    rare = {"every_iterations": 99, "keep": 0}
+    packs = Packs(tmp_path, 4, lambda trial_id, at: float(trial_id[1:]) - at, PBT, checkpoints=rare).run()
+    assert [one for one in packs.begun() if one[0] == "t0000"][1:] == [("t0000", "t0003@4"), ("t0000", "t0003@8")]
 
 
 def test_a_pack_of_slower_members_is_waited_for_and_trains_meanwhile(tmp_path: Path) -> None:
@@ -311,6 +318,27 @@ def test_a_member_that_has_to_go_on_alone_gets_a_pack_while_the_others_wait(tmp_
     packs.run()
     assert {record.status for record in packs.records()} == {"completed"}
     assert len(packs.changes()["t0000"]) == 2
+
+
+def test_a_sweep_is_not_over_while_one_that_gave_its_place_away_waits_for_one_that_fails_for_good(
+    tmp_path: Path,
+) -> None:
+    packs = Packs(tmp_path, 2, lambda trial_id, _: 1.0, PBT, num_packs=1, slots=1, max_retries=0)
+    packs.run(until=lambda: packs.keeper.record("t0000").status == "paused")
+    packs.driver.died("p00", "killed")
+    assert packs.keeper.record("t0001").status == "failed"
+    assert not packs.driver.is_finished
+    packs.starts("p00")
+    packs.run()
+    assert [record.status for record in packs.records()] == ["completed", "failed"]
+
+
+def test_what_is_told_of_one_that_gave_its_place_away_is_known_already(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 2, lambda trial_id, _: 1.0, PBT, num_packs=1, slots=1)
+    packs.run(until=lambda: packs.keeper.record("t0000").status == "paused")
+    known = packs.keeper.record("t0000")
+    packs.driver.take("p00", [MemberReport("t0000", error="late", retried=False)], node="here", pid=1)
+    assert packs.keeper.record("t0000") == known
 
 
 def test_the_last_one_of_a_population_goes_on_by_itself(tmp_path: Path) -> None:
