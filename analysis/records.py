@@ -270,6 +270,11 @@ class SweepRecord(Record):
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
     prior: tuple[PriorRecord, ...] = Field((), description="What its search began with, of earlier sweeps.")
 
+    @property
+    def is_population(self) -> bool:
+        """Whether its trials go on from copies of others, with other values."""
+        return self.section("scheduler").get("type") in ("pbt", "pb2")
+
     def section(self, name: str) -> Mapping[str, Any]:
         """Return a section of the sweep file, empty where a record lacks it or has something else there.
 

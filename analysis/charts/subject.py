@@ -63,7 +63,7 @@ class Subject:
     @property
     def is_population(self) -> bool:
         """Whether trials change their values while they train."""
-        return self.sweep.section("scheduler").get("type") == "pbt" or any(trial.changes for trial in self.trials)
+        return self.sweep.is_population or any(trial.changes for trial in self.trials)
 
     @property
     def objective(self) -> Objective:

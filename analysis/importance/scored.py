@@ -104,7 +104,7 @@ def _why_none(
     objective: Objective,
     goal: float | None,
 ) -> str:
-    if sweep.section("scheduler").get("type") == "pbt" or any(trial.changes for trial in trials):
+    if sweep.is_population or any(trial.changes for trial in trials):
         return "Population based training changes values while a trial trains, so no value has a score of its own."
     if objective == "steps_to_threshold" and goal is None:
         return "The objective is steps_to_threshold, and the threshold is not known: set objective.threshold."

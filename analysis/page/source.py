@@ -64,7 +64,7 @@ class Source:
     @property
     def is_population(self) -> bool:
         """Whether trials change their hyperparameters while they train, so that none has a setting."""
-        return self.sweep.section("scheduler").get("type") == "pbt"
+        return self.sweep.is_population
 
     @property
     def cores_per_process(self) -> float:

@@ -35,7 +35,8 @@ def speed(folder: Path) -> float:
     Logs say to the second when a trial was built for the first time; records, when its present process began with it.
     """
     logs = [path.read_text() for path in folder.glob("trials/*/log.txt")]
-    begun = min(dt.datetime.fromisoformat(found[1]) for log in logs if (found := _BUILT.search(log))).timestamp()
+    built = [match[1] for match in map(_BUILT.search, logs) if match is not None]
+    begun = min(dt.datetime.fromisoformat(when).timestamp() for when in built)
     found = records(folder)
     ended = max(record["ended_at"] for record in found)
     return float(sum(record["num_env_steps"] for record in found) / (ended - begun))

@@ -29,6 +29,7 @@ from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import Scheduler
 from tune_jobs.ray_tune.trainable import TaskReader
+from tune_jobs.search.gains import Evaluations
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.copies import remove_uncounted_copies
 from tune_jobs.store.record_keeper import RecordKeeper
@@ -178,7 +179,17 @@ class Packs:
         if self.spec.scheduler.type == "hyperband":
             grace = self.spec.scheduler.grace_env_steps or 1
             return HyperBand(grace, self.spec.stop.num_env_steps, self.spec.scheduler.reduction_factor)
-        return Population(self.spec, self.keeper.record)
+        return Population(self.spec, self.keeper.record, self._curves())
+
+    def _curves(self) -> Evaluations | None:
+        return Evaluations(self.store) if self.spec.scheduler.type == "pb2" else None
+
+    def population(self) -> Population:
+        """Its rule, to which all trials are known and that has compared none."""
+        population = Population(self.spec, self.keeper.record, self._curves())
+        for record in self.keeper.all_records():
+            population.begins(record.trial_id)
+        return population
 
     def starts(self, pack_id: str) -> None:
         """Start the process of a pack, for the first time or again."""

@@ -18,6 +18,7 @@ from policies.errors import CheckpointError
 from tune_jobs.ray_tune.hyperband import HyperBand
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+from tune_jobs.search.gains import Evaluations, gains_of
 from tune_jobs.training.pack_loop import MemberReport
 
 pytestmark = pytest.mark.ray
@@ -194,7 +195,7 @@ def test_comparing_all_at_once_decides_as_one_by_one_where_all_scores_are_known(
     standings = [Standing(name, 800, scores[name], evaluated=True) for name in names]
     others: Any = SimpleNamespace(ended=lambda: ())
     decided = []
-    with mock.patch.object(Population, "_mutated", lambda self, point, rng: {"drawn": rng.random()}):
+    with mock.patch.object(Population, "_changed", lambda self, standing, chosen, rng: {"drawn": rng.random()}):
         for at_once in (True, False):
             population = Population(spec, records.__getitem__)
             for name in names:
@@ -205,6 +206,41 @@ def test_comparing_all_at_once_decides_as_one_by_one_where_all_scores_are_known(
                 decided.append({one.trial_id: population.reached(one, others) for one in standings})
     assert decided[0] == decided[1]
     assert seed > 2 or any(isinstance(one, CopyFrom) for one in decided[0].values())
+
+
+# -- pb2
+
+PB2 = {**PBT, "type": "pb2"}
+
+
+def test_pb2_chooses_the_same_values_in_any_number_of_packs_and_other_ones_than_mutation(tmp_path: Path) -> None:
+    found = []
+    for number, (num_packs, slots, scheduler) in enumerate([(1, 64, PB2), (2, 2, PB2), (1, 64, PBT)]):
+        packs = Packs(
+            tmp_path / str(number), 8, random_scores(0), scheduler, num_packs=num_packs, slots=slots,
+            stop={"num_env_steps": 2_000},
+        ).run()  # fmt: skip
+        found.append(packs.changes())
+    ours, again, mutated = found
+    assert ours == again
+    assert ours != mutated
+    # The first copies are of the same trials: what is chosen there goes by the first intervals alone.
+    assert [[one.source_trial_id for one in each[:1]] for each in ours.values()] == [
+        [one.source_trial_id for one in each[:1]] for each in mutated.values()
+    ]
+
+
+def test_a_resumed_pb2_knows_what_intervals_gained(tmp_path: Path) -> None:
+    def until(packs: Packs, num_env_steps: int) -> Packs:
+        return packs.run(until=lambda: all(one.num_env_steps >= num_env_steps for one in packs.records()))
+
+    packs = until(Packs(tmp_path, 8, random_scores(0), PB2, stop={"num_env_steps": 2_000}), 1_400)
+    before = packs.population()
+    packs.begin()
+    standing = Standing("t0000", 1_600, 0.0, evaluated=True)
+    rngs = [np.random.default_rng(0) for _ in range(2)]
+    assert before._changed(standing, "t0003", rngs[0]) == packs.population()._changed(standing, "t0003", rngs[1])
+    assert len(gains_of(packs.records(), Evaluations(packs.store)([f"t000{index}" for index in range(8)]), 400)) > 16
 
 
 # -- what goes wrong

@@ -39,7 +39,7 @@ def unseedable_env(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- which engine
 
 
-MEETING: list[dict[str, Any]] = [{"scheduler": "pbt"}, {"scheduler": "hyperband"}]
+MEETING: list[dict[str, Any]] = [{"scheduler": "pbt"}, {"scheduler": "pb2"}, {"scheduler": "hyperband"}]
 """Sweeps whose trials wait for each other."""
 
 

@@ -19,6 +19,7 @@ from tune_jobs.sweeps.drive import write_new
 LR = {"lr": {"loguniform": [1e-4, 1e-2]}}
 TPE = {"space": LR, "num_samples": 20, "search": "tpe"}
 PBT: dict[str, Any] = {"space": LR, "num_samples": 4, "scheduler": "pbt"}
+PB2 = {**PBT, "scheduler": "pb2"}
 MACHINE = Machine(num_cpus=2)
 
 
@@ -38,6 +39,10 @@ MACHINE = Machine(num_cpus=2)
         ({**PBT, "num_samples": 1}, "num_samples", ["1 trial", "at least 2"]),
         ({**PBT, "num_samples": 1, "space": {"lr": {"grid": [0.1]}}}, "space", ["1 trial", "at least 2"]),
         ({**PBT, "seeds_per_point": 3}, "seeds_per_point", ["3", "pbt"]),
+        ({**PB2, "seeds_per_point": 3}, "seeds_per_point", ["3", "pb2"]),
+        ({**PB2, "space": {"lr": {"grid": [1e-3, 1e-2]}}}, "scheduler.type", ["pb2", "lists alone", "use pbt"]),
+        ({**TPE, "scheduler": "pb2"}, "search.type", ["tpe", "pb2 changes the values"]),
+        ({**PB2, "resources": {"max_concurrent": 1}}, "resources.max_concurrent", ["pb2", "num_cpus"]),
         (
             {**PBT, "algorithm": "random", "space": {"num_envs": {"randint": [1, 9]}}},
             "scheduler.type",

@@ -231,7 +231,7 @@ def _later(points: _Points, name: str, rule: Rule) -> str:
     others = [other for other in rule.reads if other in spec.space and other != name]
     if not others:
         return ""
-    later = f" A mutation of {', '.join(others)} may change that." if spec.scheduler.type == "pbt" else ""
+    later = f" A mutation of {', '.join(others)} may change that." if spec.scheduler.is_population else ""
     return later + (_condition(points, name, rule, others[0]) if len(others) == 1 else "")
 
 

@@ -321,7 +321,7 @@ def _members(to_run: Sequence[TrialPlan], points: Sequence[_Point], memory: Sequ
 
 def _sizes(spec: SweepSpec, points: Sequence[_Point], known: list[Hyperparams]) -> list[list[Hyperparams]]:
     """Return, for each point, the hyperparameters that its largest trials may have."""
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         return [[values, *largest_hyperparams(spec, known)] for values in known]
     # One list for all points that are not known: `_largest` measures it once.
     largest = largest_hyperparams(spec, known) if len(known) < len(points) else []

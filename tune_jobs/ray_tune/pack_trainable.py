@@ -127,7 +127,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         self._first = self._ahead.submit(self._read)
         allow_modules(reader.sweep.allowed_modules)
         # A population is compared where its members wait, and at no other evaluation.
-        self._is_scheduled = spec.scheduler.type not in ("none", "pbt")
+        self._is_scheduled = spec.scheduler.type != "none" and not spec.scheduler.is_population
         self._engine = self.make_engine()
         with watchdog(spec.iteration_timeout_s, self._file):
             self._evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, reader.sweep.evaluation_seeds)

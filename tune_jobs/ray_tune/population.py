@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 from typing_extensions import override
@@ -25,6 +26,8 @@ from policies.errors import CheckpointError, SpecError
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
 from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, is_starting, name_of, standing_of
+from tune_jobs.search.bandit import Next, propose
+from tune_jobs.search.gains import Curves, Evaluations, gains_of
 from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
@@ -38,6 +41,7 @@ _LOG = logging.getLogger(__name__)
 _ATTEMPTS = 20
 
 ReadRecord = Callable[[str], TrialRecord]
+ReadCurves = Callable[[Sequence[str]], Curves]
 Change = Callable[[str, Callable[[TrialRecord], TrialRecord]], None]
 
 
@@ -62,12 +66,16 @@ class Population:
     Args:
         spec: The sweep.
         read: Returns the newest record of a trial.
+        curves: Returns the evaluations of trials, by which pb2 chooses values; None: values are mutated.
     """
 
-    def __init__(self, spec: SweepSpec, read: ReadRecord) -> None:
+    def __init__(self, spec: SweepSpec, read: ReadRecord, curves: ReadCurves | None = None) -> None:
         self._spec = spec
         self._read = read
+        self._curves = curves
         self._members: dict[str, _Compared] = {}
+        self._chosen: dict[str, dict[str, Any]] = {}
+        """The points of trials that are copied to in this comparison, which their records may not have yet."""
 
     def begins(self, trial_id: str) -> None:
         """Add a trial to the population, with the env steps of its record, as a resumed trial has some already."""
@@ -101,6 +109,7 @@ class Population:
             member = self._members[standing.trial_id]
             member.num_env_steps = member.due_from = standing.num_env_steps
             member.score = standing.score
+        self._chosen = {}
         worst, best = self._quantiles(others)
         return {standing.trial_id: self._decision(standing, worst, best) for standing in standings}
 
@@ -111,7 +120,8 @@ class Population:
         record = self._read(standing.trial_id)
         rng = random_streams.mutation(self._spec.seed, record.index, len(record.changes))
         chosen = better[int(rng.integers(len(better)))]
-        return CopyFrom(chosen, self._mutated(self._read(chosen).point, rng))
+        point = self._chosen[standing.trial_id] = self._changed(standing, chosen, rng)
+        return CopyFrom(chosen, point)
 
     def ended(self, standing: Standing) -> None:
         """Do nothing: `Others` tells which trials have ended, including those that failed."""
@@ -124,10 +134,23 @@ class Population:
         size = min(math.ceil(len(ranked) * self._spec.scheduler.quantile_fraction), len(ranked) // 2)
         return ranked[:size], ranked[len(ranked) - size :]
 
-    def _mutated(self, point: dict[str, Any], rng: Any) -> dict[str, Any]:
-        """Return a mutation whose values are valid together, or the point itself if none is found."""
+    def _changed(self, standing: Standing, chosen: str, rng: np.random.Generator) -> dict[str, Any]:
+        """Return the point with which a trial goes on from a copy of a better one."""
+        point, space = self._read(chosen).point, self._spec.space
+        resample_probability = self._spec.scheduler.resample_probability
+        if self._curves is None:
+            return self._valid(point, lambda: mutate(point, space, rng, resample_probability))
+        interval, score = self._spec.perturb_every_env_steps, _score(self._members[chosen])
+        others = [name for name in self._members if name != standing.trial_id]
+        meanwhile = [self._chosen.get(name) or self._read(name).point for name in others]
+        coming = Next(standing.num_env_steps / interval + 1, score, point, meanwhile)
+        gains = gains_of([self._read(name) for name in self._members], self._curves(list(self._members)), interval)
+        return self._valid(point, lambda: propose(coming, space, gains, rng, resample_probability))
+
+    def _valid(self, point: dict[str, Any], draw: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return what is drawn if its values are valid together, or the point itself if none is found."""
         for _ in range(_ATTEMPTS):
-            mutated = mutate(point, self._spec.space, rng, self._spec.scheduler.resample_probability)
+            mutated = draw()
             try:
                 point_hyperparams(self._spec, mutated, 0)
             except SpecError:
@@ -189,7 +212,7 @@ class PopulationScheduler(TuneScheduler):
     """
 
     def __init__(self, spec: SweepSpec, store: Sweep, read: ReadRecord, change: Change) -> None:
-        self._population = Population(spec, read)
+        self._population = Population(spec, read, Evaluations(store) if spec.scheduler.type == "pb2" else None)
         super().__init__(self._population)
         self._spec = spec
         self._store = store

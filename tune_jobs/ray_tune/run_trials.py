@@ -90,7 +90,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
         store.clear_tune_folder()
         # Only population based training makes copies.
         record = store.read_record()
-        if stored_spec(record).scheduler.type == "pbt":
+        if stored_spec(record).scheduler.is_population:
             with store.reading(results=False):
                 for trial_id in job.trial_ids:
                     remove_uncounted_copies(store.trial(trial_id), store.trial(trial_id).read_record().changes)
@@ -176,7 +176,7 @@ class _Run:
             self._single_trials(others, f"run{suffix}")
 
     def _build_scheduler(self) -> TrialScheduler:
-        if self._spec.scheduler.type == "pbt":
+        if self._spec.scheduler.is_population:
             return PopulationScheduler(self._spec, self._store, self.keeper.record, self.keeper.change)
         return build_tune_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
 

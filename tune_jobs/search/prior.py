@@ -60,7 +60,7 @@ def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
         if name not in earlier.space and name not in earlier.hyperparams
     ]
     different += [f"{name} is searched there, and not here" for name in earlier.space if name not in spec.space]
-    if earlier.scheduler.type == "pbt":
+    if earlier.scheduler.is_population:
         different.append("it is a population, whose trials change their values while they train")
     if different:
         raise SpecError(

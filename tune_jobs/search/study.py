@@ -45,7 +45,7 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
             "An Optuna study needs Optuna, and that is not installed.",
             "Install it with `pip install 'tune-jobs[tpe]'`.",
         )
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         raise SpecError(
             f"Sweep {name} is one of population based training, whose trials change their values while they train; a "
             "trial of Optuna has one value of each.",

@@ -63,7 +63,7 @@ _FORMS = {
     "confirm": "give none, true, or a mapping of its fields (top, seeds, max_share)",
     "objective": "give final, area, best or steps_to_threshold, a list of one of them and env_steps, or a mapping of "
     "its fields (type, threshold, cost)",
-    "scheduler": "give none, asha, hyperband, median or pbt, or a mapping of its fields",
+    "scheduler": "give none, asha, hyperband, median, pbt or pb2, or a mapping of its fields",
 }
 """How to write fields that have several forms, or a form that no type describes."""
 

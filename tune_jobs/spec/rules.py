@@ -10,7 +10,7 @@ from policies.hyperparams import (
     HYPERPARAMS_BY_ALGORITHM,
     RandomHyperparams,
 )
-from tune_jobs.spec.domains import Grid
+from tune_jobs.spec.domains import Grid, Range
 from tune_jobs.spec.draws import num_points
 from tune_jobs.spec.engines import Engine, Need
 
@@ -47,16 +47,16 @@ def search_problems(spec: SweepFields) -> Found:
         found.append(("prior", text))
     if twice := [sweep for index, sweep in enumerate(spec.prior) if sweep in spec.prior[:index]]:
         found.append(("prior", f"names {twice[0]!r} twice: name it once"))
-    if spec.scheduler.type in ("pbt", "hyperband") and spec.resources.max_concurrent is not None:
+    if spec.scheduler.waits_for_others and spec.resources.max_concurrent is not None:
         text = (
             f"{spec.resources.max_concurrent} cannot be used with scheduler.type {spec.scheduler.type}, which pauses "
             "trials until others have come as far: limit how many run by resources.num_cpus"
         )
         found.append(("resources.max_concurrent", text))
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         found += _population_problems(spec)
     elif spec.scheduler.perturb_every_env_steps is not None:
-        text = f"is only for pbt, but scheduler.type is {spec.scheduler.type}: leave it out, or set the type to pbt"
+        text = f"is for pbt and pb2, but scheduler.type is {spec.scheduler.type}: leave it out, or set the type to pbt"
         found.append(("scheduler.perturb_every_env_steps", text))
     return found + _cost_problems(spec)
 
@@ -67,9 +67,9 @@ def _cost_problems(spec: SweepFields) -> Found:
     if spec.objective.type == "steps_to_threshold":
         text = "cannot be used with steps_to_threshold, which counts env steps itself: use final, area or best"
         return [("objective.cost", text)]
-    if spec.scheduler.type == "pbt":
-        text = "cannot be used with pbt (scheduler.type), whose trials are no settings that could be set against a cost"
-        return [("objective.cost", text)]
+    if spec.scheduler.is_population:
+        why = "whose trials are no settings that could be set against a cost"
+        return [("objective.cost", f"cannot be used with {spec.scheduler.type} (scheduler.type), {why}")]
     return []
 
 
@@ -77,12 +77,12 @@ _USED_BY: dict[str, dict[str, tuple[str, ...]]] = {
     "scheduler": {
         "grace_env_steps": ("asha", "hyperband", "median"),
         "reduction_factor": ("asha", "hyperband"),
-        "quantile_fraction": ("pbt",),
-        "resample_probability": ("pbt",),
+        "quantile_fraction": ("pbt", "pb2"),
+        "resample_probability": ("pbt", "pb2"),
     },
     "search": {"num_startup_trials": ("gp", "forest", "tpe")},
 }
-"""The types of search and scheduler that a field is for; `perturb_every_env_steps` is refused without pbt."""
+"""The types of search and scheduler that a field is for; `perturb_every_env_steps` is refused without pbt and pb2."""
 
 
 def idle_settings(spec: SweepFields) -> list[str]:
@@ -116,7 +116,7 @@ def check_extendable(spec: SweepFields) -> None:
     Raises:
         SpecError: The space has nothing random to draw, and no search method or scheduler chooses values.
     """
-    chosen = spec.search.has_model or spec.scheduler.type == "pbt"
+    chosen = spec.search.has_model or spec.scheduler.is_population
     if not chosen and not any(domain.is_random for domain in spec.space.values()):
         why = "its space has only grids" if spec.space else "it has no space"
         raise SpecError(
@@ -131,10 +131,10 @@ def check_replicable(spec: SweepFields) -> None:
     Raises:
         SpecError: Trials of a population change their values while they train.
     """
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         raise SpecError(
-            "The sweep cannot be replicated: with population based training (scheduler.type pbt) a trial's values "
-            "change while it trains, so that none of them is a setting that could be trained again.",
+            f"The sweep cannot be replicated: with population based training (scheduler.type {spec.scheduler.type}) a "
+            "trial's values change while it trains, so that none of them is a setting that could be trained again.",
             "Launch a sweep of the values that the best trial ended with, fixed, with a larger seeds_per_point.",
         )
 
@@ -150,9 +150,10 @@ def check_takes_points(spec: SweepFields) -> None:
             "No point can be added to the sweep: it has no space, so that all its trials have the same values.",
             "Launch a new sweep with other values under hyperparams.",
         )
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         raise SpecError(
-            "No point can be added to the sweep: with population based training (scheduler.type pbt) a trial goes on "
+            "No point can be added to the sweep: with population based training (scheduler.type "
+            f"{spec.scheduler.type}) a trial goes on "
             "from others' copies with other values, so that the point would not be trained as it was given.",
             "Launch a sweep of these values, fixed under hyperparams; `tune-jobs extend` adds trials to a population.",
         )
@@ -165,12 +166,12 @@ def _model_problems(spec: SweepFields) -> Found:
     found: Found = []
     if not spec.space:
         found.append(("search.type", f"{method} has nothing to search: space is empty"))
-    if spec.scheduler.type in ("pbt", "hyperband"):
-        why = {
-            "pbt": f"pbt changes the values that {method} would learn from: use search.type random",
-            "hyperband": f"hyperband waits for whole groups of trials, {method} starts one after another: use asha",
-        }
-        found.append(("search.type", f"{method} cannot be used with scheduler.type {why[spec.scheduler.type]}"))
+    if spec.scheduler.waits_for_others:
+        kind = spec.scheduler.type
+        why = f"waits for whole groups of trials, {method} starts one after another: use asha"
+        if spec.scheduler.is_population:
+            why = f"changes the values that {method} would learn from: use search.type random"
+        found.append(("search.type", f"{method} cannot be used with scheduler.type {kind}: {kind} {why}"))
     if spec.space and not spec.prior and spec.num_samples <= spec.search.num_startup_trials:
         text = (
             f"{spec.num_samples} is not more than search.num_startup_trials, {spec.search.num_startup_trials}: all "
@@ -183,24 +184,29 @@ def _model_problems(spec: SweepFields) -> Found:
 
 def _population_problems(spec: SweepFields) -> Found:
     found: Found = []
+    kind = spec.scheduler.type
     if is_baseline(spec):
-        return [("scheduler.type", f"pbt needs an algorithm that learns, and {spec.algorithm} does not")]
+        return [("scheduler.type", f"{kind} needs an algorithm that learns, and {spec.algorithm} does not")]
     if not spec.space:
-        found.append(("scheduler.type", "pbt has nothing to change: space is empty"))
+        found.append(("scheduler.type", f"{kind} has nothing to change: space is empty"))
+    elif kind == "pb2" and not any(isinstance(domain, Range) for domain in spec.space.values()):
+        text = "pb2 chooses values within ranges, and space has lists alone, which it changes as pbt does: use pbt"
+        found.append(("scheduler.type", text))
     for name in spec.space:
         if name in FIXED_IN_A_POPULATION:
             text = (
-                f"can't be changed within a trial, which pbt (scheduler.type) would do: fix {name} under hyperparams, "
-                "or use another scheduler"
+                f"can't be changed within a trial, which {kind} (scheduler.type) would do: fix {name} under "
+                "hyperparams, or use another scheduler"
             )
             found.append((f"space.{name}", text))
     size = num_points(spec.space, spec.num_samples)
     if spec.space and size < 2:
         name = "num_samples" if not any(isinstance(domain, Grid) for domain in spec.space.values()) else "space"
-        found.append((name, f"gives {size} trial, and pbt (scheduler.type) compares at least 2"))
+        found.append((name, f"gives {size} trial, and {kind} (scheduler.type) compares at least 2"))
     if spec.seeds_per_point > 1:
         text = (
-            f"{spec.seeds_per_point} cannot be used with pbt, which gives each trial its own values: raise num_samples"
+            f"{spec.seeds_per_point} cannot be used with {kind}, which gives each trial its own values: raise "
+            "num_samples"
         )
         found.append(("seeds_per_point", text))
     if spec.perturb_every_env_steps >= spec.stop.num_env_steps:
@@ -222,7 +228,7 @@ def needs_of(spec: SweepFields) -> dict[Need, str]:
             "env.pixels is true" if spec.env.atari is None else "env.atari is set",
         ),
         "env_runners": (runners > 0, f"resources.num_env_runners is {runners}"),
-        "copies": (spec.scheduler.type == "pbt", "scheduler.type is pbt"),
+        "copies": (spec.scheduler.is_population, f"scheduler.type is {spec.scheduler.type}"),
         "pauses": (spec.scheduler.type == "hyperband", "scheduler.type is hyperband"),
     }
     return {need: setting for need, (is_needed, setting) in found.items() if is_needed}

@@ -29,7 +29,7 @@ from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 SearchType = Literal["random", "auto", "gp", "forest", "tpe"]
 AUTO_SEARCH: SearchType = "gp"
 """What `search: auto` is: the method that found the best points in decision 40, and needs nothing to be installed."""
-SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt"]
+SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt", "pb2"]
 
 _RETURN = {"return": "final"}
 """What `objective` may be called besides: the return that training comes to."""
@@ -146,8 +146,9 @@ class SchedulerSpec(Section):
 
     type: SchedulerType = Field(
         "none",
-        description="none, asha (successive halving), hyperband, median (worse than the median) or pbt (population "
-        "based training: the worst continue from copies of the best, with mutated hyperparameters).",
+        description="none, asha (successive halving), hyperband, median (worse than the median), pbt (population "
+        "based training: the worst continue from copies of the best, with mutated hyperparameters) or pb2 (the same, "
+        "with values within ranges chosen by a model of what intervals gained).",
     )
     grace_env_steps: PositiveWhole | None = Field(
         None, description="No trial is ended before this many env steps; null: 1/20 of stop.num_env_steps."
@@ -156,19 +157,26 @@ class SchedulerSpec(Section):
         3.0, description="asha, hyperband: one trial in this many continues at each rung."
     )
     perturb_every_env_steps: PositiveWhole | None = Field(
-        None, description="pbt: env steps between two comparisons of a trial; null: 1/10 of stop.num_env_steps."
+        None, description="pbt, pb2: env steps between two comparisons of a trial; null: 1/10 of stop.num_env_steps."
     )
     quantile_fraction: Annotated[Number, Field(gt=0, le=0.5)] = Field(
-        0.25, description="pbt: the worst share of the trials, which copies the best share."
+        0.25, description="pbt, pb2: the worst share of the trials, which copies the best share."
     )
     resample_probability: Annotated[Number, Field(ge=0, le=1)] = Field(
-        0.25, description="pbt: share of mutations that draw a new value; the others move to a neighbouring one."
+        0.25,
+        description="pbt, and lists with pb2: share of mutations that draw a new value; the others move to a "
+        "neighbouring one.",
     )
 
     @property
     def waits_for_others(self) -> bool:
         """Whether trials wait at numbers of env steps until others have come as far."""
-        return self.type in ("hyperband", "pbt")
+        return self.type == "hyperband" or self.is_population
+
+    @property
+    def is_population(self) -> bool:
+        """Whether trials go on from copies of others, with other values."""
+        return self.type in ("pbt", "pb2")
 
 
 class ObjectiveSpec(Section):
@@ -378,7 +386,7 @@ class SweepFields(Section):
 
     @property
     def perturb_every_env_steps(self) -> int:
-        """pbt: the env steps between two comparisons of a trial."""
+        """pbt, pb2: the env steps between two comparisons of a trial."""
         return self.scheduler.perturb_every_env_steps or max(1, self.stop.num_env_steps // 10)
 
     @property

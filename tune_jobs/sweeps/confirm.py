@@ -22,7 +22,7 @@ from tune_jobs.sweeps.settings import ranked, threshold_for
 
 def may_confirm(spec: SweepSpec) -> bool:
     """Whether a sweep's `confirm` can act: it is on, and trials keep a setting by which a policy is trained."""
-    return spec.confirm.max_share > 0 and spec.scheduler.type != "pbt" and spec.algorithm not in BASELINE_KINDS
+    return spec.confirm.max_share > 0 and not spec.scheduler.is_population and spec.algorithm not in BASELINE_KINDS
 
 
 def points_to_confirm(store: Sweep) -> tuple[int, ...]:

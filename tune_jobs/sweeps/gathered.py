@@ -35,7 +35,7 @@ def sweep_data(store: Sweep) -> SweepData:
         objective=spec.objective.type,
         num_env_steps=spec.stop.num_env_steps,
         threshold=goal_of(store.read_record(), best),
-        has_settings=spec.scheduler.type != "pbt",
+        has_settings=not spec.scheduler.is_population,
     )
 
 

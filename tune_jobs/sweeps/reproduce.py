@@ -102,7 +102,7 @@ def reproduce(
 
 def _check(store: Sweep, trial: TrialRecord, spec: SweepSpec, recorded: Sequence[IterationRecord]) -> None:
     name = f"{store.name}/{trial.trial_id}"
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         raise SpecError(
             f"{name} is of a population: it continued from checkpoints of other trials, so it can't be repeated by "
             "itself.",

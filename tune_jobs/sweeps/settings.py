@@ -30,7 +30,7 @@ def judged(
         results: Iterations by trial id, oldest first.
         threshold: The env's own threshold; None: it has none.
     """
-    if spec.scheduler.type == "pbt":
+    if spec.scheduler.is_population:
         return None
     goal = goal_of(spec, threshold)
     return judge_settings(

@@ -6,7 +6,7 @@ import { counted, settingText } from "./format.js";
 const PREFIX = "point-";
 
 // Whether a point can be added to a sweep: something is searched, and trials keep their values while they train.
-export const takesPoints = (spec) => Object.keys(spec?.space ?? {}).length > 0 && spec.scheduler?.type !== "pbt";
+export const takesPoints = (spec) => Object.keys(spec?.space ?? {}).length > 0 && !["pbt", "pb2"].includes(spec.scheduler?.type);
 
 export function pointDialog({ name, spec, trials, post }) {
   const start = bestPoint(trials);
