@@ -82,11 +82,10 @@ def length_problems(spec: SweepFields) -> list[tuple[str, str]]:
     if ends is None:
         return []
     place, (shortest, longest) = f"space.{TRAINING_LENGTH}", ends
-    if spec.scheduler.type in ("pbt", "hyperband"):
-        why = {
-            "pbt": "whose trials go on from copies of others, so that none has a length of its own",
-            "hyperband": "which compares trials that have come equally far: use asha",
-        }[spec.scheduler.type]
+    if spec.scheduler.waits_for_others:
+        why = "which compares trials that have come equally far: use asha"
+        if spec.scheduler.is_population:
+            why = "whose trials go on from copies of others, so that none has a length of its own"
         return [(place, f"cannot be used with scheduler.type {spec.scheduler.type}, {why}")]
     found = []
     cap, grace = spec.stop.num_env_steps, spec.scheduler.grace_env_steps
