@@ -70,12 +70,12 @@ def test_a_run_is_the_same_again_and_another_number_is_another_run() -> None:
 def test_what_does_not_act_is_not_in_a_point(method: str) -> None:
     _, asked = played(method, 0, task=TASKS["cartpole-dqn"])
     points = [item.point for wanted in asked for item in wanted]
-    for name, acts in (
-        ("target_update_freq", lambda point: point["target_network"]),
-        ("prioritized_alpha", lambda point: point["replay"] == "prioritized"),
+    for name, parent, value in (
+        ("target_update_freq", "target_network", True),
+        ("prioritized_alpha", "replay", "prioritized"),
     ):
         assert {name in point for point in points} == {True, False}
-        assert all((name in point) is bool(acts(point)) for point in points)
+        assert all((name in point) is (point[parent] == value) for point in points)
 
 
 def test_a_seed_that_failed_makes_its_point_the_worst() -> None:
