@@ -62,8 +62,8 @@ def near_text(front: FrontRecord) -> str:
         return "No episode was whole before training, so only what scores as the best does is near it."
     return (
         f"Near the best is a setting that loses at most {100 * front.near_share:.0f} % of what the best one gained on "
-        f"the untrained policies' {return_text(front.untrained)}: one whose mean, drawn back to that of all settings, is "
-        f"{return_text(front.near_score)} or more."
+        f"the untrained policies' {return_text(front.untrained)}: one whose mean, drawn back to that of all settings, "
+        f"is {return_text(front.near_score)} or more."
     )
 
 

@@ -164,8 +164,11 @@ def test_what_can_not_act_in_a_short_training_is_noted_of_that_one() -> None:
 
 def test_what_follows_from_a_sweep_has_the_length_of_the_setting() -> None:
     made = ppo_sweep()
+    assert made.best is not None
+    assert made.best.settings is not None
+    best_ids = made.best.settings.best.trial_ids
     for index, trial in enumerate(made.trials):
-        point = trial.point | {TRAINING_LENGTH: [10_000, 25_000, 50_000][trial.point_index % 3]}
+        point = trial.point | {TRAINING_LENGTH: 10_000 if trial.trial_id in best_ids else 50_000}
         made.trials[index] = trial.model_copy(update={"point": point})
     space = {**made.sweep.spec["space"], TRAINING_LENGTH: {"choice": [10_000, 25_000, 50_000]}}
     made = with_spec(made, space=space)
@@ -173,6 +176,7 @@ def test_what_follows_from_a_sweep_has_the_length_of_the_setting() -> None:
     assert source.settings is not None
     best = next(trial for trial in made.trials if trial.trial_id in source.settings.best.trial_ids)
     length = best.point[TRAINING_LENGTH]
+    assert length == 10_000
     ranking = [item.model_copy(update={"point": best.point}) for item in source.settings.ranking]
     settings = source.settings.model_copy(update={"ranking": tuple(ranking)})
     made.best = made.best and made.best.model_copy(update={"settings": settings})
