@@ -239,6 +239,17 @@ def test_grids_may_depend_on_draws_where_they_are_lists_to_choose_from() -> None
     assert load_spec({**DQN, "space": space, "search": "tpe", "num_samples": 20}).space["prioritized_alpha"].when
 
 
+@pytest.mark.parametrize("scheduler", ["none", "pbt"])
+def test_a_chain_or_a_loop_of_names_that_there_are_not_is_told_as_such(scheduler: str) -> None:
+    number = 3_000
+    chain = {
+        f"n{i}": {"choice": [1, 2], **({"when": {f"n{i + 1}": 1}} if i < number else {})} for i in range(number + 1)
+    }
+    assert "dqn has no hyperparameter 'n7'" in refused(chain, scheduler=scheduler)
+    loop = {"x": {"grid": [1, 2], "when": {"y": 1}}, "y": {"grid": [1, 2], "when": {"x": 1}}}
+    assert "dqn has no hyperparameter 'x'" in refused(loop, scheduler=scheduler)
+
+
 # -- what else a sweep file says
 
 

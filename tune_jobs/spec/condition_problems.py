@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from analysis.records import TRAINING_LENGTH
 from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.suggestions import did_you_mean
@@ -31,9 +32,12 @@ def condition_problems(
         fixed: Fixed values by name.
         space: Domains by name.
         are_grids_tried: Whether each combination of the grids is tried, not drawn.
-        unread: Names of the space whose domains are wrong, so that nothing can be said of conditions on them.
+        unread: Names of the space whose domains are wrong, so that nothing can be said of conditions on them; nor can
+            it of those on names that the algorithm does not have.
     """
     given = _Given(algorithm, fixed, space, are_grids_tried=are_grids_tried)
+    known = {*HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields, TRAINING_LENGTH}
+    unread = {*unread, *(name for name in space if name not in known)}
     problems: list[Problem] = []
     readable: dict[str, Domain] = {}
     for name, domain in space.items():
@@ -44,7 +48,7 @@ def condition_problems(
             for place, text in _problems_of(given, name, other, values)
         ]
         problems += found
-        is_known = not found and not any(other in unread for other in domain.when or {})
+        is_known = not found and name not in unread and not any(other in unread for other in domain.when or {})
         readable[name] = domain if is_known else domain.model_copy(update={"when": None})
     loops = list(_loops(readable))
     return problems + loops if loops else problems + list(_contradictions(readable))

@@ -75,16 +75,15 @@ def named_values(domain: Domain, given: Any) -> tuple[Any, ...]:
 def in_order(space: Mapping[str, Domain]) -> list[str]:
     """Return the names of a space without loops so that each comes after those that it depends on."""
     found: dict[str, None] = {}
-
-    def add(name: str) -> None:
-        for other in space[name].when or {}:
-            if other not in found:
-                add(other)
-        found[name] = None
-
-    for name in space:
-        if name not in found:
-            add(name)
+    # Without recursion, as a file may chain more names than Python nests calls.
+    waiting = list(reversed(space))
+    while waiting:
+        name = waiting[-1]
+        ahead = [other for other in space[name].when or {} if other not in found]
+        if ahead:
+            waiting += ahead
+        else:
+            found[waiting.pop()] = None
     return list(found)
 
 

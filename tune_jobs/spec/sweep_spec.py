@@ -53,8 +53,9 @@ class SweepSpec(SweepFields):
             spec.algorithm, spec.hyperparams, spec.space, are_grids_tried=spec.search.type == "random"
         )
         problems = hyperparam_problems(spec.algorithm, spec.hyperparams, spec.space) + of_conditions
-        # Points are counted there, which takes conditions that are right.
-        problems += _section_problems(spec) if not of_conditions else []
+        # Points are counted there, which takes conditions that are right; those of unknown names were not looked at.
+        if not problems or not any(domain.when for domain in spec.space.values()):
+            problems += _section_problems(spec)
         if problems:
             raise WrongSpecError.of("SweepSpec", problems)
         return spec
