@@ -206,6 +206,15 @@ class TestImportance:
         assert [level.adjusted for level in levels] == pytest.approx([level.mean for level in levels], abs=0.5)
         assert mattered.interactions == ()
 
+    def test_points_in_which_it_does_not_act_move_none_of_its_means(self) -> None:
+        def score(point: dict[str, Any], elsewhere: float) -> float:
+            return 20.0 * point["alpha"] if "alpha" in point else elsewhere
+
+        for elsewhere in (10.0, 1000.0):
+            mattered = sweep_of(conditional(80), partial(score, elsewhere=elsewhere), space=CONDITIONAL).mattered
+            levels = effect_of(mattered, "alpha").levels
+            assert [level.adjusted for level in levels] == pytest.approx([level.mean for level in levels], abs=30.0)
+
     def test_a_listed_value_that_does_not_act_is_no_level(self) -> None:
         space = {**CONDITIONAL, "alpha": {"choice": [0.2, 0.6], "when": {"replay": "prioritized"}}}
         points = [
