@@ -76,7 +76,7 @@ def in_order(space: Mapping[str, Domain]) -> list[str]:
     """Return the names of a space without loops so that each comes after those that it depends on."""
     found: dict[str, None] = {}
     # Without recursion, as a file may chain more names than Python nests calls.
-    waiting = list(reversed(space))
+    waiting = list(space)[::-1]
     while waiting:
         name = waiting[-1]
         ahead = [other for other in space[name].when or {} if other not in found]
