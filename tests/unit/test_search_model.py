@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from tune_jobs.search.asking import Question
+from tune_jobs.search.candidates import _settled
 from tune_jobs.search.coordinates import Cube
 from tune_jobs.search.gaussian_process import Observed, Posterior, Settings, _expected, _loss, _squares_by_group, fit
 from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.improvement import log_expected_improvement
+from tune_jobs.search.parts import Parts
 from tune_jobs.search.proposal import next_point
 from tune_jobs.search.warped import observed, warped
 from tune_jobs.spec.domains import DOMAIN_KINDS, Domain
@@ -245,3 +248,26 @@ def test_where_all_fail_or_all_are_equal_points_are_still_proposed() -> None:
         point = next_point("gp", SPACE, tried, 12, seed=0)
         assert point.keys() == SPACE.keys()
         assert json.loads(json.dumps(point)) == point
+
+
+def test_what_does_not_act_has_one_value_for_the_model_whatever_was_looked_at() -> None:
+    space = {
+        name: TypeAdapter(Domain).validate_python(domain)
+        for name, domain in {
+            "replay": {"choice": ["uniform", "prioritized"]},
+            "alpha": {"uniform": [0, 1], "when": {"replay": "prioritized"}},
+            "layers": {"layers": {"number": [1, 3], "sizes": [8, 16, 32]}},
+            "lr": {"uniform": [0, 1]},
+        }.items()
+    }
+    parts = Parts(space)
+    cube = Cube(parts.space)
+    places = np.random.default_rng(0).random((200, cube.num_sides))
+    settled = _settled(cube, Question(parts.space, [], 0, 0, parts), places)
+    for before, after in zip(places, settled, strict=True):
+        values = cube.point(before)
+        assert cube.point(after) == parts.values_of(parts.point_of(values))
+        names = [name in parts.acting(values) for name in parts.space]
+        assert (after[names] == before[names]).all()
+    assert len({tuple(place[1:2]) for place in settled}) < 150
+    assert (_settled(cube, Question(parts.space, [], 0, 0), places) == places).all()

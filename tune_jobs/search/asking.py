@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tune_jobs.search.history import KnownPoint
+from tune_jobs.search.parts import Parts
 from tune_jobs.spec.domains import Domain
 
 Check = Callable[[dict[str, Any]], object]
@@ -25,6 +26,8 @@ class Question:
     """How many points the search gave before: the random numbers of the answer belong to it."""
     seed: int
     """The sweep's seed."""
+    parts: Parts | None = None
+    """Which names act in which point; None: all do in each."""
 
 
 Method = Callable[[Question, Check], dict[str, Any]]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.errors import SpecError
-from tune_jobs.search.asking import Check
+from tune_jobs.search.asking import Check, Question
 from tune_jobs.search.coordinates import Cube
 
 Floats = NDArray[np.float64]
@@ -25,10 +25,10 @@ _NUM_CHECKED = 100
 
 def best_point(
     cube: Cube,
+    question: Question,
     promise: Callable[[Floats], Floats],
     near: Floats,
     *,
-    tried: Sequence[Mapping[str, Any]],
     rng: np.random.Generator,
     check: Check,
 ) -> dict[str, Any]:
@@ -36,9 +36,9 @@ def best_point(
 
     Args:
         cube: The search space.
+        question: What is asked.
         promise: Returns what the model promises of places, by their columns; the higher the better.
         near: Good places, shape (any, num_sides), whose surroundings are looked at more closely.
-        tried: The points that were tried.
         rng: Draws the places.
         check: Raises SpecError for a point that is not valid.
 
@@ -46,13 +46,29 @@ def best_point(
         SpecError: None of many points is valid.
     """
     places = np.concatenate([rng.random((_NUM_RANDOM, cube.num_sides)), _steps(cube, near, 0.2, rng)])
+    places = _settled(cube, question, places)
     promises = promise(cube.columns(places))
     for width in 0.1 / 4.0 ** np.arange(_ROUNDS):
         leading = places[np.argsort(-promises, kind="stable")[:8]]
-        more = _steps(cube, leading, width, rng)
+        more = _settled(cube, question, _steps(cube, leading, width, rng))
         places, promises = np.concatenate([places, more]), np.concatenate([promises, promise(cube.columns(more))])
     best_first = places[np.argsort(-promises, kind="stable")]
-    return _first_valid(cube, best_first, tried, rng, check)
+    return _first_valid(cube, best_first, [point.point for point in question.known], rng, check)
+
+
+def _settled(cube: Cube, question: Question, places: Floats) -> Floats:
+    """Return places with the values that points have of what does not act in them; a model would take others for new.
+
+    Which names act is asked once for each combination of values that decide it.
+    """
+    if question.parts is None:
+        return places
+    names = list(question.space)
+    deciding = np.isin(cube.group_of_column, [names.index(name) for name in question.parts.deciding])
+    _, first, kinds = np.unique(cube.columns(places)[:, deciding], axis=0, return_index=True, return_inverse=True)
+    acting = [question.parts.acting(cube.point(places[index])) for index in first]
+    acts = np.array([[name in each for name in names] for each in acting])
+    return np.where(acts[kinds.ravel()], places, cube.units([question.parts.values_of({})]))
 
 
 def _steps(cube: Cube, origins: Floats, width: float, rng: np.random.Generator) -> Floats:

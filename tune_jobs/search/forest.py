@@ -38,7 +38,6 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     from sklearn.ensemble import RandomForestRegressor
 
     rng = random_streams.model_draws(question.seed, question.index)
-    tried = [point.point for point in question.known]
     if rng.random() < _RANDOM_SHARE:
         try:
             point = draw_point(question.space, question.index, question.seed)
@@ -73,4 +72,4 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
         return log_expected_improvement(said.mean(0), np.maximum(said.std(0), _LEAST_DEVIATION), best)
 
     near = units[np.argsort(-expected, kind="stable")[:10]]
-    return best_point(cube, promise, near, tried=tried, rng=rng, check=check)
+    return best_point(cube, question, promise, near, rng=rng, check=check)

@@ -52,8 +52,7 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     def promise(columns: Floats) -> Floats:
         return log_expected_improvement(*posterior.at(columns), best)
 
-    tried = [point.point for point in question.known]
-    return best_point(cube, promise, near, tried=tried, rng=rng, check=check)
+    return best_point(cube, question, promise, near, rng=rng, check=check)
 
 
 def _settings(cube: Cube, known: Sequence[KnownPoint]) -> Settings:

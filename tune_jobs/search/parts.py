@@ -49,6 +49,16 @@ class Parts:
             values |= {number_of(name): len(sizes)} | {size_of(name, index): size for index, size in enumerate(sizes)}
         return {name: values[name] for name in self.space if name in values}
 
+    @property
+    def deciding(self) -> tuple[str, ...]:
+        """The names on whose values it depends which names act."""
+        needed = {name for domain in self._given.values() for name in domain.when or ()}
+        return tuple(name for name in self.space if name in needed or name in map(number_of, self._layers))
+
+    def acting(self, values: Mapping[str, Any]) -> set[str]:
+        """Return the names that act where each name has a value."""
+        return set(self.known_values_of(self.point_of(values)))
+
     def point_of(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the point with a value of each name; what does not act is left out."""
         known = {

@@ -148,5 +148,5 @@ def next_point(
         return propose(Question(space, known, index, seed), check)
     seen = [replace(item, point=parts.values_of(item.point)) for item in known]
     return parts.point_of(
-        propose(Question(parts.space, seen, index, seed), lambda values: check(parts.point_of(values)))
+        propose(Question(parts.space, seen, index, seed, parts), lambda values: check(parts.point_of(values)))
     )
