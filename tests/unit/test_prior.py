@@ -172,7 +172,7 @@ def test_a_wrong_field_is_refused(changes: dict[str, Any], words: str) -> None:
 
 
 def test_what_is_not_there_and_a_place_where_only_names_are_read_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(NotFoundError, match="first"):
+    with pytest.raises(NotFoundError, match="prior: No sweep 'first'"):
         begun(tmp_path)
     spec = make_spec(prior=str(tmp_path / "first"), search="gp")
     with pytest.raises(SpecError, match="no name of a sweep"):

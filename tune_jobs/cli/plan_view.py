@@ -108,7 +108,8 @@ def _resources(cpus: float, gpus: float) -> str:
 def _search_fact(spec: SweepSpec) -> str:
     if not spec.search.has_model:
         return "random draws for each combination of the grids"
-    return f"{spec.search.type}: its model proposes points once {spec.search.num_startup_trials} have ended"
+    ended = f"{spec.search.num_startup_trials} have ended" + (", those of prior among them" if spec.prior else "")
+    return f"{spec.search.type}: its model proposes points once {ended}"
 
 
 def _confirm_fact(race: Race | None) -> str:

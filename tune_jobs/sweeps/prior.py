@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from analysis.records import PriorRecord
-from policies.errors import SpecError, shortened
+from policies.errors import NotFoundError, SpecError, shortened
 from tune_jobs.search.prior import prior_record
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sections import NAME_PATTERN
@@ -34,6 +34,9 @@ def read_priors(spec: SweepSpec, storage: str | Path | None, *, by_name: bool = 
                 f"prior: {shortened(sweep)} is no name of a sweep, and places are not read here.",
                 "Name a sweep of this service.",
             )
-        store = find_sweep(sweep, storage)
+        try:
+            store = find_sweep(sweep, storage)
+        except NotFoundError as error:
+            raise NotFoundError(f"prior: {error.message}", error.hint) from error
         found.append(prior_record(spec, store.name, stored_spec(store.read_record()), store.read_trials()))
     return tuple(found)
