@@ -112,3 +112,22 @@ def test_a_sweep_that_could_not_be_written_while_the_queue_was_away_is_made_anew
     assert submit(client, headers=KEY) == 201
     (job,) = service.queue.jobs()
     assert job.state == "waiting"
+
+
+@pytest.mark.parametrize(
+    ("fields", "status", "words"),
+    [
+        ({"points": [{"lr": "fast"}]}, 422, "points[0]: lr: 'fast' is not a number"),
+        ({"points": [{"lr": 1e-3}]}, 201, ""),
+        ({"search": "gp", "num_samples": 20, "prior": "../elsewhere"}, 422, "no name of a sweep"),
+        ({"search": "gp", "num_samples": 20, "prior": "missing"}, 422, "prior: No sweep 'missing'"),
+        ({"prior": "missing"}, 422, "prior: is for a model"),
+    ],
+)
+def test_points_and_earlier_sweeps_are_checked_and_places_are_not_read(
+    fields: dict[str, Any], status: int, words: str, client: TestClient
+) -> None:
+    spec = {**FAKE, "space": {"lr": {"loguniform": [1e-4, 1e-2]}}, **fields}
+    answer = client.post("/api/v1/sweeps", json={"spec": spec})
+    assert answer.status_code == status, answer.text
+    assert words in answer.json().get("detail", "")

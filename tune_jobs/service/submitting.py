@@ -197,7 +197,11 @@ class Submitter:
                 "Choose one that the service's operator allows (serve --env).",
             )
         try:
-            plan = make_plan(spec, self._machine(spec), prior=read_priors(spec, self._config.storage, by_name=True))
+            prior = read_priors(spec, self._config.storage, by_name=True)
+            plan = make_plan(spec, self._machine(spec), prior=prior)
+        except NotFoundError as error:
+            # What is asked for is there; what its sweep names is not.
+            raise SpecError(error.message, error.hint) from error
         except CannotRunError as error:
             raise DoesNotFitError(error.message, error.hint) from error
         limits = self._config.limits
