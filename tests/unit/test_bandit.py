@@ -40,10 +40,12 @@ def test_it_does_better_than_mutations_where_the_best_values_drift() -> None:
 
 def gains_at(domain: Any, best: float, *, num: int = 40, time: int = 1) -> list[Gain]:
     """Gains that fall with the distance from the best place of a range, from 0 to 1, in its scale."""
-    from tune_jobs.search.bandit import _unit, _value
-
-    values = [_value(domain, unit) for unit in np.linspace(0, 1, num)]
-    return [Gain(time, 0.0, 1.0 - abs(_unit(domain, value) - best), {"x": value}) for value in values]
+    low, high = domain.codes
+    ends = np.log([low, high]) if domain.has_log_codes else np.array([low, high])
+    codes = ends[0] + np.linspace(0, 1, num) * (ends[1] - ends[0])
+    values = [domain.of_code(float(code)) for code in (np.exp(codes) if domain.has_log_codes else codes)]
+    places = np.linspace(0, 1, num)
+    return [Gain(time, 0.0, 1.0 - abs(place - best), {"x": value}) for place, value in zip(places, values, strict=True)]
 
 
 @pytest.mark.parametrize(
