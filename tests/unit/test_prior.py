@@ -160,9 +160,10 @@ def test_a_population_and_a_sweep_in_which_nothing_has_ended_tell_nothing(tmp_pa
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"prior": "first"}, "prior: is for a model, and search.type is random"),
+        ({"prior": "first"}, "prior: is for a search that learns, and search.type is random"),
         ({"prior": ["a", "b", "a"], "search": "gp"}, "prior: names 'a' twice"),
         ({"prior": 3, "search": "gp"}, "prior"),
+        ({"prior": "", "search": "gp"}, "prior"),
         ({"prior": {"a": 1}, "search": "gp"}, "prior"),
     ],
 )

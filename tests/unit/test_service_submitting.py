@@ -121,7 +121,7 @@ def test_a_sweep_that_could_not_be_written_while_the_queue_was_away_is_made_anew
         ({"points": [{"lr": 1e-3}]}, 201, ""),
         ({"search": "gp", "num_samples": 20, "prior": "../elsewhere"}, 422, "no name of a sweep"),
         ({"search": "gp", "num_samples": 20, "prior": "missing"}, 422, "prior: No sweep 'missing'"),
-        ({"prior": "missing"}, 422, "prior: is for a model"),
+        ({"prior": "missing"}, 422, "prior: is for a search that learns"),
     ],
 )
 def test_points_and_earlier_sweeps_are_checked_and_places_are_not_read(

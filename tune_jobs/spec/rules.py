@@ -43,7 +43,7 @@ def search_problems(spec: SweepFields) -> Found:
     if spec.search.has_model:
         found += _model_problems(spec)
     elif spec.prior:
-        text = f"is for a model, and search.type is {spec.search.type}: set search: auto, or leave prior out"
+        text = f"is for a search that learns, and search.type is {spec.search.type}: set search: auto, or leave it out"
         found.append(("prior", text))
     if twice := [sweep for index, sweep in enumerate(spec.prior) if sweep in spec.prior[:index]]:
         found.append(("prior", f"names {twice[0]!r} twice: name it once"))

@@ -327,7 +327,7 @@ class SweepFields(Section):
     search: Annotated[SearchSpec, _from_text("type")] = Field(
         default_factory=SearchSpec, description="Search method: random, auto, gp, forest or tpe, or a mapping."
     )
-    prior: Annotated[tuple[str, ...], BeforeValidator(_one_or_several)] = Field(
+    prior: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], BeforeValidator(_one_or_several)] = Field(
         (),
         description="Earlier sweeps, by name or place, whose points the model begins with: of the same algorithm and "
         "space, and of any environment. They are copied when the sweep is created.",
