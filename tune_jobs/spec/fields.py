@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -13,6 +13,19 @@ Flag = Annotated[bool, Field(strict=True)]
 PositiveWhole = Annotated[WholeNumber, Field(ge=1)]
 NonNegativeWhole = Annotated[WholeNumber, Field(ge=0)]
 PositiveNumber = Annotated[Number, Field(gt=0)]
+NameText = Annotated[str, Field(min_length=1)]
+"""A text of at least one letter."""
+
+
+def name_or_flag(value: Any) -> Any:
+    """Let through a name, true, false and null, and refuse the rest in one sentence.
+
+    Raises:
+        ValueError: It is none of these.
+    """
+    if value is None or isinstance(value, bool) or (isinstance(value, str) and value):
+        return value
+    raise ValueError(f"{value!r} is not allowed: it should be a name, true or false")
 
 
 class Section(BaseModel):

@@ -23,7 +23,7 @@ from tune_jobs.spec.atari import AtariSpec, atari_from_a_flag
 from tune_jobs.spec.domain_kinds import Number, WholeNumber
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import ENGINES
-from tune_jobs.spec.fields import Flag, NonNegativeWhole, PositiveNumber, PositiveWhole, Section
+from tune_jobs.spec.fields import Flag, NameText, NonNegativeWhole, PositiveNumber, PositiveWhole, Section, name_or_flag
 from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
 SearchType = Literal["random", "auto", "gp", "forest", "tpe"]
@@ -62,7 +62,7 @@ class EnvSpec(Section):
     pixels: Flag = Field(
         default=False, description="Observe small grey images of what the env renders, not its numbers."
     )
-    action_mask: Annotated[str, Field(min_length=1)] | Flag | None = Field(
+    action_mask: Annotated[NameText | bool | None, BeforeValidator(name_or_flag)] = Field(
         None,
         description="The name of what says which actions are allowed: a member of Dict observations, a method, or an "
         "info of reset and step. true: a member action_mask, the method that MaskablePPO asks for, or an info "
