@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from analysis.front_words import cheapest_near_text, front_rows, interval_text, near_text, undecided_text
 from analysis.page.scores import score_means
 from analysis.page.source import Source
+from analysis.points import searched_names, value_text
 from analysis.report_tables import Cell, Table
 from analysis.tables import cell_value
 from analysis.wording import NONE, number, return_text
@@ -35,7 +36,8 @@ def section(source: Source) -> Front:
         return Front("", [], Table([], []))
     front = settings.front
     several = front.num_undecided is not None
-    names = list(settings.best.point)
+    # A name that does not act in the best setting may act in another.
+    names = searched_names(item.point for item, _ in front_rows(front))
     headings = ["env steps", f"score {score_means(settings)}", *(["95 % interval over training seeds"] * several)]
     headings += ["rank by score", *names, "seeds", "on the front"]
     rows = []
@@ -49,8 +51,8 @@ def section(source: Source) -> Front:
             Cell(item.rank, str(item.rank)),
         ]
         for name in names:
-            value = cell_value(item.point.get(name))
-            cells.append(Cell(value, number(value)))
+            told_value = value_text(item.point, name, lambda known: number(cell_value(known)), NONE)
+            cells.append(Cell(cell_value(item.point.get(name)), told_value))
         rows.append(
             [*cells, Cell(item.num_seeds, str(item.num_seeds)), Cell(told, told, "" if row.is_on_front else "pending")]
         )

@@ -12,8 +12,15 @@
   const ramp = () => [0, 1, 2, 3, 4].map((i) => color("ramp-" + i));
   const category = (i) => color(i < 6 ? "series-" + i : "muted");
   const known = (values) => values.filter((value) => value !== null);
-  const short = (value) => (Math.abs(value) >= 1e6 || (value && Math.abs(value) < 1e-3)
-    ? value.toExponential(2).replace(/\.?0+e/, "e").replace("e+", "e") : String(+value.toPrecision(4)));
+  const rounded = (value, digits) => (Math.abs(value) >= 1e6 || (value && Math.abs(value) < 1e-3)
+    ? value.toExponential(digits - 2).replace(/\.?0+e/, "e").replace("e+", "e") : String(+value.toPrecision(digits)));
+  const short = (value) => rounded(value, 4);
+  // As many digits as tell the ticks of an axis apart; where its ends are not given, they are round numbers themselves.
+  const ticks = (axis) => {
+    const [low, high] = [axis.low, axis.high], size = Math.max(Math.abs(low), Math.abs(high));
+    const digits = low < high ? Math.min(12, Math.max(4, 3 + Math.ceil(Math.log10(size / (high - low))))) : 8;
+    return (value) => rounded(value, digits);
+  };
   const steps = (value) => {
     const [size, letter] = value >= 1e9 ? [1e9, "G"] : value >= 1e6 ? [1e6, "M"] : value >= 1e3 ? [1e3, "k"] : [1, ""];
     return +(value / size).toPrecision(4) + letter;
@@ -37,7 +44,7 @@
       type: axis.kind === "log" ? "log" : "value", scale: true, min: axis.low, max: axis.high,
       name: axis.name, nameLocation: vertical ? "end" : "middle", nameGap: vertical ? 12 : 26,
       nameTextStyle: { color: color("ink"), align: vertical ? "left" : "center" },
-      axisLabel: { color: color("ink"), hideOverlap: true, formatter: /env steps/.test(axis.name) ? steps : short },
+      axisLabel: { color: color("ink"), hideOverlap: true, formatter: /env steps/.test(axis.name) ? steps : ticks(axis) },
       axisLine: { show: !vertical, onZero: false, lineStyle: { color: color("muted") } }, axisTick: { show: false },
       splitLine: { lineStyle: { color: color("grid") } }, splitNumber: narrow ? 3 : 5,
     };

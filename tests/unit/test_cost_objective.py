@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from report_sources import source_of
+from rich.console import Console
 from spec_errors import errors
 from synthetic_sweep import Synthetic, make_sweep
 
@@ -14,6 +15,7 @@ from analysis.page import front
 from analysis.settings import judge_settings
 from policies.errors import SpecError
 from tests.narrowing import present
+from tune_jobs.cli import output
 from tune_jobs.spec.file import json_schema, load_spec
 from tune_jobs.spec.rules import idle_settings
 
@@ -103,6 +105,32 @@ def test_the_page_and_its_chart_show_the_front() -> None:
     assert lines["the front"].y[:-1] == tuple(item.expected for item in found.points)
     drawn = {name: len(line.x) for name, line in lines.items() if name in ("other settings", "may be on the front")}
     assert sum(drawn.values()) + found.num_on_front == present(settings).num_settings
+
+
+def test_what_does_not_act_is_an_empty_cell_though_it_does_not_act_in_the_best(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The best setting lacks a name that the cheapest has."""
+    points = [{"lr": 0.1}, {"lr": 0.2, "adam_beta1": 0.5}]
+    made = with_cost(make_sweep(points=points, seeds_per_point=2))
+    settings = present(
+        judge_settings(made.trials, made.results, num_env_steps=50_000, threshold=195.0, cost="env_steps")
+    )
+    front_of = present(settings.front)
+    item = front_of.cheapest_near
+    both = tuple(
+        item.model_copy(update={"point": point, "point_index": index, "num_env_steps": 1000.0 * (index + 1)})
+        for index, point in enumerate(points)
+    )
+    best = settings.best.model_copy(update={"point": points[0], "point_index": 0})
+    found = front_of.model_copy(update={"points": both, "undecided": (), "cheapest_near": both[1]})
+    settings = settings.model_copy(update={"front": found, "best": best})
+    table = front.section(source_of(made, settings)).table
+    at = table.headings.index("adam_beta1")
+    assert [row[at].text for row in table.rows] == ["", "0.5"]
+    output._print_front(Console(width=200), settings)
+    assert "adam_beta1" in (shown := capsys.readouterr().out)
+    assert "None" not in shown
 
 
 def test_who_does_not_ask_for_cost_sees_nothing_of_it() -> None:

@@ -248,12 +248,14 @@ def _print_front(console: Console, settings: SettingsRecord | None) -> None:
     from rich.text import Text
 
     from analysis.front_words import front_rows, interval_text, near_text, undecided_text
+    from analysis.points import searched_names, value_text
 
     console.print()
-    names = list(settings.best.point)
+    # A name that does not act in the best setting may act in another.
+    names = searched_names(item.point for item, _ in front_rows(settings.front))
     table = make_table("env steps", "score", "95 % interval", "rank", *names, "seeds", "on the front")
     for item, told in front_rows(settings.front):
-        values = (setting_text(item.point.get(name)) for name in names)
+        values = (value_text(item.point, name) for name in names)
         cells = [f"{item.num_env_steps:,.0f}", return_text(item.score), interval_text(item, PLAIN_NONE), str(item.rank)]
         table.add_row(*map(Text, (*cells, *values, str(item.num_seeds), told)))
     console.print(table)
