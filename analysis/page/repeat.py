@@ -26,7 +26,7 @@ class Repeat:
     """The resolved sweep file."""
     command: str
     reproduce: str
-    """The command that runs one trial again and compares; empty: no trial has ended."""
+    """The command that runs one trial again and compares; empty: none has ended, or they are a population's."""
     hyperparams: Table
 
 
@@ -136,6 +136,8 @@ def _machines(source: Source) -> list[tuple[str, str]]:
 
 
 def _reproduce(source: Source) -> str:
+    if source.is_population:
+        return ""
     ended = [trial.trial_id for trial in source.trials if trial.status == "completed"]
     which = source.winner or next(iter(ended), None)
     return "" if which is None else f"tune-jobs reproduce {shlex.quote(shown_part(source.path, which))}"

@@ -278,6 +278,8 @@ def test_the_command_and_the_machine_are_told() -> None:
     found = repeat.section(source_of(synthetic))
     assert found.reproduce == f"tune-jobs reproduce sweep/{present(synthetic.best).checkpoint.trial_id}"
     assert repeat.section(source_of(make_sweep(failed=range(20)))).reproduce == ""
+    # A trial of a population went on from others' checkpoints, and `reproduce` refuses it.
+    assert repeat.section(source_of(with_spec(synthetic, scheduler={"type": "pb2"}))).reproduce == ""
     assert found.command == "tune-jobs launch cartpole-ppo-1.yaml --name cartpole-ppo-1-again"
     assert dict(found.facts)["CPU"] == "not recorded; other CPUs round differently"
     assert dict(found.facts)["python"] == "3.11.7"
