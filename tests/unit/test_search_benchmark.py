@@ -117,8 +117,8 @@ def test_the_tables_show_means_intervals_and_ranks() -> None:
 
     text = "\n".join(tables({("cartpole-dqn", "random"): kept(1, 2, 3), ("cartpole-dqn", "tpe"): kept(5, 5, 2)}))
     # The t distribution's 97.5 % quantile with 2 degrees of freedom is 4.303; the deviations are 1 and 1.732.
-    assert "| cartpole-dqn | 2.0 ± 2.5 | 4.0 ± 4.3 | 485.7 | 500 | 466.7 | 421.3 |" in text
-    assert "| cartpole-dqn | 0.0 ± 2.5 | 2.0 ± 4.3 |" in text
+    assert "| cartpole-dqn | 2.0 ± 2.5 (of 3) | 4.0 ± 4.3 (of 3) | 485.7 | 500 | 466.7 | 421.3 |" in text
+    assert "| cartpole-dqn | 0.0 ± 2.5 (of 3) | 2.0 ± 4.3 (of 3) |" in text
     assert "while tuning: random 1.67, tpe 1.33" in text
 
 

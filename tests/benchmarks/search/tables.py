@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from tests.benchmarks.search.runs import NUM_RUNS
 from tests.benchmarks.search.tasks import TASKS
 
 Kept = Mapping[tuple[str, str], dict[str, Any] | None]
@@ -53,10 +54,11 @@ def _table(kept: Kept, tasks: list[str], methods: list[str], what: str, *, publi
 
 def _cell(found: dict[str, Any], what: str) -> str:
     values = np.array(values_of(found, what))
+    of = "" if len(values) == NUM_RUNS else f" (of {len(values)})"
     if len(values) < 2 or not np.isfinite(values).all():
-        return f"{values.mean():.1f} ({len(values)} runs)"
+        return f"{values.mean():.1f}{of}"
     half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
-    return f"{values.mean():.1f} ± {half:.1f}"
+    return f"{values.mean():.1f} ± {half:.1f}{of}"
 
 
 def _ranks(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
