@@ -110,6 +110,24 @@ def test_no_training_is_made_twice_whenever_the_benchmark_is_killed(
     }  # fmt: skip
 
 
+def test_a_line_that_was_not_written_whole_is_made_again(tmp_path: Path) -> None:
+    file = tmp_path / "made.jsonl"
+    whole = json.dumps({"point": {"lr": 0.5}, "seed": 1, "return": 2.0}) + "\n"
+    for unfinished in ('{"point": {"lr": 0.', '{"point": {"lr": 0.25}, "seed": 1, "return": 3.0}'):
+        for before in ("", whole):
+            file.write_text(before + unfinished)
+            assert len(Trainings(TASK, file, 1)) == (before != "")
+            assert file.read_text() == before
+
+
+def test_what_no_point_is_to_blame_for_is_no_failed_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tune_jobs.training.packed import PackedEngine
+
+    monkeypatch.setattr(PackedEngine, "train_iteration", lambda _: {"t0000": OSError("the disk is full")})
+    with pytest.raises(OSError, match="the disk is full"):
+        module.train(TASK, [({"lr": 1e-3, "minibatch_size": 128}, 0)])
+
+
 def test_the_tables_show_means_intervals_and_ranks() -> None:
     def kept(*values: float) -> dict[str, Any]:
         runs = [{"scores": [value - 1, value], "best": {}, "test": value - 2} for value in values]

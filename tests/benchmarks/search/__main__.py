@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import platform
 from datetime import UTC, datetime
 from pathlib import Path
@@ -76,6 +77,8 @@ def main() -> None:
     parser.add_argument("--tables", action="store_true", help="train nothing")
     options = parser.parse_args()
     DATA.mkdir(exist_ok=True)
+    # Packs use a core each, and their processes take this from here.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for name in options.tasks or TASKS:
         if not options.tables:
             trainings = Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from policies.errors import TuneJobsError
+from policies.errors import NonFiniteWeightsError
 from tests.benchmarks.search.tasks import Task
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
@@ -51,7 +51,11 @@ class Trainings:
         self._task, self._file, self._num_processes = task, file, num_processes
         self._known: dict[str, float | None] = {}
         if file.exists():
-            for line in file.read_text().splitlines():
+            lines, _, unfinished = file.read_text().rpartition("\n")
+            if unfinished:
+                # It was killed while it wrote this one; what is written next must not stand behind it.
+                os.truncate(file, len(lines) + 1 if lines else 0)
+            for line in lines.splitlines():
                 row = json.loads(line)
                 self._known[Wanted(row["point"], row["seed"]).key] = row["return"]
 
@@ -72,7 +76,7 @@ class Trainings:
         packs = [missing[first : first + size] for first in range(0, len(missing), size)]
         context = multiprocessing.get_context("spawn")
         with (
-            ProcessPoolExecutor(self._num_processes, mp_context=context, initializer=_alone_on_a_core) as pool,
+            ProcessPoolExecutor(self._num_processes, mp_context=context, initializer=os.nice, initargs=(10,)) as pool,
             self._file.open("a") as file,
         ):
             futures = {
@@ -85,17 +89,15 @@ class Trainings:
                 file.flush()
 
 
-def _alone_on_a_core() -> None:
-    os.nice(10)
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-
-
 def train(task: Task, wanted: Sequence[tuple[dict[str, Any], int]]) -> list[float | None]:
-    """Train a pack and return each member's mean greedy return at its end; None: it failed.
+    """Train a pack and return each member's mean greedy return at its end; None: its weights are no numbers any more.
 
     Args:
         task: The task.
         wanted: Points and training seeds.
+
+    Raises:
+        Exception: Something else went wrong, of which no point is to blame.
     """
     from policies.acting.evaluate import Episodes, Evaluator
     from policies.acting.load import policy_from_portable
@@ -131,20 +133,18 @@ def train(task: Task, wanted: Sequence[tuple[dict[str, Any], int]]) -> list[floa
     while left:
         for name, stats in engine.train_iteration().items():
             if isinstance(stats, Exception):
-                found[name] = None
-            elif stats.num_env_steps >= spec.stop.num_env_steps:
+                raise stats
+            if stats.num_env_steps >= spec.stop.num_env_steps:
                 policies[name] = engine.policy(name)
-            else:
-                continue
-            engine.remove(name)
-            left.discard(name)
+                engine.remove(name)
+                left.discard(name)
     engine.close()
     evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, task.evaluation_seeds)
     acting = [policy_from_portable(portable) for portable in policies.values()]
     for name, episodes in zip(policies, evaluate_many(evaluator, acting), strict=True):
         if isinstance(episodes, Episodes):
             found[name] = episodes.mean_return
-        elif isinstance(episodes, TuneJobsError):
+        elif isinstance(episodes, NonFiniteWeightsError):
             found[name] = None
         else:
             raise episodes
