@@ -242,6 +242,23 @@ def test_a_space_of_few_points_is_tried_whole_before_one_is_tried_again(method: 
     assert len({json.dumps(item.point) for item in tried}) >= 5
 
 
+def test_a_point_is_not_tried_again_because_of_a_value_that_does_not_act_in_it() -> None:
+    space = {
+        name: TypeAdapter(Domain).validate_python(domain)
+        for name, domain in {
+            "replay": {"choice": ["none", "uniform", "prioritized"]},
+            "n_step": {"choice": [1, 2, 3]},
+            "alpha": {"loguniform": [0.01, 1], "when": {"replay": "prioritized"}},
+        }.items()
+    }
+    worth = {"none": 1.0, "uniform": 0.5, "prioritized": 0.0}
+    tried: list[KnownPoint] = []
+    for index in range(14):
+        point = next_point("gp", space, tried, index, seed=0, num_startup_trials=2)
+        tried.append(KnownPoint(point, (worth[point["replay"]] + 0.1 * point["n_step"],)))
+    assert len({json.dumps(item.point) for item in tried}) == 14
+
+
 def test_where_all_fail_or_all_are_equal_points_are_still_proposed() -> None:
     for score in (None, 0.0):
         tried = [KnownPoint(point, (score, score)) for point in drawn(12)]

@@ -6,7 +6,7 @@ As SMAC does it (Hutter et al. 2011, "Sequential Model-Based Optimization for Ge
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,7 @@ def best_point(
         more = _settled(cube, question, _steps(cube, leading, width, rng))
         places, promises = np.concatenate([places, more]), np.concatenate([promises, promise(cube.columns(more))])
     best_first = places[np.argsort(-promises, kind="stable")]
-    return _first_valid(cube, best_first, [point.point for point in question.known], rng, check)
+    return _first_valid(cube, question, best_first, rng, check)
 
 
 def _settled(cube: Cube, question: Question, places: Floats) -> Floats:
@@ -90,9 +90,19 @@ def _steps(cube: Cube, origins: Floats, width: float, rng: np.random.Generator) 
     return np.where(moves, moved, places)
 
 
+def _point_at(cube: Cube, question: Question, place: Floats) -> dict[str, Any]:
+    """Return the point at a place, with exactly the values that points have of what does not act in them.
+
+    There and back, a value of a log scale may change in its last digit, so that a tried point would look new.
+    """
+    point = cube.point(place)
+    return point if question.parts is None else question.parts.values_of(question.parts.point_of(point))
+
+
 def _first_valid(
-    cube: Cube, places: Floats, tried: Sequence[Mapping[str, Any]], rng: np.random.Generator, check: Check
+    cube: Cube, question: Question, places: Floats, rng: np.random.Generator, check: Check
 ) -> dict[str, Any]:
+    tried = [point.point for point in question.known]
     seen: list[dict[str, Any]] = []
     repeated: dict[str, Any] | None = None
     last_error: SpecError | None = None
@@ -103,7 +113,7 @@ def _first_valid(
             skipped += 1
             continue
         skipped = 0
-        point = cube.point(place)
+        point = _point_at(cube, question, place)
         # Places of a space with few values are often the same point.
         if point in seen or (point in tried and repeated is not None):
             continue
