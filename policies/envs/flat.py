@@ -172,15 +172,6 @@ def flattened(env: gym.Env[Any, Any]) -> Any:
         return env
 
 
-def is_flattened(env: gym.Env[Any, Any]) -> bool:
-    """Whether a wrapper of this environment makes vectors of its observations."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, FlatObservations):
-            return True
-        env = env.env
-    return False
-
-
 def leaves(space: gym.Space[Any], keys: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], gym.Space[Any]]]:
     """Yield the members of a space that have none themselves, each with the keys that lead to it."""
     if isinstance(space, gym.spaces.Dict):

@@ -26,21 +26,21 @@ from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.envs.faults import close_env, is_of_env
 from policies.envs.first_step import check_first_step
-from policies.envs.flat import FlatBox, UnsupportedMemberError, flattened, is_flattened, needs_flattening
+from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
-from policies.envs.masks import ACTION_MASK, masks_actions
+from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked
 from policies.envs.own_actions import (
     Choices,
+    TakesActions,
     UnsupportedActionsError,
     is_taken,
     made_of,
     sizes_of,
-    takes_own_actions,
 )
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
-from policies.envs.wrappers import FailurePenalty, ObservationWrappers
+from policies.envs.wrappers import FailurePenalty, ObservationWrappers, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
 
@@ -125,7 +125,8 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         env_id, spec = find_env(env_id)
         kwargs = dict(env_args or {})
         wrappers = ObservationWrappers.take_from(kwargs)
-        mask = masks_actions(env)
+        mask = wrapper_of(env, MasksActions)
+        is_changed = mask or wrapper_of(env, FlatObservations) or wrapper_of(env, TakesActions)
         info = EnvInfo(
             env_id=env_id,
             env_args=copy.deepcopy(dict(env_args or {})),
@@ -133,7 +134,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
             max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
-            has_vector_entry_point=not (wrappers.observes_images or is_flattened(env) or takes_own_actions(env) or mask)
+            has_vector_entry_point=not (wrappers.observes_images or is_changed)
             and takes_vector_entry_point(spec, kwargs),
             failure=failure_rule(env_id, spec, env.metadata, kwargs),
             mask=None if mask is None else mask.place,
@@ -212,7 +213,7 @@ def make_vector_env(
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
-            own = not (wrappers.observes_images or wrappers.action_mask)
+            own = not (wrappers.observes_images or may_be_masked(_creator(env_id, spec), wrappers.action_mask))
             env = own_vector_env(spec, num_envs, kwargs) if own else None
             if env is None:
                 if wrappers.pixels:

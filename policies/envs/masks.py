@@ -329,13 +329,9 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
     return MasksActions(env, space, source, name)
 
 
-def masks_actions(env: gym.Env[Any, Any]) -> MasksActions | None:
-    """Return the wrapper that observes an environment's mask; None: there is none."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, MasksActions):
-            return env
-        env = env.env
-    return None
+def may_be_masked(creator: Any, setting: Setting) -> bool:
+    """Whether what a class, or a function, makes may be masked, as a vectorised version of it would not be."""
+    return bool(setting) or (setting is None and hasattr(creator, METHOD))
 
 
 def check_setting(setting: Any) -> Setting:

@@ -175,15 +175,6 @@ def with_own_actions(env: gym.Env[Any, Any]) -> Any:
         return env
 
 
-def takes_own_actions(env: gym.Env[Any, Any]) -> bool:
-    """Whether a wrapper of this environment makes its own actions of what policies give."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, TakesActions):
-            return True
-        env = env.env
-    return False
-
-
 def sizes_of(space: gym.Space[Any]) -> tuple[int, ...]:
     """Return how many values each choice of an action has; empty if actions are no choices."""
     if isinstance(space, gym.spaces.Discrete):

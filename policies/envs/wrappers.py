@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -34,6 +34,7 @@ MAX_PIXELS = 64
 
 # Shares of red, green and blue in the perceived brightness (ITU-R BT.601).
 _LUMA = np.array([0.299, 0.587, 0.114])
+_Wrapper = TypeVar("_Wrapper", bound=gym.Wrapper[Any, Any, Any, Any])
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,15 @@ class ObservationWrappers:
     def wrap_vector(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> gym.vector.VectorEnv[Any, Any, Any]:
         """Return a vector environment with stacked frames; its sub-environments have the pixels already."""
         return StackFramesVector(env, self.frame_stack) if self.frame_stack > 1 else env
+
+
+def wrapper_of(env: gym.Env[Any, Any], kind: type[_Wrapper]) -> _Wrapper | None:
+    """Return the outermost wrapper of a kind around an environment; None: there is none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, kind):
+            return env
+        env = env.env
+    return None
 
 
 def with_wrappers(

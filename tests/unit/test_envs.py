@@ -10,6 +10,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
 from policy_factory import register_test_envs
 
 from policies.acting.baselines import ConstantPolicy
@@ -215,6 +216,23 @@ def test_a_vectorised_version_that_resets_at_another_time_is_not_used(mode: str,
     )
     try:
         assert check_env("TestVector-v0", None, "ppo").has_vector_entry_point == used
+    finally:
+        del gym.registry["TestVector-v0"]
+
+
+def test_a_vectorised_version_without_the_envs_mask_is_not_used() -> None:
+    class Masked(CartPoleEnv):
+        def action_masks(self) -> list[int]:
+            return [0, 1]
+
+    vectorised = cast("Any", CartPoleVectorEnv)
+    gym.register("TestVector-v0", cast("Any", Masked), vector_entry_point=vectorised, max_episode_steps=9)
+    cases: list[tuple[dict[str, Any], int]] = [({}, 6), ({"action_mask": False}, 4)]
+    try:
+        for args, size in cases:
+            info, envs = check_env("TestVector-v0", args), make_vector_env("TestVector-v0", args, 2)
+            assert info.observation_space.shape == envs.single_observation_space.shape == (size,)
+            assert info.has_vector_entry_point == isinstance(envs.unwrapped, CartPoleVectorEnv) == (size == 4)
     finally:
         del gym.registry["TestVector-v0"]
 
