@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import pytest
-from trials import make_task, run_trial
+from trials import make_task, run_trial, train_pack
 
 from policies.acting.evaluate import Evaluator
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, Policy
-from policies.portable.file import save_policy
 from tune_jobs.spec.sections import EvaluationSpec, StopSpec
 
 if TYPE_CHECKING:
@@ -62,22 +61,11 @@ def return_on_the_envs_own_observations(policy: Policy, kind: str) -> float:
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_pack_learns_from_it(kind: str, algorithm: str, tmp_path: Path) -> None:
-    from tune_jobs.training.packed import PackedEngine
-
-    engine = PackedEngine()
     tasks = [task_of(tmp_path, algorithm, kind, seed) for seed in range(3)]
-    for task in tasks:
-        engine.add(task, None)
-    for _ in range(NUM_ITERATIONS):
-        for stats in engine.train_iteration().values():
-            assert not isinstance(stats, Exception), stats
-    for trial_id in (task.trial_id for task in tasks):
-        save_policy(engine.policy(trial_id), tmp_path / trial_id)
-        policy = load_policy(tmp_path / trial_id)
+    for policy in train_pack(tasks, tmp_path, NUM_ITERATIONS):
         assert return_on_the_envs_own_observations(policy, kind) >= LEARNED
         with Evaluator("TestSecret-v0", {"kind": kind}, SEEDS) as evaluator:
             assert evaluator.run(policy).mean_return >= LEARNED
-    engine.close()
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])

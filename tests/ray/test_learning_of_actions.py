@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import pytest
 from test_learning_from_spaces import NUM_ITERATIONS, SEEDS, VALUES
-from trials import make_task, run_trial
+from trials import make_task, run_trial, train_pack
 
 from policies.acting.evaluate import Evaluator
 from policies.acting.load import load_policy
 from policies.errors import EnvError
-from policies.portable.file import save_policy
 from tune_jobs.spec.sections import EvaluationSpec, StopSpec
 
 if TYPE_CHECKING:
@@ -78,19 +77,9 @@ def check(policy: Policy, case: str) -> None:
 
 @pytest.mark.parametrize(("algorithm", "case"), PAIRS)
 def test_a_pack_learns_it(algorithm: str, case: str, tmp_path: Path) -> None:
-    from tune_jobs.training.packed import PackedEngine
-
-    engine = PackedEngine()
     tasks = [task_of(tmp_path, algorithm, case, seed) for seed in range(2)]
-    for task in tasks:
-        engine.add(task, None)
-    for _ in range(NUM_ITERATIONS):
-        for stats in engine.train_iteration().values():
-            assert not isinstance(stats, Exception), stats
-    for trial_id in (task.trial_id for task in tasks):
-        save_policy(engine.policy(trial_id), tmp_path / trial_id)
-        check(load_policy(tmp_path / trial_id), case)
-    engine.close()
+    for policy in train_pack(tasks, tmp_path, NUM_ITERATIONS):
+        check(policy, case)
 
 
 @pytest.mark.parametrize(

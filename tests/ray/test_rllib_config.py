@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import dqn_cases  # noqa: F401 (its cases register themselves)
+import dqn_replay_cases  # noqa: F401
 import network_cases  # noqa: F401
 import numpy as np
 import ppo_cases  # noqa: F401

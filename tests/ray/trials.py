@@ -1,9 +1,13 @@
 """Single trials without Ray Tune: what several test modules here run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from policies.acting.evaluate import Evaluator
+from policies.acting.load import load_policy
+from policies.acting.policy import Policy
+from policies.portable.file import save_policy
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 from tune_jobs.store.progress import Progress
 from tune_jobs.training.protocol import TrainingEngine, TrialTask
@@ -53,3 +57,19 @@ def run_trial(task: TrialTask, engine: TrainingEngine) -> Progress:
         while (progress := loop.advance(60.0)).status == "running":
             pass
     return progress
+
+
+def train_pack(tasks: Sequence[TrialTask], folder: Path, num_iterations: int) -> list[Policy]:
+    """Train trials as one pack, none of which may fail, and return their policies, each read from its file."""
+    from tune_jobs.training.packed import PackedEngine
+
+    engine = PackedEngine()
+    for task in tasks:
+        engine.add(task, None)
+    for _ in range(num_iterations):
+        for stats in engine.train_iteration().values():
+            assert not isinstance(stats, Exception), stats
+    for task in tasks:
+        save_policy(engine.policy(task.trial_id), folder / task.trial_id)
+    engine.close()
+    return [load_policy(folder / task.trial_id) for task in tasks]
