@@ -10,7 +10,7 @@ import pytest
 from spec_errors import MINIMAL
 from test_search_methods import record
 
-from analysis.records import PriorRecord, TrialRecord
+from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
@@ -82,6 +82,18 @@ def test_what_ended_is_told_by_its_rank_and_what_runs_is_not(earlier: SweepStore
     assert [item.score for item in told[11:]] == [0.625, 0.375, None, 0.875]
     assert [item.score for item in told[:11]] == [item.share for item in prior.points]
     assert with_prior(own, []) == own
+
+
+def test_with_a_scheduler_a_point_counts_as_ended_early_where_the_own_point_of_its_rank_was() -> None:
+    shares = [0.05, 0.45, 19.3 / 29, 0.9, None]
+    points = tuple(PriorPointRecord(point={"lr": 1e-3}, share=share) for share in shares)
+    prior = PriorRecord(sweep="first", env_id="Acrobot-v1", points=points)
+    stopped = [KnownPoint({"lr": 1e-2}, (float(score),), level=score % 2) for score in range(20)]
+    whole = [KnownPoint({"lr": 1e-2}, (-100.0 + score,)) for score in range(10)]
+    told = with_prior([*whole, *stopped], [prior])[:5]
+    # Of 30: the 2nd is of the first rung, the 14th of the second; the best third was not ended, whatever its scores.
+    assert [item.level for item in told] == [0, 1, 1, None, None]
+    assert [item.score for item in told] == [pytest.approx(score) for score in (2.9, 7.1, 19.0, -93.9)] + [None]
 
 
 @pytest.mark.parametrize("method", ["gp", "tpe"])

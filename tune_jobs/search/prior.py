@@ -6,17 +6,16 @@ share of that sweep's points that it is better than, and counts like the new swe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
 
 from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
 from analysis.wording import counted
 from policies.errors import SpecError, shortened
 from tune_jobs.search.chosen_point import outside
 from tune_jobs.search.history import KnownPoint, known_points
-from tune_jobs.search.warped import shares_of
+from tune_jobs.search.warped import rank_of, shares_of
 from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -83,7 +82,8 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
     """Return points as a model is told them, those of earlier sweeps first, on one scale.
 
     While few of the sweep's own points are known, which tell nothing of their scale, they too count by their ranks
-    among themselves. Later an earlier sweep's point has the score of the own point of the same rank.
+    among themselves. Later an earlier sweep's point has the score of the own point of the same rank, and counts as one
+    that the scheduler ended where that one does.
 
     Args:
         known: The sweep's own points.
@@ -93,17 +93,31 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
         return list(known)
     earlier = [item for each in prior for item in each.points]
     ended = [point for point in known if not point.is_running]
-    scores = [point.score for point in ended if point.score is not None and point.level is None]
-    if len(scores) >= _ENOUGH:
-        values = [None if item.share is None else float(np.quantile(scores, item.share)) for item in earlier]
-        own = list(known)
-    else:
-        values = [item.share for item in earlier]
-        shares = iter(map(float, shares_of(ended)))
-        own = [
-            point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known
-        ]
-    return [*(KnownPoint(item.point, (value,)) for item, value in zip(earlier, values, strict=True)), *own]
+    scored = sorted((point for point in ended if point.score is not None), key=rank_of)
+    if sum(point.level is None for point in scored) >= _ENOUGH:
+        return [*(_like_own(item, scored) for item in earlier), *known]
+    shares = iter(map(float, shares_of(ended)))
+    own = [point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known]
+    return [*(KnownPoint(item.point, (item.share,)) for item in earlier), *own]
+
+
+def _like_own(item: PriorPointRecord, scored: Sequence[KnownPoint]) -> KnownPoint:
+    """Return an earlier sweep's point with what the own point of its rank reached.
+
+    Args:
+        item: The point.
+        scored: The own points that have a score, the worst first.
+    """
+    if item.share is None:
+        return KnownPoint(item.point, (None,))
+    place = item.share * (len(scored) - 1)
+    worse, better = scored[math.floor(place)], scored[math.ceil(place)]
+    part = place - math.floor(place)
+    nearest = better if part >= 0.5 else worse
+    score = nearest.score
+    if worse.level == better.level and worse.score is not None and better.score is not None:
+        score = worse.score * (1.0 - part) + better.score * part
+    return KnownPoint(item.point, (score,), level=nearest.level)
 
 
 def _share_of(point: KnownPoint, share: float) -> float | None:

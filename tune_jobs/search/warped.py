@@ -48,7 +48,7 @@ def warped(known: Sequence[KnownPoint]) -> Warped:
         known: Points that have ended.
     """
     shares = shares_of(known)
-    table = np.array([_key(point) for point in known], dtype=np.float64).reshape(-1, 2)
+    table = np.array([rank_of(point) for point in known], dtype=np.float64).reshape(-1, 2)
     scores = _with_distances(_normal_quantiles(shares), table, shares)
     scores = scores - scores.mean()
     if (deviation := float(scores.std())) > 0:
@@ -62,7 +62,7 @@ def shares_of(known: Sequence[KnownPoint]) -> Floats:
     Args:
         known: As for `warped`.
     """
-    keys = [_key(point) for point in known]
+    keys = [rank_of(point) for point in known]
     order = {key: place for place, key in enumerate(sorted(set(keys)))}
     places = np.array([order[key] for key in keys], dtype=np.int64)
     counts = np.bincount(places, minlength=len(order))
@@ -70,7 +70,7 @@ def shares_of(known: Sequence[KnownPoint]) -> Floats:
     return shares
 
 
-def _key(point: KnownPoint) -> tuple[float, float]:
+def rank_of(point: KnownPoint) -> tuple[float, float]:
     """Return what orders points: how comparable their scores are, then the scores."""
     if (score := point.score) is None:
         return -1.0, -sum(each is None for each in point.scores) / max(1, len(point.scores))
