@@ -91,7 +91,7 @@ def test_a_trial_that_comes_to_the_same_is_equal_and_nothing_of_it_changes(store
     assert not again.folders[0].parent.exists()
 
 
-def test_what_trains_again_is_the_trial_without_what_ended_or_chose_others(tmp_path: Path, again: Again) -> None:
+def test_what_trains_again_is_the_trial_without_what_ended_others(tmp_path: Path, again: Again) -> None:
     spec = {"scheduler": {"type": "asha"}, "stop": {"num_env_steps": 900, "time_s": 5}, "max_retries": 2}
     store = make_sweep_folder(tmp_path / "mine", iterations=4, **spec)
     tune_jobs.reproduce("mine/t0002", storage=tmp_path)
@@ -101,6 +101,33 @@ def test_what_trains_again_is_the_trial_without_what_ended_or_chose_others(tmp_p
     # A slower machine must not end it sooner.
     assert made.stop.time_s > 1e8
     assert made.space == stored_spec(store.read_record()).space
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        {"prior": ["earlier"]},
+        {"objective": ["return", "env_steps"], "space": {"stop.num_env_steps": {"choice": [900, 2_000]}}},
+        {
+            "algorithm": "dqn",
+            "hyperparams": {},
+            "space": {
+                "replay": {"choice": ["uniform", "prioritized"]},
+                "prioritized_alpha": {"grid": [0.1, 0.5], "when": {"replay": "prioritized"}},
+            },
+        },
+    ],
+)
+def test_a_trial_that_a_model_chose_is_repeated_whatever_its_search_began_with_or_searched(
+    tmp_path: Path, store: SweepStore, again: Again, chosen: dict[str, Any]
+) -> None:
+    record = store.read_record()
+    search = {"search": {"type": "gp", "num_startup_trials": 1}, "num_samples": 4}
+    stop = {"num_env_steps": 2_000} if "objective" in chosen else record.spec["stop"]
+    store.write_record(record.model_copy(update={"spec": record.spec | {"stop": stop} | search | chosen}))
+    was = stored_spec(store.read_record())
+    tune_jobs.reproduce("mine/t0001", storage=tmp_path)
+    assert again.specs[0].space == was.space
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.process.ran_with import versions
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import stored_spec
-from tune_jobs.spec.sections import SchedulerSpec, SearchSpec
+from tune_jobs.spec.sections import SchedulerSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.logs import continued_from
@@ -134,14 +134,17 @@ def _folder(output: str | Path | None, name: str) -> tuple[Path, bool]:
 
 
 def _write(again: Sweep, sweep: SweepRecord, spec: SweepSpec, trial: TrialRecord, last_iteration: int) -> None:
-    """Write a sweep of the one trial: nothing but its stop rules, and what chose or ended trials, is other."""
+    """Write a sweep of the one trial: nothing but its stop rules, and what ended trials, is other.
+
+    The search stays, though the point is known: what is allowed in a space depends on it.
+    """
     # One that failed did so in the iteration after the last that is recorded.
     cap = last_iteration + (trial.status == "failed")
     stop = spec.stop.model_copy(
         update={"num_iterations": min(spec.stop.num_iterations, max(1, cap)), "time_s": _LONG_S}
     )
     changes = {
-        "stop": stop, "scheduler": SchedulerSpec(), "search": SearchSpec(), "max_retries": 0, "name": again.name,
+        "stop": stop, "scheduler": SchedulerSpec(), "max_retries": 0, "name": again.name,
     }  # fmt: skip
     plan = TrialPlan.model_validate({name: getattr(trial, name) for name in TrialPlan.model_fields})
     again.trial(trial.trial_id).write_record(pending_record(plan))
