@@ -76,8 +76,8 @@ def _rises(item: Searched, distance: Floats, rest: Floats) -> bool:
 
 
 def item_point(hyperparams: Sequence[Searched], index: int) -> dict[str, Any]:
-    """Return the values of one point."""
-    return {item.name: item.values[index] for item in hyperparams}
+    """Return the values of one point, of what acts in it."""
+    return {item.name: item.values[index] for item in hyperparams if not item.is_idle[index]}
 
 
 def _places(item: Searched) -> Floats:
@@ -145,7 +145,10 @@ def _is_taken(name: str, value: float, spec: Mapping[str, Any], point: Mapping[s
     if algorithm not in HYPERPARAMS_BY_ALGORITHM:
         return True
     fixed = spec.get("hyperparams")
-    values = {**(fixed if isinstance(fixed, Mapping) else {}), **point, name: value}
+    # A point may have what is no hyperparameter: the length of training, or a layer that is judged by itself.
+    known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
+    own = {key: given for key, given in point.items() if key in known}
+    values = {**(fixed if isinstance(fixed, Mapping) else {}), **own, name: value}
     try:
         make_hyperparams(algorithm, values)
     except ValidationError:

@@ -1,109 +1,14 @@
 """What mattered in a sweep: on sweeps whose scores depend on known things."""
 
-import dataclasses
 import math
-from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from known_scores import SPACE, Score, by_activation, by_log_lr, draw, effect_of, slope_of_log_lr, sweep_of
 
-from analysis.importance import Effect, WhatMattered, what_mattered
-from analysis.records import ChangeRecord, IterationRecord, SweepRecord, TrialRecord, TrialStatus
-from tests.narrowing import present
-
-SPACE = {
-    "lr": {"loguniform": [1e-5, 1e-1]},
-    "activation": {"choice": ["tanh", "relu"]},
-    "hidden_sizes": {"choice": [[32], [64, 64]]},
-}
-CONDITIONAL = {
-    "replay": {"choice": ["uniform", "prioritized"]},
-    "alpha": {"uniform": [0.01, 1.0], "when": {"replay": "prioritized"}},
-    "lr": {"loguniform": [1e-5, 1e-1]},
-}
-Score = Callable[[dict[str, Any]], float]
-
-
-@dataclasses.dataclass
-class Sweep:
-    sweep: SweepRecord
-    trials: list[TrialRecord]
-    results: dict[str, list[IterationRecord]]
-
-    @property
-    def mattered(self) -> WhatMattered:
-        return what_mattered(self.sweep, self.trials, self.results)
-
-
-def draw(count: int, seed: int = 0) -> list[dict[str, Any]]:
-    rng = np.random.default_rng(seed)
-    return [
-        {
-            "lr": float(10 ** rng.uniform(-5, -1)),
-            "activation": str(rng.choice(["tanh", "relu"])),
-            "hidden_sizes": [[32], [64, 64]][rng.integers(2)],
-        }
-        for _ in range(count)
-    ]
-
-
-def conditional(count: int) -> list[dict[str, Any]]:
-    rng = np.random.default_rng(0)
-    points = []
-    for _ in range(count):
-        point = {"replay": ["uniform", "prioritized"][rng.integers(2)], "alpha": float(rng.uniform(0.01, 1.0))}
-        if point["replay"] == "uniform":
-            del point["alpha"]
-        points.append({**point, "lr": float(10 ** rng.uniform(-5, -1))})
-    return points
-
-
-def sweep_of(
-    points: Sequence[dict[str, Any]],
-    score: Score,
-    *,
-    seeds: int = 1,
-    noise: float = 1.0,
-    space: dict[str, Any] = SPACE,
-    status: Callable[[int], TrialStatus] = lambda index: "completed",
-    steps: Callable[[int], int] = lambda index: 1000,
-    seed: int = 0,
-    **spec: Any,
-) -> Sweep:
-    """A sweep whose trials evaluate to `score` of their points, and noise, at every 100 env steps."""
-    rng = np.random.default_rng(seed)
-    trials, results = [], {}
-    for index in range(len(points) * seeds):
-        trial_id, value = f"t{index:04d}", score(points[index // seeds]) + noise * rng.standard_normal()
-        results[trial_id] = [
-            IterationRecord(iteration=n, num_env_steps=100 * n, num_episodes=n, time_s=1.0, evaluation_return=value)
-            for n in range(1, steps(index) // 100 + 1)
-        ]
-        trials.append(
-            TrialRecord(
-                trial_id=trial_id, index=index, point_index=index // seeds, seed_index=index % seeds, seed=index,
-                point=points[index // seeds], status=status(index), num_env_steps=steps(index),
-            )
-        )  # fmt: skip
-    record = SweepRecord(
-        name="s", state="completed", num_trials=len(trials), created_at=0.0, evaluation_seeds=(), confirmation_seeds=(),
-        spec={"space": space, "stop": {"num_env_steps": 1000}} | spec,
-    )  # fmt: skip
-    return Sweep(record, trials, results)
-
-
-def by_activation(point: dict[str, Any]) -> float:
-    return 10.0 if point["activation"] == "tanh" else 0.0
-
-
-def by_log_lr(point: dict[str, Any]) -> float:
-    return -10.0 * (math.log10(point["lr"]) + 3.0) ** 2
-
-
-def slope_of_log_lr(point: dict[str, Any], slope: float) -> float:
-    return slope * math.log10(point["lr"])
+from analysis.records import ChangeRecord
 
 
 class TestImportance:
@@ -176,105 +81,12 @@ class TestImportance:
         last = sweep_of(points, by_activation, space={"gamma": {"choice": [0.9]}} | SPACE).mattered.hyperparams[-1]
         assert (last.name, last.share) == ("gamma", None)
 
-    def test_what_acts_with_one_value_takes_nothing_from_that_value(self) -> None:
-        made = sweep_of(conditional(60), lambda point: 10.0 * (point["replay"] == "prioritized"), space=CONDITIONAL)
-        mattered = made.mattered
-        assert mattered.names[0] == "replay"
-        shares = {item.name: item for item in mattered.hyperparams}
-        assert shares["replay"].is_clear
-        assert present(shares["replay"].share) > 0.6
-        assert not shares["alpha"].is_clear
-        assert present(shares["alpha"].share) < 0.05
-        # Each level of the one is compared, though the other acts in one of them alone.
-        assert effect_of(mattered, "replay").why_not_comparable == ""
-        levels = {level.label: level for level in effect_of(mattered, "replay").levels}
-        gap = present(levels["prioritized"].adjusted) - present(levels["uniform"].adjusted)
-        assert gap == pytest.approx(10, abs=1.5)
-
-    def test_what_matters_where_it_acts_is_found_there(self) -> None:
-        def score(point: dict[str, Any]) -> float:
-            return 20.0 * point["alpha"] if "alpha" in point else 10.0
-
-        mattered = sweep_of(conditional(80), score, space=CONDITIONAL).mattered
-        shares = {item.name: item for item in mattered.hyperparams}
-        assert mattered.names[0] == "alpha"
-        assert shares["alpha"].is_clear
-        assert not shares["replay"].is_clear
-        levels = effect_of(mattered, "alpha").levels
-        assert [level.label for level in levels] == ["0.01 to 0.34", "0.34 to 0.67", "0.67 to 1"]
-        assert sum(level.num_points for level in levels) == sum("alpha" in point for point in conditional(80))
-        assert [level.adjusted for level in levels] == pytest.approx([level.mean for level in levels], abs=0.5)
-        assert mattered.interactions == ()
-
-    def test_points_in_which_it_does_not_act_move_none_of_its_means(self) -> None:
-        def score(point: dict[str, Any], elsewhere: float) -> float:
-            return 20.0 * point["alpha"] if "alpha" in point else elsewhere
-
-        for elsewhere in (10.0, 1000.0):
-            mattered = sweep_of(conditional(80), partial(score, elsewhere=elsewhere), space=CONDITIONAL).mattered
-            levels = effect_of(mattered, "alpha").levels
-            assert [level.adjusted for level in levels] == pytest.approx([level.mean for level in levels], abs=30.0)
-
-    def test_a_listed_value_that_does_not_act_is_no_level(self) -> None:
-        space = {**CONDITIONAL, "alpha": {"choice": [0.2, 0.6], "when": {"replay": "prioritized"}}}
-        points = [
-            {**point, "alpha": [0.2, 0.6][index % 3 == 0]} if "alpha" in point else point
-            for index, point in enumerate(conditional(60))
-        ]
-        mattered = sweep_of(points, lambda point: 10.0 * (point.get("alpha") == 0.6), space=space).mattered
-        assert [level.label for level in effect_of(mattered, "alpha").levels] == ["0.2", "0.6"]
-        assert mattered.names[0] == "alpha"
-
-    def test_layers_are_judged_by_their_number_and_by_the_size_of_each(self) -> None:
-        rng = np.random.default_rng(0)
-        points = [
-            {"hidden_sizes": [int(size) for size in rng.choice([16, 32, 64], rng.integers(1, 4))]} for _ in range(80)
-        ]
-        space = {"hidden_sizes": {"layers": {"number": [1, 3], "sizes": {"choice": [16, 32, 64]}}}}
-        by_number = sweep_of(points, lambda point: 5.0 * len(point["hidden_sizes"]), space=space).mattered
-        assert by_number.names[0] == "hidden_sizes.number"
-        assert [item.is_clear for item in by_number.hyperparams] == [True, False, False, False]
-        by_first = sweep_of(points, lambda point: 0.2 * point["hidden_sizes"][0], space=space).mattered
-        assert [item.name for item in by_first.hyperparams if item.is_clear] == ["hidden_sizes.1"]
-        third = effect_of(by_first, "hidden_sizes.3").levels
-        assert sum(level.num_points for level in third) == sum(len(point["hidden_sizes"]) == 3 for point in points)
-
-    def test_values_near_one_are_judged_on_the_scale_of_their_distance(self) -> None:
-        rng = np.random.default_rng(0)
-        points = [{"gamma": 1.0 - float(10 ** rng.uniform(-4, -1))} for _ in range(60)]
-        space = {"gamma": {"one_minus_loguniform": [0.9, 0.9999]}}
-        mattered = sweep_of(points, lambda point: -abs(math.log10(1 - point["gamma"]) + 2.5), space=space).mattered
-        labels = [level.label for level in effect_of(mattered, "gamma").levels]
-        assert labels == ["0.9 to 0.99", "0.99 to 0.999", "0.999 to 0.9999"]
-
-    @pytest.mark.parametrize(
-        ("domain", "values", "wider"),
-        [
-            ({"power_of_two": [16, 128]}, [16, 32, 64, 128], {"power_of_two": [16, 512]}),
-            (
-                {"one_minus_loguniform": [0.9, 0.999]},
-                [0.9, 0.97, 0.99, 0.997, 0.999],
-                {"one_minus_loguniform": [0.9, 0.99978]},
-            ),
-        ],
-    )
-    def test_ends_are_moved_on_the_scale_of_their_kind(self, domain: Any, values: list[float], wider: Any) -> None:
-        points = [{"x": values[index % len(values)]} for index in range(60)]
-        rank = {value: 10.0 * place for place, value in enumerate(values)}
-        mattered = sweep_of(points, lambda point: rank[point["x"]], space={"x": domain}).mattered
-        (edge,) = mattered.edges
-        assert edge.domain == wider
-
     def test_a_hyperparameter_that_some_points_do_not_have(self) -> None:
         points = [{"a": index % 3, **({"b": 0.1 * index} if index % 2 else {})} for index in range(40)]
         mattered = sweep_of(points, lambda point: 5.0 * point["a"] + 10.0 * point.get("b", 0.0), space={}).mattered
         assert mattered.names == ("b", "a")
         assert mattered.hyperparams[0].is_clear
         assert [level.label for level in effect_of(mattered, "b").levels][-1] == "not set"
-
-
-def effect_of(mattered: WhatMattered, name: str) -> Effect:
-    return next(effect for effect in mattered.effects if effect.name == name)
 
 
 class TestEffects:
