@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _OF_THE_RUN = (
     "about", "checkpoints", "confirm", "engine", "iteration_timeout_s", "max_retries", "name", "num_samples",
-    "points", "resources", "scheduler", "search", "space",
+    "points", "prior", "resources", "scheduler", "search", "space",
 )  # fmt: skip
 """Sections of a sweep file that say how it was searched and run, not what was trained."""
 _SEEDS_OF_A_SETTING = 5

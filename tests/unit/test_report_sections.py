@@ -120,6 +120,13 @@ def test_next_steps_are_commands_and_sweep_files_that_can_be_launched() -> None:
     assert 1e-7 < low < settings.best.point["lr"] < high <= 1e-2
 
 
+def test_next_steps_leave_out_the_earlier_sweeps_that_a_search_began_with() -> None:
+    # A search of a narrower space, or none, could be refused for them.
+    steps = steps_of(with_spec(ppo_sweep(), search={"type": "gp", "num_startup_trials": 3}, prior=["earlier"]))
+    for title in ("Search a narrower space", "Train the setting by itself"):
+        assert load_spec(yaml.safe_load(steps[title].text)).prior == ()
+
+
 def test_what_has_no_setting_has_no_steps_with_one() -> None:
     assert list(steps_of(with_spec(ppo_sweep(), scheduler={"type": "pbt"}))) == ["Extend"]
     assert steps_of(make_sweep(points=[{}], algorithm="random")) == {}
