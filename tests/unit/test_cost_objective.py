@@ -111,7 +111,7 @@ def test_what_does_not_act_is_an_empty_cell_though_it_does_not_act_in_the_best(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The best setting lacks a name that the cheapest has."""
-    points = [{"lr": 0.1}, {"lr": 0.2, "adam_beta1": 0.5}]
+    points = [{"lr": 0.1}, {"lr": 0.2, "prioritized_alpha": 0.5}]
     made = with_cost(make_sweep(points=points, seeds_per_point=2))
     settings = present(
         judge_settings(made.trials, made.results, num_env_steps=50_000, threshold=195.0, cost="env_steps")
@@ -126,11 +126,13 @@ def test_what_does_not_act_is_an_empty_cell_though_it_does_not_act_in_the_best(
     found = front_of.model_copy(update={"points": both, "undecided": (), "cheapest_near": both[1]})
     settings = settings.model_copy(update={"front": found, "best": best})
     table = front.section(source_of(made, settings)).table
-    at = table.headings.index("adam_beta1")
+    at = table.headings.index("prioritized_alpha")
     assert [row[at].text for row in table.rows] == ["", "0.5"]
-    output._print_front(Console(width=200), settings)
-    assert "adam_beta1" in (shown := capsys.readouterr().out)
-    assert "None" not in shown
+    for width in (80, 200):
+        output._print_front(Console(width=width), settings)
+        assert "None" not in (shown := capsys.readouterr().out)
+        assert "…" not in shown
+    assert "lr 0.2, prioritized_alpha 0.5" in shown
 
 
 def test_who_does_not_ask_for_cost_sees_nothing_of_it() -> None:

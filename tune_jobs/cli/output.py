@@ -248,16 +248,15 @@ def _print_front(console: Console, settings: SettingsRecord | None) -> None:
     from rich.text import Text
 
     from analysis.front_words import front_rows, interval_text, near_text, undecided_text
-    from analysis.points import searched_names, value_text
 
     console.print()
-    # A name that does not act in the best setting may act in another.
-    names = searched_names(item.point for item, _ in front_rows(settings.front))
-    table = make_table("env steps", "score", "95 % interval", "rank", *names, "seeds", "on the front")
+    # Of any width, so that nothing is cut: settings may have many values, and different ones.
+    wide = ("setting", "on the front")
+    table = make_table("env steps", "score", "95 % interval", "rank", "seeds", *wide, wrapped=wide)
     for item, told in front_rows(settings.front):
-        values = (value_text(item.point, name) for name in names)
         cells = [f"{item.num_env_steps:,.0f}", return_text(item.score), interval_text(item, PLAIN_NONE), str(item.rank)]
-        table.add_row(*map(Text, (*cells, *values, str(item.num_seeds), told)))
+        point = ", ".join(f"{name} {setting_text(value)}" for name, value in item.point.items())
+        table.add_row(*map(Text, (*cells, str(item.num_seeds), point, told)))
     console.print(table)
     console.print(f"{near_text(settings.front)} {undecided_text(settings.front)}", style="dim")
 
@@ -354,7 +353,7 @@ def make_table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
-        table.add_column(column, no_wrap=column not in wrapped)
+        table.add_column(column, no_wrap=column not in wrapped, overflow="fold" if column in wrapped else "ellipsis")
     return table
 
 
