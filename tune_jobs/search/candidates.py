@@ -63,12 +63,13 @@ def _settled(cube: Cube, question: Question, places: Floats) -> Floats:
     """
     if question.parts is None:
         return places
-    names = list(question.space)
-    deciding = np.isin(cube.group_of_column, [names.index(name) for name in question.parts.deciding])
-    _, first, kinds = np.unique(cube.columns(places)[:, deciding], axis=0, return_index=True, return_inverse=True)
-    acting = [question.parts.acting(cube.point(places[index])) for index in first]
+    names, usual = list(question.space), question.parts.values_of({})
+    deciding = Cube({name: question.space[name] for name in question.parts.deciding})
+    sides = places[:, [names.index(name) for name in question.parts.deciding]]
+    _, first, kinds = np.unique(deciding.columns(sides), axis=0, return_index=True, return_inverse=True)
+    acting = [question.parts.acting(usual | deciding.point(sides[index])) for index in first]
     acts = np.array([[name in each for name in names] for each in acting])
-    return np.where(acts[kinds.ravel()], places, cube.units([question.parts.values_of({})]))
+    return np.where(acts[kinds.ravel()], places, cube.units([usual]))
 
 
 def _steps(cube: Cube, origins: Floats, width: float, rng: np.random.Generator) -> Floats:

@@ -30,6 +30,7 @@ class Parts:
             part: plain for name, domain in space.items() for part, plain in _parts(name, domain).items()
         }
         """A list or a range by each name."""
+        self._middles = {name: _middle(domain) for name, domain in self.space.items()}
 
     @property
     def are_the_same(self) -> bool:
@@ -38,8 +39,7 @@ class Parts:
 
     def values_of(self, point: Mapping[str, Any]) -> dict[str, Any]:
         """Return the value of each name in a point; what does not act is filled in."""
-        values = self.known_values_of(point)
-        return {name: values[name] if name in values else _middle(domain) for name, domain in self.space.items()}
+        return self._middles | self.known_values_of(point)
 
     def known_values_of(self, point: Mapping[str, Any]) -> dict[str, Any]:
         """Return the value of each name that acts in a point."""
