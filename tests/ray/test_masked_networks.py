@@ -59,6 +59,27 @@ def test_the_portable_policy_does_what_the_module_does(case: str, build: Build) 
     assert len(np.unique(ours.reshape(len(ours), -1), axis=0)) > 2
 
 
+def test_what_is_normalised_is_behind_the_mask(build: Build) -> None:
+    module = module_of(build("ppo", "TestForbidding-v0", normalize_observations=True)[0])
+    rows = observed(module.observation_space, 1000)
+    module.update_observation_statistics(rows)
+    seen = rows[:, 4:]
+    np.testing.assert_allclose(module.obs_mean, seen.mean(axis=0), rtol=1e-4)
+    prepared = module.prepare(torch.from_numpy(rows))
+    np.testing.assert_allclose(prepared, (seen - seen.mean(axis=0)) / seen.std(axis=0), atol=1e-4)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if "dqn" in case])
+def test_targets_are_of_what_the_next_observation_allows(case: str, build: Build) -> None:
+    algorithm, env_id, values = CASES[case]
+    module = module_of(build(algorithm, env_id, **values)[0])
+    rows, next_rows = np.split(observed(module.observation_space, 100), 2)
+    batch = {"obs": torch.from_numpy(rows), "new_obs": torch.from_numpy(next_rows)}
+    out = module.forward_train(batch)
+    for key, mask in (("qf_preds", rows), ("qf_next_preds", next_rows), ("qf_target_next_preds", next_rows)):
+        assert ((out[key] == FORBIDDEN).numpy() == (mask[:, :4] == 0)).all(), key
+
+
 @pytest.mark.parametrize("case", [case for case in CASES if "masked" in case])
 def test_of_ten_thousand_draws_none_is_forbidden_and_all_else_is_drawn(case: str, build: Build) -> None:
     algorithm, env_id, values = CASES[case]

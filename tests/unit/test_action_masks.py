@@ -269,6 +269,9 @@ def test_a_policy_takes_the_best_of_what_is_allowed(place: str, hyperparams: Any
     assert policy.act(rows).tolist() == wanted.tolist()
     assert policy.act(numbers, mask=masks).tolist() == wanted.tolist()
     assert (policy.outputs(rows)[masks == 0] == FORBIDDEN).all()
+    # Also in place of the one that a vector begins with.
+    others = 7 + np.where(masks[::-1] == 1, scores, -np.inf).argmax(axis=1)
+    assert policy.act(rows, mask=masks[::-1]).tolist() == others.tolist()
     for index in (0, 3, 9):
         assert policy.act(rows[index]) == policy.act(numbers[index], masks[index]) == wanted[index]
         if place == "observation":
