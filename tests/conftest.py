@@ -34,6 +34,12 @@ def guard() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def nothing_is_synced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of hundreds of checkpoints, none of whose processes is really killed."""
+    monkeypatch.setattr("os.fsync", lambda _: None)
+
+
 @pytest.fixture(scope="session")
 def env_plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Install `env_plugin` for this process and those it starts: a metadata folder with Gymnasium's entry point."""

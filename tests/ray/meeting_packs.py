@@ -36,6 +36,9 @@ from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.training.pack_loop import PackLoop
 from tune_jobs.training.protocol import IterationStats, TrialTask
 
+PBT: dict[str, Any] = {"type": "pbt", "perturb_every_env_steps": 400, "quantile_fraction": 0.25}
+"""With evaluations every 200 env steps, to 1,000: compared at 400 and 800."""
+
 Score = Callable[[str, int], float]
 """Trial and iteration -> evaluation return."""
 
@@ -43,6 +46,15 @@ Score = Callable[[str, int], float]
 @functools.cache
 def _policy() -> PortablePolicy:
     return make_portable("CartPole-v1", hidden=(2,))
+
+
+def random_scores(seed: int, num_levels: int = 6) -> Score:
+    """Scores with ties, the same for each trial and iteration."""
+
+    def score(trial_id: str, iteration: int) -> float:
+        return float(np.random.default_rng([seed, int(trial_id[1:]), iteration]).integers(num_levels))
+
+    return score
 
 
 class Engine:

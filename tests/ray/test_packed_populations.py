@@ -1,45 +1,23 @@
-"""Populations and HyperBand in packs: who waits for whom, who goes on from whom, and what is left of it on disk."""
+"""Populations in packs: who waits for whom, who goes on from whom, and what is left of it on disk."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
-from meeting_packs import Packs
+from meeting_packs import PBT, Packs, random_scores
 
-from analysis.records import ChangeRecord, TrialRecord
+from analysis.records import ChangeRecord
 from policies.errors import CheckpointError
-from tune_jobs.ray_tune.hyperband import HyperBand
-from tune_jobs.ray_tune.population import Population
-from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+from tune_jobs.ray_tune.scheduling import Standing
 from tune_jobs.search.gains import Evaluations, gains_of
 from tune_jobs.training.pack_loop import MemberReport
 
-pytestmark = pytest.mark.ray
-
-PBT: dict[str, Any] = {"type": "pbt", "perturb_every_env_steps": 400, "quantile_fraction": 0.25}
-"""With evaluations every 200 env steps, to 1,000: compared at 400 and 800."""
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_synced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hundreds of checkpoints; none of these processes is really killed."""
-    monkeypatch.setattr("os.fsync", lambda _: None)
-
-
-def random_scores(seed: int, num_levels: int = 6) -> Callable[[str, int], float]:
-    """Scores with ties, the same for each trial and iteration."""
-
-    def score(trial_id: str, iteration: int) -> float:
-        return float(np.random.default_rng([seed, int(trial_id[1:]), iteration]).integers(num_levels))
-
-    return score
+pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("nothing_is_synced")]
 
 
 # -- when, and who
@@ -105,107 +83,6 @@ def test_a_pack_of_slower_members_is_waited_for_and_trains_meanwhile(tmp_path: P
     assert {record.status for record in packs.records()} == {"running"}
     packs.run()
     assert len(packs.changes()["t0000"]) == 2
-
-
-# -- as on engine rllib
-
-
-class FakedTune:
-    """Tune's controller, to which the trials of a population report."""
-
-    def __init__(self, names: list[str]) -> None:
-        manager = SimpleNamespace(checkpoint_config=SimpleNamespace(num_to_keep=None), _latest_checkpoint_result=None)
-        self.trials = [
-            SimpleNamespace(
-                config={"trial_id": name}, status="RUNNING", is_finished=lambda: False,
-                run_metadata=SimpleNamespace(checkpoint_manager=manager),
-            )
-            for name in names
-        ]  # fmt: skip
-
-    def get_trials(self) -> list[SimpleNamespace]:
-        return self.trials
-
-    get_live_trials = get_trials
-
-    def pause_trial(self, trial: SimpleNamespace, should_checkpoint: bool) -> None:
-        pass
-
-    def _schedule_trial_save(self, trial: SimpleNamespace, result: dict[str, Any]) -> SimpleNamespace:
-        return SimpleNamespace(checkpoint="pointer", metrics={})
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_same_scores_give_the_same_changes_as_on_engine_rllib(tmp_path: Path, seed: int) -> None:
-    """Each trial has been at 400 env steps with the score that it has at 800 too, so that all scores are known."""
-    from tune_jobs.ray_tune.population import PopulationScheduler
-
-    score = random_scores(seed)
-
-    def steady(trial_id: str, iteration: int) -> float:
-        return score(trial_id, 0)
-
-    def resumed(folder: Path) -> Packs:
-        packs = Packs(folder, 8, steady, PBT, seed=seed)
-        for record in packs.records():
-            known = {"num_iterations": 4, "num_env_steps": 400, "evaluation_return": steady(record.trial_id, 4)}
-            packs.store.trial(record.trial_id).write_record(record.model_copy(update=known))
-        packs.begin()
-        return packs
-
-    def copied(source: SimpleNamespace, target: SimpleNamespace, iteration: int) -> SimpleNamespace:
-        return SimpleNamespace(iteration=iteration)
-
-    packs, single = resumed(tmp_path / "packs"), resumed(tmp_path / "single")
-    scheduler = PopulationScheduler(single.spec, single.store, single.keeper.record, single.keeper.change)
-    tune: Any = FakedTune([record.trial_id for record in single.records()])
-    for trial in tune.trials:
-        scheduler.on_trial_add(tune, trial)
-    # Every trial has saved where it is compared.
-    scheduler._saved = {trial.config["trial_id"]: SimpleNamespace(checkpoint="pointer") for trial in tune.trials}
-    with mock.patch("tune_jobs.ray_tune.population.copy_latest_checkpoint", copied):
-        for trial in tune.trials:
-            told = {
-                "num_env_steps": 800, "score": steady(trial.config["trial_id"], 8), "evaluated": True,
-                "progress": SimpleNamespace(report=SimpleNamespace(num_iterations=8)),
-            }  # fmt: skip
-            scheduler.on_trial_result(tune, trial, told)
-        packs.run(until=lambda: any(packs.changes().values()))
-    theirs, ours = single.changes(), packs.changes()
-    assert sum(map(len, theirs.values())) in (0, 1, 2)
-    assert ours == theirs
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_comparing_all_at_once_decides_as_one_by_one_where_all_scores_are_known(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    names = [f"t{index:04d}" for index in range(int(rng.integers(2, 20)))]
-    spec: Any = SimpleNamespace(
-        perturb_every_env_steps=400, seed=seed, space={},
-        scheduler=SimpleNamespace(quantile_fraction=float(rng.choice([0.1, 0.25, 0.5])), resample_probability=0.2),
-    )  # fmt: skip
-    scores = {name: float(rng.integers(5)) for name in names}
-    records = {
-        name: TrialRecord(
-            trial_id=name, index=index, point_index=index, seed=0, point={}, num_env_steps=400,
-            evaluation_return=scores[name],
-        )
-        for index, name in enumerate(names)
-    }  # fmt: skip
-    standings = [Standing(name, 800, scores[name], evaluated=True) for name in names]
-    others: Any = SimpleNamespace(ended=lambda: ())
-    decided = []
-    with mock.patch.object(Population, "_changed", lambda self, standing, chosen, rng: {"drawn": rng.random()}):
-        for at_once in (True, False):
-            population = Population(spec, records.__getitem__)
-            for name in names:
-                population.begins(name)
-            if at_once:
-                decided.append(population.compared(standings, others))
-            else:
-                decided.append({one.trial_id: population.reached(one, others) for one in standings})
-    assert decided[0] == decided[1]
-    assert seed > 2 or any(isinstance(one, CopyFrom) for one in decided[0].values())
 
 
 # -- pb2
@@ -418,61 +295,3 @@ def test_where_evaluations_are_rarer_than_comparisons_the_next_evaluation_counts
     scheduler = {**PBT, "perturb_every_env_steps": 250}
     packs = Packs(tmp_path, 4, lambda trial_id, _: float(trial_id[1:]), scheduler).run()
     assert times(packs.changes()) == [400, 800]
-
-
-# -- HyperBand
-
-BAND: dict[str, Any] = {"type": "hyperband", "grace_env_steps": 200, "reduction_factor": 2.0}
-
-
-def by_itself(packs: Packs, num_trials: int, seed: int) -> dict[str, tuple[str, int]]:
-    """Where HyperBand ends each trial if all have a place, and one after the other comes to its next evaluation."""
-    band = packs._scheduler()
-    assert isinstance(band, HyperBand)
-    rng = np.random.default_rng(seed)
-    names = [f"t{index:04d}" for index in range(num_trials)]
-    steps, over = dict.fromkeys(names, 0), dict[str, str]()
-    for name in names:
-        band.begins(name)
-    while running := [name for name in names if name not in over and not band.waits(name)]:
-        name = str(rng.choice(running))
-        steps[name] += 200
-        if steps[name] == 1_000:
-            over[name] = "completed"
-            band.gone(name)
-        else:
-            score = packs.score(name, steps[name] // 100)
-            score = WORST_SCORE if math.isnan(score) else score
-            if band.reached(Standing(name, steps[name], score, evaluated=True), NobodyWaits()) is Decision.STOP:
-                over[name] = "stopped"
-                band.gone(name)
-        over |= dict.fromkeys(band.take_ended(), "stopped")
-    assert over.keys() == set(names)
-    return {name: (over[name], steps[name]) for name in names}
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_hyperband_ends_the_same_trials_at_the_same_env_steps_in_packs(tmp_path: Path, seed: int) -> None:
-    score = random_scores(seed, 100)
-    for number, (num_packs, slots) in enumerate([(1, 64), (2, 2)]):
-        packs = Packs(
-            tmp_path / str(number), 9, lambda name, at: math.nan if name == "t0004" else score(name, at), BAND,
-            seed=seed, num_packs=num_packs, slots=slots,
-        )  # fmt: skip
-        expected = by_itself(packs, 9, seed)
-        packs.run()
-        found = {record.trial_id: (record.status, record.num_env_steps) for record in packs.records()}
-        assert found == expected
-    assert 2 <= sum(status == "completed" for status, _ in found.values()) <= 7
-    # Nobody begins anew: who waited goes on where it was, in whichever pack.
-    assert len(packs.trained()) == sum(steps // 100 for _, steps in found.values())
-
-
-def test_a_member_that_fails_does_not_hold_up_its_bracket(tmp_path: Path) -> None:
-    def script(trial_id: str, iteration: int) -> None:
-        if trial_id == "t0000" and iteration == 2:
-            raise ZeroDivisionError
-
-    packs = Packs(tmp_path, 6, random_scores(1), BAND, script=script, max_retries=0).run()
-    assert packs.keeper.record("t0000").status == "failed"
-    assert {record.status for record in packs.records()} == {"failed", "completed", "stopped"}

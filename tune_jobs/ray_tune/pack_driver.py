@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from policies.errors import CheckpointError
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.ray_tune.meetings import meeting_of
+from tune_jobs.ray_tune.pack_failures import PackFailures
 from tune_jobs.ray_tune.pack_state import PackState, Tell
 from tune_jobs.ray_tune.population import take_over
 from tune_jobs.ray_tune.scheduling import CopyFrom, Decision, NobodyWaits, Scheduler, Standing
@@ -35,9 +36,6 @@ from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.training.pack_loop import MemberReport
 
 _LOG = logging.getLogger(__name__)
-
-_DEATHS_IN_COMPANY = 2
-"""How many times a member may be in a pack that dies before it continues alone."""
 
 
 class PackDriver:
@@ -68,7 +66,6 @@ class PackDriver:
     ) -> None:
         self._store = store
         self._slots = plan.slots
-        self._max_retries = spec.max_retries
         self._spec = spec
         self._meeting = meeting_of(scheduler)
         self._scheduler = self._meeting or scheduler
@@ -77,8 +74,7 @@ class PackDriver:
         self._waiting = deque(trial_ids)
         self._alone: deque[str] = deque()
         self._known: set[str] = set()
-        self._num_failures: Counter[str] = Counter()
-        self._num_deaths: Counter[str] = Counter()
+        self._failures = PackFailures(spec.max_retries)
         self._arrived: set[str] = set()
         """The trials that are saved and wait for others: their packs don't train them."""
         self._outside: set[str] = set()
@@ -190,16 +186,12 @@ class PackDriver:
         for trial_id in list(pack.ending):
             self._stopped(pack, trial_id)
         for trial_id in list(pack.members):
-            if in_company:
-                self._num_deaths[trial_id] += 1
-            else:
-                self._num_failures[trial_id] += 1
-            is_over = self._num_failures[trial_id] > self._max_retries
+            is_over = self._failures.died(trial_id, in_company=in_company)
             self._keeper.failed(trial_id, error, retried=not is_over)
             self._left(trial_id, for_good=is_over)
             if is_over:
                 self._leave(pack, trial_id)
-            elif in_company and self._is_alone(trial_id):
+            elif in_company and self._failures.is_alone(trial_id):
                 self._leave(pack, trial_id)
                 self._alone.append(trial_id)
         self._fill(pack, self._slots)
@@ -250,6 +242,9 @@ class PackDriver:
         standing = Standing.of(trial_id, progress)
         if progress.status == "running":
             if trial_id in pack.ending:
+                if report.waits:
+                    # It is saved, and its process will end it without a further report.
+                    self._stopped(pack, trial_id)
                 return
             if self._meeting is not None and report.waits:
                 self._arrived.add(trial_id)
@@ -269,7 +264,7 @@ class PackDriver:
         if trial_id in pack.ending:
             self._stopped(pack, trial_id)
             return
-        self._num_failures[trial_id] += 1
+        self._failures.failed(trial_id)
         self._left(trial_id, for_good=not report.retried)
         self._keeper.failed(trial_id, report.error or "", retried=report.retried, reached=report.reached)
         if not report.retried or self._store.stop_requested():
@@ -287,7 +282,7 @@ class PackDriver:
         self._leave(pack, trial_id)
         self._waiting.append(trial_id)
 
-    def _stopped(self, pack: PackState, trial_id: str) -> None:
+    def _stopped(self, pack: PackState | None, trial_id: str) -> None:
         """Handle a member that was to be ended and is gone without a report: its checkpoints are those on disk."""
         checkpoints = candidates(self._store.trial(trial_id))
         self._keeper.change(trial_id, lambda record: transitions.with_checkpoints(record, checkpoints))
@@ -316,27 +311,26 @@ class PackDriver:
         for pack in self._packs.values():
             if pack.is_up:
                 self._fill(pack, self._slots)
-                self._write(pack)
+            self._write(pack)
 
     def _end(self, pack: PackState | None, trial_id: str) -> None:
-        if pack is None:
-            self._outside.discard(trial_id)
-            self._arrived.discard(trial_id)
-            self._keeper.ended(trial_id)
-        elif trial_id in self._arrived:
-            self._stopped(pack, trial_id)
-        else:
+        if pack is not None and pack.tell is not None and trial_id not in self._arrived:
             pack.ending.add(trial_id)
+            return
+        # No process trains it, or one that has told nothing yet, and would not tell its end either.
+        for others in (self._waiting, self._alone):
+            if trial_id in others:
+                others.remove(trial_id)
+        self._outside.discard(trial_id)
+        if trial_id not in self._keeper.running:
+            self._keeper.started(trial_id)  # as in the next process, where it would end
+        self._stopped(pack, trial_id)
 
     def _goes_on(self, trial_id: str) -> None:
         self._arrived.discard(trial_id)
         if trial_id in self._outside:
             self._outside.discard(trial_id)
-            (self._alone if self._is_alone(trial_id) else self._waiting).append(trial_id)
-
-    def _is_alone(self, trial_id: str) -> bool:
-        """Whether a trial has no company in its pack, as it may be what ended others."""
-        return self._num_deaths[trial_id] >= _DEATHS_IN_COMPANY
+            (self._alone if self._failures.is_alone(trial_id) else self._waiting).append(trial_id)
 
     def _take_over(self, trial_id: str, outcome: CopyFrom) -> None:
         try:
@@ -348,7 +342,7 @@ class PackDriver:
         """Let members that wait for others give their places to trials that have none; they are saved."""
         arrived = [trial_id for trial_id in pack.staying if trial_id in self._arrived]
         num_wanted = len(self._waiting) + len(pack.staying) - self._slots
-        is_for_one = bool(self._alone) or any(map(self._is_alone, arrived))
+        is_for_one = bool(self._alone) or any(map(self._failures.is_alone, arrived))
         if is_for_one and (self._alone or self._waiting) and len(arrived) == len(pack.staying):
             num_wanted = len(arrived)
         for trial_id in arrived[: max(0, num_wanted)]:
@@ -356,10 +350,11 @@ class PackDriver:
             self._outside.add(trial_id)
             self._keeper.paused(trial_id)
 
-    def _leave(self, pack: PackState, trial_id: str) -> None:
-        pack.members.pop(trial_id, None)
-        pack.ending.discard(trial_id)
+    def _leave(self, pack: PackState | None, trial_id: str) -> None:
         self._arrived.discard(trial_id)
+        if pack is not None:
+            pack.members.pop(trial_id, None)
+            pack.ending.discard(trial_id)
 
     def _fill(self, pack: PackState, num_members: int) -> None:
         """Assign more trials to a pack; a trial that has to run alone is assigned only to an empty pack."""
@@ -371,7 +366,7 @@ class PackDriver:
         if self._alone and not staying:
             self._give(pack, self._alone.popleft())
             return
-        if any(map(self._is_alone, staying)):
+        if any(map(self._failures.is_alone, staying)):
             return
         for _ in range(num_members - len(staying)):
             if self._waiting:
@@ -392,7 +387,7 @@ class PackDriver:
         pack.assign(self._assignment(pack.staying), self._keeper.owned, soon=soon)
 
     def _assignment(self, trial_ids: tuple[str, ...]) -> Assignment:
-        failures = {name: self._num_failures[name] for name in trial_ids if self._num_failures[name]}
+        failures = self._failures.of(trial_ids)
         if self._meeting is None:
             return Assignment(trial_ids, failures)
         due = {name: self._meeting.due_at(name) for name in trial_ids}
