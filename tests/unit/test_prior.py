@@ -157,6 +157,24 @@ def test_a_name_that_was_fixed_there_has_that_value(tmp_path: Path) -> None:
     assert {item.point["gamma"] for item in prior.points} == {0.95}
 
 
+def test_a_point_has_what_acts_in_the_new_space_and_one_that_lacks_some_of_it_is_left_out(tmp_path: Path) -> None:
+    replay = {"choice": ["uniform", "prioritized"]}
+    alpha = {"uniform": [0.1, 0.9]}
+    bound = {**alpha, "when": {"replay": "prioritized"}}
+    dqn = {"algorithm": "dqn", "search": "gp"}
+    write_earlier(tmp_path, algorithm="dqn", space={"replay": replay, "prioritized_alpha": alpha})
+    _, (prior,) = begun(tmp_path, **dqn, space={"replay": replay, "prioritized_alpha": bound})
+    assert len(prior.points) == 11
+    assert {(item.point["replay"], "prioritized_alpha" in item.point) for item in prior.points} == {
+        ("uniform", False), ("prioritized", True),
+    }  # fmt: skip
+    shutil.rmtree(tmp_path / "first")
+    write_earlier(tmp_path, algorithm="dqn", space={"replay": replay, "prioritized_alpha": bound})
+    _, (prior,) = begun(tmp_path, **dqn, space={"replay": replay, "prioritized_alpha": alpha})
+    assert 0 < len(prior.points) < 11
+    assert {item.point["replay"] for item in prior.points} == {"prioritized"}
+
+
 def test_a_population_and_a_sweep_in_which_nothing_has_ended_tell_nothing(tmp_path: Path) -> None:
     write_earlier(tmp_path, scheduler="pbt")
     with pytest.raises(SpecError, match="population"):

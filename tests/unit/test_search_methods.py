@@ -262,3 +262,11 @@ def test_the_model_learns_from_the_score_that_the_selection_goes_by() -> None:
     one = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0})
     (known,) = known_points(spec, [one])
     assert known.score == present(score_trial(one)).score == 3.0
+
+
+def test_of_what_has_not_begun_a_model_is_told_nothing() -> None:
+    spec, point = make_spec(seeds_per_point=2), {"lr": 1e-3, "activation": "tanh"}
+    waiting = [record(index, point, status="pending", point_index=0) for index in range(2)]
+    assert known_points(spec, waiting) == []
+    (known,) = known_points(spec, [record(0, point, 3.0, point_index=0), waiting[1]])
+    assert (known.is_running, known.scores) == (True, (3.0,))
