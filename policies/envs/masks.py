@@ -115,13 +115,17 @@ class MaskedBox(gym.spaces.Box):
             return observations
         seen = self.seen
         rows = seen.flat_or_own(observations) if isinstance(seen, FlatBox) else observations
+        vectors = np.asarray(rows, np.float32)
+        if vectors.shape[-1:] not in (seen.shape, self.shape):
+            raise ValueError(f"there is an observation of shape {vectors.shape[-1:]}")
         # A mask that a vector has already is replaced.
-        vectors = np.asarray(rows, np.float32)[..., -seen.shape[0] :]
+        vectors = vectors[..., -seen.shape[0] :]
         if vectors.ndim == 1:
             return np.concatenate([self._checked(mask), vectors])
         if len(mask) != len(vectors):
             raise ValueError(f"there are {len(mask)} masks for {len(vectors)} observations")
-        return np.concatenate([np.stack([self._checked(one) for one in mask]), vectors], axis=-1)
+        masks = np.array([self._checked(one) for one in mask]).reshape(-1, self.num_masked)
+        return np.concatenate([masks, vectors], axis=-1)
 
     def _mask_in(self, observation: Mapping[str, Any]) -> Any:
         if self.key is None or self.key not in observation:

@@ -296,6 +296,10 @@ def test_a_policy_says_what_is_wrong_with_a_mask(tmp_path: Path) -> None:
             policy.act(np.zeros(2, np.float32), mask)
     with pytest.raises(ObservationError, match="1 masks for 2 observations"):
         policy.act(np.zeros((2, 2), np.float32), np.ones((1, 4)))
+    for numbers in (np.zeros(3), np.zeros(())):
+        with pytest.raises(ObservationError, match="there is an observation of shape"):
+            policy.act(numbers, np.ones(4))
+    assert policy.act(np.zeros((0, 2)), np.ones((0, 4))).shape == (0,)
     policy = policy_of(PPO, {}, tmp_path)
     with pytest.raises(ObservationError, match="with no member 'action_mask'"):
         policy.act({"observation": np.zeros(2)})
