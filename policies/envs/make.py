@@ -134,7 +134,8 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
             max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
-            has_vector_entry_point=not (wrappers.observes_images or is_changed)
+            has_vector_entry_point=not is_changed
+            and _may_be_vectorised(env_id, spec, wrappers)
             and takes_vector_entry_point(spec, kwargs),
             failure=failure_rule(env_id, spec, env.metadata, kwargs),
             mask=None if mask is None else mask.place,
@@ -213,8 +214,7 @@ def make_vector_env(
     own_args = dict(kwargs)
     try:
         with calls.inside(Call.CONSTRUCTOR):
-            own = not (wrappers.observes_images or may_be_masked(_creator(env_id, spec), wrappers.action_mask))
-            env = own_vector_env(spec, num_envs, kwargs) if own else None
+            env = own_vector_env(spec, num_envs, kwargs) if _may_be_vectorised(env_id, spec, wrappers) else None
             if env is None:
                 if wrappers.pixels:
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
@@ -252,6 +252,11 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
 def _game_args(env_id: str, spec: EnvSpec, kwargs: dict[str, Any], wrappers: ObservationWrappers) -> dict[str, Any]:
     """Return the constructor's arguments, as the wrappers need them."""
     return kwargs if wrappers.atari is None else wrappers.atari.game_args(env_id, _creator(env_id, spec), kwargs)
+
+
+def _may_be_vectorised(env_id: str, spec: EnvSpec, wrappers: ObservationWrappers) -> bool:
+    """Whether a vectorised version, around which there are no wrappers, may observe what they make."""
+    return not (wrappers.observes_images or may_be_masked(_creator(env_id, spec), wrappers.action_mask))
 
 
 def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:
