@@ -107,6 +107,17 @@ def test_the_page_and_its_chart_show_the_front() -> None:
     assert sum(drawn.values()) + found.num_on_front == present(settings).num_settings
 
 
+@pytest.mark.parametrize(("cheapest", "scale"), [(2_000, "value"), (1_000, "log")])
+def test_costs_that_lie_far_apart_are_drawn_on_a_log_scale(cheapest: int, scale: str) -> None:
+    made = with_cost(make_sweep(points=[{"lr": 0.1}, {"lr": 0.2}], max_steps=30_000))
+    made.trials[0] = made.trials[0].model_copy(update={"status": "completed", "num_env_steps": cheapest})
+    made.trials[1] = made.trials[1].model_copy(update={"status": "completed", "num_env_steps": 30_000})
+    subject = Subject(made.sweep, made.trials, made.results, 195.0, source_of(made).importance)
+    (chart,) = [chart for chart in make_charts(subject) if chart.section == "front"]
+    assert isinstance(chart.data, Plots)
+    assert chart.data.plots[0].x.kind == scale
+
+
 def test_what_does_not_act_is_an_empty_cell_though_it_does_not_act_in_the_best(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

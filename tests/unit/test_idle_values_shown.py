@@ -1,5 +1,6 @@
 """A value that doesn't act in its point is shown as nothing: in tables, files and figures."""
 
+import dataclasses
 import io
 from typing import Any
 
@@ -9,9 +10,10 @@ from rich.console import Console
 from spec_errors import MINIMAL
 from synthetic_sweep import Synthetic, make_sweep
 
+from analysis.charts import model
 from analysis.charts.columns import column
 from analysis.charts.subject import Subject
-from analysis.charts.what_mattered import make_charts
+from analysis.charts.what_mattered import _heat_map, make_charts
 from analysis.exports.frames import SweepData, make_frame
 from analysis.exports.latex import latex_table
 from analysis.importance import what_mattered
@@ -80,6 +82,15 @@ def test_a_plan_has_an_empty_cell() -> None:
     assert all((line[start : start + 6].strip() == "") == ("uniform" in line) for line in rows)
 
 
+def test_a_plan_says_which_points_a_model_will_choose() -> None:
+    search = {"type": "gp", "num_startup_trials": 2}
+    spec = load_spec({**MINIMAL, "algorithm": "dqn", "space": SPACE, "num_samples": 3, "search": search})
+    console = Console(file=io.StringIO(), width=200)
+    console.print(_plan_table(spec, make_plan(spec, Machine(2))))
+    rows = [line for line in console.file.getvalue().splitlines() if " t000" in line]  # type: ignore[attr-defined]
+    assert [line.count("by gp") for line in rows] == [0, 0, len(SPACE)]
+
+
 def test_files_have_empty_cells_and_whole_numbers_stay_whole(data: SweepData) -> None:
     for rows in ("trials", "settings"):
         text = csv_text(make_frame(data, rows))
@@ -120,6 +131,18 @@ def test_axes_have_no_place_for_it(made: Synthetic) -> None:
     panels, heat_map, parallel = make_charts(subject)
     assert "Where a line is pale" in parallel.caption
     assert not any("not set" in str(chart.data) for chart in (panels, heat_map, parallel))
+
+
+def test_a_heat_map_is_of_two_that_act_together() -> None:
+    values = {"a": (1.0, 2.0, None, None), "b": (None, None, 0.1, 0.2), "c": (3, 4, 3, 4)}
+    columns = tuple(model.Column(model.Axis(name), found) for name, found in values.items())
+    endings: tuple[model.Ending, ...] = ("whole", "whole", "whole", "whole")
+    score = model.Axis("score")
+    trials = model.Trials(("t0000", "t0001", "t0002", "t0003"), score, (1, 2, 3, 4), endings, columns, (0, 1, 2, 3))
+    assert _heat_map(trials, "").title == "Mean score by a and c"
+    never = _heat_map(dataclasses.replace(trials, columns=columns[:2]), "")
+    assert never.title == "Mean score by a and b"
+    assert "Fewer than two trials in which both act" in never.missing
 
 
 def test_a_study_of_optuna_lacks_it(data: SweepData) -> None:

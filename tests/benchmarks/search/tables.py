@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from analysis.wording import counted
 from tests.benchmarks.search.runs import NUM_RUNS
 from tests.benchmarks.search.tasks import TASKS
 
@@ -77,7 +78,7 @@ def _ranks(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
         means = np.mean(ranks, axis=0)
         named = ", ".join(f"{method} {mean:.2f}" for method, mean in zip(methods, means, strict=True))
         told.append(f"{words}: {named}")
-    yield f"Mean rank of {len(methods)} over {len(whole)} tasks, {'; '.join(told)}."
+    yield f"Mean rank of {len(methods)} over {counted(len(whole), 'task')}, {'; '.join(told)}."
 
 
 def _made(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
