@@ -9,7 +9,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from tune_jobs.search.asking import Question
-from tune_jobs.search.candidates import _settled
+from tune_jobs.search.candidates import _settled, _steps
 from tune_jobs.search.coordinates import Cube
 from tune_jobs.search.gaussian_process import Observed, Posterior, Settings, _expected, _loss, _squares_by_group, fit
 from tune_jobs.search.history import KnownPoint
@@ -223,6 +223,15 @@ def test_expected_improvement_is_that_of_the_normal_distribution_far_below_the_b
     far = log_expected_improvement(np.array([-20.0, -200.0, -2e4, -2e6]), np.ones(4), 0.0)
     assert np.isfinite(far).all()
     assert (np.diff(far) < 0).all()
+
+
+def test_a_small_step_leads_to_any_value_of_a_list_in_no_order_but_not_far_in_a_range() -> None:
+    space = {name: SPACE[name] for name in ("grid", "uniform")}
+    cube = Cube(space)
+    origin = cube.units([{"grid": [8], "uniform": 0.5}])
+    points = [cube.point(place) for place in _steps(cube, origin, 0.01, np.random.default_rng(0))]
+    assert {json.dumps(point["grid"]) for point in points} == {"[8]", "[16, 16]", "[8, 8]"}
+    assert all(abs(point["uniform"] - 0.5) < 0.5 for point in points)
 
 
 # -- asked without a sweep
