@@ -13,6 +13,7 @@ from analysis.records import CheckpointRecord
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.ray_tune.early_stopping import build_scheduler
 from tune_jobs.ray_tune.pack_driver import PackDriver
+from tune_jobs.ray_tune.pack_state import PackState
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Assignment
@@ -370,3 +371,16 @@ def test_the_loss_of_a_packs_node_is_no_failure_and_who_was_to_end_has_ended(tmp
     )
     assert driven.assigned() == [0, 2, 3]
     assert not driven.driver.is_finished
+
+
+def test_the_next_process_of_a_pack_finds_written_what_the_last_one_was_told() -> None:
+    writes, told = list[tuple[tuple[str, ...], bool]](), list[Assignment]()
+    files: Any = SimpleNamespace(write=lambda assignment, soon: writes.append((assignment.trial_ids, soon)))
+    pack, assignment = PackState(files), Assignment(("t0000",))
+    pack.tell = told.append
+    for _ in range(2):
+        pack.assign(assignment, contextlib.nullcontext)
+    assert (writes, told) == ([(("t0000",), True)], [assignment])
+    pack.tell = None
+    pack.assign(assignment, contextlib.nullcontext)
+    assert writes[1:] == [(("t0000",), False)]

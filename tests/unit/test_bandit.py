@@ -74,8 +74,25 @@ def test_values_are_near_those_that_gained_most_in_the_scale_of_their_range(
 def test_the_same_records_and_draws_give_the_same_point_in_whatever_order_they_come() -> None:
     gains = [*gains_at(DOMAIN.validate_python({"uniform": [0.0, 1.0]}), 0.3)]
     space, coming = {"x": DOMAIN.validate_python({"uniform": [0.0, 1.0]})}, Next(2.0, 0.0, {"x": 0.9}, [{"x": 0.5}])
-    points = [propose(coming, space, gains, np.random.default_rng(7), 0.25) for _ in range(2)]
+    points = [propose(coming, space, known, np.random.default_rng(7), 0.25) for known in (gains, gains[::-1])]
     assert points[0] == points[1]
+
+
+def test_what_gained_long_ago_counts_less_than_what_gains_now() -> None:
+    domain = DOMAIN.validate_python({"uniform": [0.0, 1.0]})
+    values = np.linspace(0.0, 1.0, 6)
+
+    def gained(at: float, best: float) -> list[Gain]:
+        return [Gain(at, 0.0, 1.0 - abs(x - best), {"x": float(x)}) for x in values]
+
+    # Most intervals say that little is best; the newest ones say otherwise.
+    gains = [
+        *(one for at in range(1, 11) for one in gained(at, 0.1)),
+        *(one for at in (19, 20) for one in gained(at, 0.9)),
+    ]
+    coming = Next(21.0, 0.0, {"x": 0.5}, [])
+    found = [propose(coming, {"x": domain}, gains, np.random.default_rng(seed), 0.25)["x"] for seed in range(5)]
+    assert min(found) > 0.6, found
 
 
 def test_without_two_known_gains_everything_is_mutated() -> None:
