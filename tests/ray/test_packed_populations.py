@@ -15,6 +15,7 @@ from analysis.records import ChangeRecord
 from policies.errors import CheckpointError
 from tune_jobs.ray_tune.scheduling import Standing
 from tune_jobs.search.gains import Evaluations, gains_of
+from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.pack_loop import MemberReport
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("nothing_is_synced")]
@@ -71,6 +72,18 @@ def test_who_waits_is_saved_there_whatever_its_score_and_its_checkpoints_are(tmp
     rare = {"every_iterations": 99, "keep": 0}
     packs = Packs(tmp_path, 4, lambda trial_id, at: float(trial_id[1:]) - at, PBT, checkpoints=rare).run()
     assert [one for one in packs.begun() if one[0] == "t0000"][1:] == [("t0000", "t0003@4"), ("t0000", "t0003@8")]
+
+
+def test_who_waits_is_brought_to_the_store_before_others_hear_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settled = list[str]()
+    monkeypatch.setattr(TrialStore, "settle", lambda self: settled.append(self.trial_id))
+    packs = Packs(tmp_path, 2, lambda trial_id, _: 1.0, PBT, num_packs=1)
+    process = packs.processes["p00"]
+    process.trainable._arrange(process.loop)
+    reports = process.loop.advance(1e9, until_evaluated=False)
+    assert {report.trial_id for report in reports if report.waits} == {"t0000", "t0001"} == set(settled)
 
 
 def test_a_pack_of_slower_members_is_waited_for_and_trains_meanwhile(tmp_path: Path) -> None:
