@@ -60,6 +60,11 @@ def near_text(front: FrontRecord) -> str:
     """Say what is near the best one."""
     if front.untrained is None:
         return "No episode was whole before training, so only what scores as the best does is near it."
+    if front.near_score <= front.untrained:
+        return (
+            f"The best one gained nothing on the untrained policies' {return_text(front.untrained)}, so only what "
+            "scores as it does is near it."
+        )
     return (
         f"Near the best is a setting that loses at most {100 * front.near_share:.0f} % of what the best one gained on "
         f"the untrained policies' {return_text(front.untrained)}: one whose mean, drawn back to that of all settings, "

@@ -90,6 +90,16 @@ def test_what_the_untrained_score() -> None:
     assert untrained_return({"t0004": []}) is None
 
 
+def test_what_is_near_is_said_of_what_was_gained_too() -> None:
+    items = ranked(setting(0, [2.0], 200), setting(1, [1.0], 100))
+    assert "No episode was whole" in near_text(present(front_of(items, None)))
+    assert "loses at most 5 % of what the best one gained on the untrained policies' 1.0" in near_text(
+        present(front_of(items, 1.0))
+    )
+    for untrained in (2.0, 22.5):
+        assert "gained nothing on the untrained policies'" in near_text(present(front_of(items, untrained)))
+
+
 def test_with_one_seed_nothing_is_said_of_how_sure_it_is() -> None:
     found = present(front_of(ranked(setting(0, [2.0], 200), setting(1, [1.0], 100)), 0.0))
     assert found.num_undecided is None
