@@ -104,7 +104,7 @@ bench-choice: $(VENV)/installed-test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.benchmarks.choice
 
 bench-search: $(VENV)/installed-test
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.benchmarks.search
+	OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python -m tests.benchmarks.search
 
 # Warnings, links that lead nowhere among them, are errors; with --quiet they would not be.
 docs: $(VENV)/installed-docs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -15,6 +16,7 @@ from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run, run_a
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
 from tests.benchmarks.search.trainings import Trainings, Wanted
+from tune_jobs.search.proposal import next_point
 
 TASK = TASKS["cartpole-ppo"]
 Formula = Callable[[Mapping[str, Any], int], float | None]
@@ -108,6 +110,20 @@ def test_no_training_is_made_twice_whenever_the_benchmark_is_killed(
     assert {name: item for name, item in found.items() if name[1] == 0} == {
         ("random", 0): played("random", 0)[0], ("tpe", 0): played("tpe", 0)[0],
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("wanted", "sizes"), [(1, [1]), (3, [1, 2]), (48, [24, 24]), (60, [15] * 4)])
+def test_packs_are_of_one_size_and_of_trainings_that_share_stacks(
+    tmp_path: Path, wanted: int, sizes: list[int]
+) -> None:
+    task = TASKS["pendulum-ppo"]
+    points = [next_point("random", task.spec.space, [], index, seed=0) for index in range(wanted)]
+    missing = [Wanted(point, 0) for point in points]
+    packs = Trainings(task, tmp_path / "made.jsonl", 2)._packs(missing)
+    assert sorted(map(len, packs)) == sizes
+    assert sorted(item.key for pack in packs for item in pack) == sorted(item.key for item in missing)
+    in_order = [item.point["minibatch_size"] for pack in packs for item in pack]
+    assert len([size for size, _ in itertools.groupby(in_order)]) == len(set(in_order))
 
 
 def test_a_line_that_was_not_written_whole_is_made_again(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ trial is, without Ray: what is measured is what points a method asks for, and th
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import multiprocessing
@@ -18,6 +19,7 @@ from typing import Any
 
 from policies.errors import NonFiniteWeightsError
 from tests.benchmarks.search.tasks import Task
+from tune_jobs.plan.engine_choice import pack_key
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 
@@ -50,6 +52,7 @@ class Trainings:
     def __init__(self, task: Task, file: Path, num_processes: int) -> None:
         self._task, self._file, self._num_processes = task, file, num_processes
         self._known: dict[str, float | None] = {}
+        self._pool: ProcessPoolExecutor | None = None
         if file.exists():
             lines, _, unfinished = file.read_text().rpartition("\n")
             if unfinished:
@@ -70,18 +73,24 @@ class Trainings:
             self._make(missing)
         yield from (self._known[item.key] for item in wanted)
 
+    def _packs(self, missing: Sequence[Wanted]) -> list[list[Wanted]]:
+        """Divide trainings among packs of nearly one size: those that can share a stack stand side by side."""
+        ordered = sorted(missing, key=lambda item: repr(pack_key(point_hyperparams(self._task.spec, item.point, 0))))
+        rounds = math.ceil(len(ordered) / (MAX_AT_ONCE * self._num_processes))
+        count = min(rounds * self._num_processes, len(ordered))
+        ends = [len(ordered) * number // count for number in range(count + 1)]
+        return [ordered[first:end] for first, end in itertools.pairwise(ends)]
+
     def _make(self, missing: Sequence[Wanted]) -> None:
-        share = math.ceil(len(missing) / self._num_processes)
-        size = min(MAX_AT_ONCE, share)
-        packs = [missing[first : first + size] for first in range(0, len(missing), size)]
-        context = multiprocessing.get_context("spawn")
-        with (
-            ProcessPoolExecutor(self._num_processes, mp_context=context, initializer=os.nice, initargs=(10,)) as pool,
-            self._file.open("a") as file,
-        ):
-            futures = {
-                pool.submit(train, self._task, [(dict(item.point), item.seed) for item in pack]): pack for pack in packs
-            }
+        if self._pool is None:
+            # Kept, as a search asks for a few trainings at a time, and each process loads PyTorch first.
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self._num_processes, mp_context=context)
+        futures = {
+            self._pool.submit(train, self._task, [(dict(item.point), item.seed) for item in pack]): pack
+            for pack in self._packs(missing)
+        }
+        with self._file.open("a") as file:
             for future in as_completed(futures):
                 for item, value in zip(futures[future], future.result(), strict=True):
                     self._known[item.key] = value
