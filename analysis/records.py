@@ -129,6 +129,11 @@ class ChangeRecord(Record):
     source_iteration: int = Field(description="Iteration of the copied checkpoint in that trial.")
     before: dict[str, Any] = Field(description="The trial's searched values until then.")
     after: dict[str, Any] = Field(description="Its searched values from then on.")
+    values_trial_id: TrialId | None = Field(
+        None,
+        description="The trial whose values these were, where a trial of another sub-population was copied; null: they "
+        "are new.",
+    )
     time: Number = Field(description="Unix time, seconds.")
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.collapse import collapsed_trials
 from analysis.points import searched_names
-from analysis.records import FINISHED, IterationRecord, TrialRecord
+from analysis.records import FINISHED, ChangeRecord, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
 from analysis.statistics import median_steps
 from policies.files import write_atomic
@@ -55,11 +55,15 @@ def cell_value(value: Any) -> Any:
 def describe_changes(trial: TrialRecord) -> str | None:
     """Describe what population based training changed: "at 4,096 env steps from t0003: lr 0.01"; None: nothing."""
     texts = [
-        f"at {change.num_env_steps:,} env steps from {change.source_trial_id}: "
+        f"at {change.num_env_steps:,} env steps from {change.source_trial_id}{_values_of(change)}: "
         + ", ".join(f"{name} {cell_value(value)}" for name, value in change.after.items())
         for change in trial.changes
     ]
     return "; ".join(texts) or None
+
+
+def _values_of(change: ChangeRecord) -> str:
+    return "" if change.values_trial_id in (None, change.source_trial_id) else f", values of {change.values_trial_id}"
 
 
 def point_names(trials: Sequence[TrialRecord]) -> list[str]:

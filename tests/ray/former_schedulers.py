@@ -11,7 +11,7 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import ASHAScheduler, HyperBandScheduler, MedianStoppingRule, TrialScheduler
 
 from tune_jobs.ray_tune.scheduling import WORST_SCORE
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.spec.scheduler import SchedulerSpec
 
 
 def _is_unscored(score: float) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from ray.tune.experiment import Trial
 
 from tune_jobs.ray_tune.scheduling import WORST_SCORE
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.spec.scheduler import SchedulerSpec
 
 MAX_ENV_STEPS = 1_600
 

@@ -7,7 +7,7 @@ from typing import Any
 from ray import tune
 
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.spec.scheduler import SchedulerSpec
 
 STEPS = 100
 

@@ -15,7 +15,7 @@ from analysis.records import TrialRecord
 from tests.narrowing import present
 from tune_jobs.ray_tune.early_stopping import build_scheduler
 from tune_jobs.ray_tune.scheduling import Decision, NobodyWaits, Standing
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.store.pack_files import PackFiles
 from tune_jobs.store.sweep_store import SweepStore
 

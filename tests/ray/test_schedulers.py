@@ -8,7 +8,7 @@ from scripted_trials import run_scripted
 from test_sweeps import assert_results_without_gaps, launch, make_spec
 
 from tests.narrowing import present
-from tune_jobs.spec.sections import SchedulerSpec, SchedulerType
+from tune_jobs.spec.scheduler import SchedulerSpec, SchedulerType
 from tune_jobs.store.sweep_store import SweepStore
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]

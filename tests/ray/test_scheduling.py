@@ -11,7 +11,7 @@ from former_schedulers import FakedController, FakedTrial, former
 from tune_jobs.ray_tune.early_stopping import build_scheduler, build_tune_scheduler
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
-from tune_jobs.spec.sections import SchedulerSpec, SchedulerType
+from tune_jobs.spec.scheduler import SchedulerSpec, SchedulerType
 
 pytestmark = [
     pytest.mark.ray,

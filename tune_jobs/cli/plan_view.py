@@ -8,6 +8,7 @@ from analysis.points import searched_names, value_text
 from analysis.records import TRAINING_LENGTH
 from analysis.wording import bytes_text, counted
 from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
+from tune_jobs.search.subpopulations import subpopulation_of
 from tune_jobs.spec.training_length import ends_of
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "at once": f"{_at_once(plan)}; {machine.source} has {has}",
         "a trial stops at": " or ".join(rules),
         "search": _search_fact(spec),
-        "scheduler": spec.scheduler.type,
+        "scheduler": _scheduler_fact(spec),
         "then": _confirm_fact(largest_race(spec, plan.num_points)),
         "env steps": f"at most {plan.max_env_steps:,} in all",
         "disk": f"at most about {bytes_text(plan.max_disk_bytes)}",
@@ -112,6 +113,19 @@ def _search_fact(spec: SweepSpec) -> str:
     return f"{spec.search.type}: its model proposes points once {ended}"
 
 
+def _scheduler_fact(spec: SweepSpec) -> str:
+    every = _selects_every(spec)
+    if len(every) == 1:
+        return spec.scheduler.type
+    listed = f"{', '.join(every[:-1])} and {every[-1]}"
+    return f"{spec.scheduler.type}, {len(every)} sub-populations that select every {listed} env steps"
+
+
+def _selects_every(spec: SweepSpec) -> list[str]:
+    """Return after how many env steps each sub-population selects; one text if there is but one."""
+    return [f"{times * spec.perturb_every_env_steps:,}" for times in spec.scheduler.frequencies]
+
+
 def _confirm_fact(race: Race | None) -> str:
     if race is None:
         return "no setting is trained again"
@@ -122,8 +136,12 @@ def _confirm_fact(race: Race | None) -> str:
 def _plan_table(spec: SweepSpec, plan: SweepPlan) -> Table:
     names = searched_names(trial.point for trial in plan.trials)
     engines_differ = len(plan.engines) > 1
-    table = make_table("trial", "seed", *names, *(["engine"] if engines_differ else []))
+    every = _selects_every(spec)
+    more = [*(["engine"] if engines_differ else []), *(["selects every"] if len(every) > 1 else [])]
+    table = make_table("trial", "seed", *names, *more)
     for trial in plan.trials[:_MAX_TRIALS_SHOWN]:
         values = [value_text(trial.point, name, none=f"by {spec.search.type}") for name in names]
-        table.add_row(trial.trial_id, str(trial.seed), *values, *([trial.engine] if engines_differ else []))
+        told = [trial.engine] if engines_differ else []
+        told += [every[subpopulation_of(trial.index, len(every))]] if len(every) > 1 else []
+        table.add_row(trial.trial_id, str(trial.seed), *values, *told)
     return table

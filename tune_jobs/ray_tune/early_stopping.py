@@ -19,7 +19,7 @@ from ray.tune.schedulers import ASHAScheduler, MedianStoppingRule, TrialSchedule
 from tune_jobs.ray_tune.hyperband import HyperBand, HyperBandScheduler
 from tune_jobs.ray_tune.scheduling import Decision, EveryoneGoesOn, Others, Scheduler, Standing, is_unscored
 from tune_jobs.ray_tune.tune_scheduler import METRIC, TuneScheduler
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.spec.scheduler import SchedulerSpec
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 At regular numbers of env steps a trial is compared with the others. One of the worst continues from a copy of the
 latest checkpoint of one of the best, with mutated values of the better one. The change is written into the trial's
 record before it takes effect, so that a sweep that is killed continues with it.
+
+With several frequencies the trials are as many sub-populations; see `tune_jobs.search.subpopulations`.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +31,7 @@ from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, is_starting
 from tune_jobs.search.bandit import Next, propose
 from tune_jobs.search.gains import Curves, Evaluations, gains_of
 from tune_jobs.search.mutation import mutate
+from tune_jobs.search.subpopulations import Migration, Ranked, migrations, subpopulation_of
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.copies import copy_latest_checkpoint
@@ -55,6 +58,18 @@ class _Compared:
     """Env steps from which the interval to the next comparison counts."""
     score: float | None
     """The score of the last comparison; None: there was none."""
+    subpopulation: int
+    """The number of the sub-population with which it is compared."""
+    selected_from: int
+    """Env steps from which the interval to the next selection of its sub-population counts."""
+
+
+@dataclass(frozen=True)
+class _Ranking:
+    """All trials that may be compared now."""
+
+    subpopulations: Sequence[Ranked]
+    migrations: Mapping[str, Migration]
 
 
 class Population:
@@ -73,6 +88,7 @@ class Population:
         self._spec = spec
         self._read = read
         self._curves = curves
+        self._frequencies = spec.scheduler.frequencies
         self._members: dict[str, _Compared] = {}
         self._chosen: dict[str, dict[str, Any]] = {}
         """The points of trials that are copied to in this comparison, which their records may not have yet."""
@@ -81,8 +97,9 @@ class Population:
         """Add a trial to the population, with the env steps of its record, as a resumed trial has some already."""
         record, interval = self._read(trial_id), self._spec.perturb_every_env_steps
         score = WORST_SCORE if record.evaluation_return is None else record.evaluation_return
-        steps = record.num_env_steps
-        self._members[trial_id] = _Compared(steps, steps // interval * interval, score if steps else None)
+        steps, own = record.num_env_steps, subpopulation_of(record.index, len(self._frequencies))
+        due_from, selected_from = (steps // each * each for each in (interval, self._frequencies[own] * interval))
+        self._members[trial_id] = _Compared(steps, due_from, score if steps else None, own, selected_from)
 
     def compared_at(self, trial_id: str) -> int:
         """Return the env steps at which a trial was compared last, or at which it began if it never was."""
@@ -105,17 +122,30 @@ class Population:
             standings: Of these trials, in the order in which they are decided about.
             others: What is known of the others.
         """
+        selected = set()
         for standing in standings:
             member = self._members[standing.trial_id]
             member.num_env_steps = member.due_from = standing.num_env_steps
             member.score = standing.score
+            interval = self._frequencies[member.subpopulation] * self._spec.perturb_every_env_steps
+            if standing.num_env_steps >= member.selected_from + interval:
+                member.selected_from = standing.num_env_steps
+                selected.add(standing.trial_id)
         self._chosen = {}
-        worst, best = self._quantiles(others)
-        return {standing.trial_id: self._decision(standing, worst, best) for standing in standings}
+        ranking = self._ranking(others)
+        return {
+            standing.trial_id: self._decision(standing, ranking) if standing.trial_id in selected else Decision.SAVE
+            for standing in standings
+        }
 
-    def _decision(self, standing: Standing, worst: Sequence[str], best: Sequence[str]) -> Decision | CopyFrom:
-        better = [other for other in best if _score(self._members[other]) > standing.score]
-        if standing.trial_id not in worst or not better:
+    def _decision(self, standing: Standing, ranking: _Ranking) -> Decision | CopyFrom:
+        migration = ranking.migrations.get(standing.trial_id)
+        if migration is not None:
+            point = self._read(migration.values_of).point
+            return CopyFrom(migration.weights_of, point, values_of=migration.values_of)
+        ranked = ranking.subpopulations[self._members[standing.trial_id].subpopulation]
+        better = [other for other in ranked.best if _score(self._members[other]) > standing.score]
+        if standing.trial_id not in ranked.worst or not better:
             return Decision.SAVE
         record = self._read(standing.trial_id)
         rng = random_streams.mutation(self._spec.seed, record.index, len(record.changes))
@@ -126,13 +156,21 @@ class Population:
     def ended(self, standing: Standing) -> None:
         """Do nothing: `Others` tells which trials have ended, including those that failed."""
 
-    def _quantiles(self, others: Others) -> tuple[list[str], list[str]]:
-        """Return the worst and the best of the running trials that have a score; none in a population of one."""
+    def _ranking(self, others: Others) -> _Ranking:
+        """Rank the running trials that have a score, in each sub-population."""
         ended = others.ended()
         known = {name: member for name, member in self._members.items() if name not in ended and _is_scored(member)}
-        ranked = sorted(known, key=lambda name: _score(known[name]))
-        size = min(math.ceil(len(ranked) * self._spec.scheduler.quantile_fraction), len(ranked) // 2)
-        return ranked[:size], ranked[len(ranked) - size :]
+        scores = {name: _score(member) for name, member in known.items()}
+        numbers = range(len(self._frequencies))
+        ranked = [
+            Ranked.of(
+                {name: scores[name] for name, member in known.items() if member.subpopulation == number},
+                self._spec.scheduler.quantile_fraction,
+            )
+            for number in numbers
+        ]
+        found = [migrations(number, ranked, scores) for number in numbers]
+        return _Ranking(ranked, {name: migration for each in found for name, migration in each.items()})
 
     def _changed(self, standing: Standing, chosen: str, rng: np.random.Generator) -> dict[str, Any]:
         """Return the point with which a trial goes on from a copy of a better one."""
@@ -188,6 +226,7 @@ def take_over(spec: SweepSpec, store: Sweep, record: TrialRecord, decision: Copy
         num_env_steps=record.num_env_steps,
         source_trial_id=decision.trial_id,
         source_iteration=copied.iteration,
+        values_trial_id=decision.values_of,
         before=record.point,
         after=decision.point,
         time=time.time(),

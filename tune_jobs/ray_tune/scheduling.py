@@ -67,6 +67,8 @@ class CopyFrom:
     """The trial to copy from."""
     point: dict[str, Any]
     """The searched values that the trial continues with."""
+    values_of: str | None = None
+    """The trial whose values these are; None: they are new."""
 
 
 class Others(Protocol):

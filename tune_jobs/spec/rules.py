@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from analysis.records import TRAINING_LENGTH
+from analysis.wording import counted
 from policies.errors import SpecError
 from policies.hyperparams import (
     HYPERPARAMS_BY_ALGORITHM,
@@ -13,6 +14,7 @@ from policies.hyperparams import (
 from tune_jobs.spec.domains import Grid, Range
 from tune_jobs.spec.draws import num_points
 from tune_jobs.spec.engines import Engine, Need
+from tune_jobs.spec.scheduler import SMALLEST_SUBPOPULATION, num_worst
 
 if TYPE_CHECKING:
     from tune_jobs.spec.sections import SweepFields
@@ -58,6 +60,8 @@ def search_problems(spec: SweepFields) -> Found:
     elif spec.scheduler.perturb_every_env_steps is not None:
         text = f"is for pbt and pb2, but scheduler.type is {spec.scheduler.type}: leave it out, or set the type to pbt"
         found.append(("scheduler.perturb_every_env_steps", text))
+    if len(spec.scheduler.frequencies) > 1:
+        found += _frequency_problems(spec)
     return found + _cost_problems(spec)
 
 
@@ -110,11 +114,12 @@ def _cost_notes(spec: SweepFields) -> list[str]:
     return [text]
 
 
-def check_extendable(spec: SweepFields) -> None:
-    """Check that more samples would be new points.
+def check_extendable(spec: SweepFields, num_samples: int) -> None:
+    """Check that so many more samples would be new points, and enough for the sub-populations if there are any.
 
     Raises:
-        SpecError: The space has nothing random to draw, and no search method or scheduler chooses values.
+        SpecError: The space has nothing random to draw, and no search method or scheduler chooses values; or there
+            would be fewer trials than sub-populations need.
     """
     chosen = spec.search.has_model or spec.scheduler.is_population
     if not chosen and not any(domain.is_random for domain in spec.space.values()):
@@ -122,6 +127,14 @@ def check_extendable(spec: SweepFields) -> None:
         raise SpecError(
             f"The sweep cannot be extended: {why}, so more samples would be the same points again.",
             "Launch a new sweep: with a larger seeds_per_point for more seeds, with more grid values for more points.",
+        )
+    number = len(spec.scheduler.frequencies)
+    added = num_points(spec.space, spec.num_samples + num_samples) - num_points(spec.space, spec.num_samples)
+    if number > 1 and added < SMALLEST_SUBPOPULATION * number:
+        raise SpecError(
+            f"The sweep cannot be extended by {counted(added, 'trial')}: they are compared with each other, in "
+            f"{number} sub-populations (scheduler.frequencies), and each of these needs {SMALLEST_SUBPOPULATION}.",
+            f"Add at least {SMALLEST_SUBPOPULATION * number} trials.",
         )
 
 
@@ -215,6 +228,36 @@ def _population_problems(spec: SweepFields) -> Found:
             "no trial would ever be changed"
         )
         found.append(("scheduler.perturb_every_env_steps", text))
+    return found
+
+
+def _frequency_problems(spec: SweepFields) -> Found:
+    """Return what is wrong with several sub-populations."""
+    given, fraction, kind = spec.scheduler.frequencies, spec.scheduler.quantile_fraction, spec.scheduler.type
+    path, number, num_trials = "scheduler.frequencies", len(given), num_points(spec.space, spec.num_samples)
+    if kind != "pbt":
+        return [(path, f"is for pbt, but scheduler.type is {kind}: leave it out, or set the type to pbt")]
+    found: Found = []
+    sizes = (num_trials // number, -(-num_trials // number))
+    if sizes[0] < SMALLEST_SUBPOPULATION:
+        text = (
+            f"gives {number} sub-populations, each of which needs at least {SMALLEST_SUBPOPULATION} trials, and there "
+            f"would be {num_trials}: have at least {SMALLEST_SUBPOPULATION * number}, or fewer frequencies"
+        )
+        found.append((path, text))
+    elif any(size <= 2 * num_worst(size, fraction) for size in sizes):
+        text = (
+            f"{fraction:g} leaves no trial of a sub-population of {sizes[0]} between the worst and the best, to "
+            "take in one of another: lower it, or have more trials"
+        )
+        found.append(("scheduler.quantile_fraction", text))
+    every, cap = spec.perturb_every_env_steps, spec.stop.num_env_steps
+    if every < cap <= given[-1] * every:
+        text = (
+            f"{given[-1]} times scheduler.perturb_every_env_steps, {every:,}, is {given[-1] * every:,} env steps, "
+            f"not less than stop.num_env_steps, {cap:,}: trials of this sub-population would never be compared"
+        )
+        found.append((path, text))
     return found
 
 

@@ -24,12 +24,12 @@ from tune_jobs.spec.domain_kinds import Number, WholeNumber
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import ENGINES
 from tune_jobs.spec.fields import Flag, NameText, NonNegativeWhole, PositiveNumber, PositiveWhole, Section, name_or_flag
+from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
 SearchType = Literal["random", "auto", "gp", "forest", "tpe"]
 AUTO_SEARCH: SearchType = "gp"
 """What `search: auto` is: the method that found the best points in decision 40, and needs nothing to be installed."""
-SchedulerType = Literal["none", "asha", "hyperband", "median", "pbt", "pb2"]
 
 _RETURN = {"return": "final"}
 """What `objective` may be called besides: the return that training comes to."""
@@ -139,44 +139,6 @@ class SearchSpec(Section):
     def has_model(self) -> bool:
         """Whether the points of trials that have not begun depend on those that have ended."""
         return self.type != "random"
-
-
-class SchedulerSpec(Section):
-    """Whether trials that do worse than others after the same env steps are ended early, or continue from copies."""
-
-    type: SchedulerType = Field(
-        "none",
-        description="none, asha (successive halving), hyperband, median (worse than the median), pbt (population "
-        "based training: the worst continue from copies of the best, with mutated hyperparameters) or pb2 (the same, "
-        "with values within ranges chosen by a model of what intervals gained).",
-    )
-    grace_env_steps: PositiveWhole | None = Field(
-        None, description="No trial is ended before this many env steps; null: 1/20 of stop.num_env_steps."
-    )
-    reduction_factor: Annotated[Number, Field(gt=1)] = Field(
-        3.0, description="asha, hyperband: one trial in this many continues at each rung."
-    )
-    perturb_every_env_steps: PositiveWhole | None = Field(
-        None, description="pbt, pb2: env steps between two comparisons of a trial; null: 1/10 of stop.num_env_steps."
-    )
-    quantile_fraction: Annotated[Number, Field(gt=0, le=0.5)] = Field(
-        0.25, description="pbt, pb2: the worst share of the trials, which copies the best share."
-    )
-    resample_probability: Annotated[Number, Field(ge=0, le=1)] = Field(
-        0.25,
-        description="pbt, and lists with pb2: share of mutations that draw a new value; the others move to a "
-        "neighbouring one.",
-    )
-
-    @property
-    def waits_for_others(self) -> bool:
-        """Whether trials wait at numbers of env steps until others have come as far."""
-        return self.type == "hyperband" or self.is_population
-
-    @property
-    def is_population(self) -> bool:
-        """Whether trials go on from copies of others, with other values."""
-        return self.type in ("pbt", "pb2")
 
 
 class ObjectiveSpec(Section):

@@ -28,7 +28,7 @@ from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.process.ran_with import versions
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import stored_spec
-from tune_jobs.spec.sections import SchedulerSpec
+from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.logs import continued_from

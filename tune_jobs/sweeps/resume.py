@@ -61,7 +61,7 @@ def go_on(
         record = store.read_record()
         spec = stored_spec(record)
         if num_samples:
-            check_extendable(spec)
+            check_extendable(spec, num_samples)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
         if point is not None:
             record = with_chosen_point(record, spec, store.read_trials(), point)

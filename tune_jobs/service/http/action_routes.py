@@ -63,7 +63,7 @@ def retry(name: str, service: TheService, caller: AChanger, wait_for_nodes: Wait
 def extend(name: str, more: Extend, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Add points to a sweep, and run them."""
     spec = stored_spec(service.statuses.see(name).status.sweep)
-    check_extendable(spec)
+    check_extendable(spec, more.num_samples)
     jobs = _check_growth(service, name, Addition(num_samples=more.num_samples))
     # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
     arguments = {"to_num_samples": num_samples_after(spec, jobs) + more.num_samples}
