@@ -11,6 +11,8 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from analysis.best_records import FrontPointRecord, FrontRecord
 from analysis.objectives import SettingScores
 from analysis.records import IterationRecord
@@ -21,6 +23,8 @@ NEAR = 0.05
 """The share of what training gains, from the untrained policy to the best setting, that one near it loses at most."""
 _NUM_LISTED = 50
 _NUM_UNDECIDED = 10
+_LEAST_RATIO = 30.0
+"""From where on costs lie far apart: the greatest of the least."""
 
 
 def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> FrontRecord | None:
@@ -68,6 +72,26 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
         near_score=near_score,
         may_be_best=None if with_best is None else cheapest in with_best,
     )
+
+
+def other_settings(ranking: Sequence[SettingScores], front: FrontRecord, most: int) -> list[SettingScores]:
+    """Return the settings that are neither listed on a front nor among its undecided, best first; evenly, if too many.
+
+    Args:
+        ranking: The settings that the front is of, best first.
+        front: Their front.
+        most: How many are wanted at most.
+    """
+    known = {item.point_index for item in (*front.points, *front.undecided)}
+    others = [item for item in ranking if item.point_index not in known]
+    picks = np.linspace(0, len(others) - 1, min(len(others), most)).round().astype(int).tolist()
+    return [others[pick] for pick in picks]
+
+
+def costs_lie_far_apart(ranking: Sequence[SettingScores]) -> bool:
+    """Whether the costs of settings are better drawn to a logarithmic scale."""
+    costs = [item.cost for item in ranking]
+    return min(costs) > 0 and max(costs) / min(costs) >= _LEAST_RATIO
 
 
 def untrained_return(results: Mapping[str, Sequence[IterationRecord]]) -> float | None:

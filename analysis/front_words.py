@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from analysis.best_records import FrontPointRecord, FrontRecord, SettingsRecord
+from analysis.best_records import FrontPointRecord, FrontRecord
 from analysis.wording import counted, number, return_text, setting_text
 
 ON_FRONT, MAY_BE = "yes", "may be"
 NEAREST = "yes, the cheapest near the best"
+_ABOUT = (
+    "On the front are the settings than which no other is as cheap and better, or as good and cheaper, by expected "
+    "means over seeds. The cost is the mean env steps of a training: less than its length where it reached its goal, "
+    "and the whole length where a scheduler ended it or it failed."
+)
 
 
 class FrontRow(NamedTuple):
@@ -39,13 +44,12 @@ def interval_text(item: FrontPointRecord, none: str) -> str:
     return f"{return_text(item.lower)} to {return_text(item.upper)}"
 
 
-def cheapest_near_text(settings: SettingsRecord) -> str:
+def cheapest_near_text(front: FrontRecord | None) -> str:
     """Name the cheapest setting near the best one, and say how much it saves; empty: the sweep doesn't ask for it."""
-    front = settings.front
     if front is None:
         return ""
-    near, best = front.cheapest_near, settings.best
-    if near.point_index == best.point_index:
+    near = front.cheapest_near
+    if near.rank == 1:
         return "the best setting itself: no cheaper one is near it"
     point = ", ".join(f"{name} {setting_text(value)}" for name, value in near.point.items())
     whole = front.points[-1].num_env_steps if front.num_on_front == len(front.points) else None
@@ -54,6 +58,14 @@ def cheapest_near_text(settings: SettingsRecord) -> str:
     if front.may_be_best is None:
         return text
     return f"{text}; the data {'cannot' if front.may_be_best else 'can'} tell it from the best"
+
+
+def about_front(front: FrontRecord) -> list[str]:
+    """Say what the front is, how sure that is, and what of it is listed."""
+    told = [_ABOUT, near_text(front), undecided_text(front)]
+    if front.num_on_front > len(front.points):
+        told.append(f"The {len(front.points)} cheapest of {front.num_on_front:,} on the front are listed.")
+    return told
 
 
 def near_text(front: FrontRecord) -> str:

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots, drawable
 from analysis.charts.subject import Subject
-from analysis.front import front_of, untrained_return
+from analysis.front import costs_lie_far_apart, front_of, other_settings, untrained_return
 from analysis.objectives import SettingScores
 
 _FRONT = "the front"
 _MAX_DRAWN = 2_000
-_LEAST_RATIO = 30.0
-"""From where on costs are drawn to a logarithmic scale: the greatest of the least."""
 
 
 def make_charts(subject: Subject) -> list[Chart]:
@@ -26,22 +22,19 @@ def make_charts(subject: Subject) -> list[Chart]:
     by_point = {item.point_index: item for item in ranking}
     on_front = [by_point[item.point_index] for item in front.points]
     may_be = [by_point[item.point_index] for item in front.undecided]
-    known = {item.point_index for item in (*on_front, *may_be)}
-    others = [item for item in ranking if item.point_index not in known]
-    picks = np.linspace(0, len(others) - 1, min(len(others), _MAX_DRAWN)).round().astype(int).tolist()
-    notes = [f"{_MAX_DRAWN:,} of {len(others):,} other settings are drawn."] if len(others) > _MAX_DRAWN else []
-    lines = [_dots(subject, "other settings", "muted", [others[pick] for pick in picks])]
+    others = other_settings(ranking, front, _MAX_DRAWN)
+    num_others = len(ranking) - len(on_front) - len(may_be)
+    notes = [f"{_MAX_DRAWN:,} of {num_others:,} other settings are drawn."] if num_others > _MAX_DRAWN else []
+    lines = [_dots(subject, "other settings", "muted", others)]
     lines += [_dots(subject, "may be on the front", "series-1", may_be, look="hollow")]
     lines += [_dots(subject, _FRONT, "series-0", on_front), _front(subject, on_front, [item.cost for item in ranking])]
     near = by_point[front.cheapest_near.point_index]
     lines += [_dots(subject, "the best", "accent", [ranking[0]])]
     if near is not ranking[0]:
         lines += [_dots(subject, "the cheapest near it", "series-2", [near])]
-    costs = [item.cost for item in ranking]
-    is_wide = min(costs) > 0 and max(costs) / min(costs) >= _LEAST_RATIO
     x = (
         Axis("env steps of a training, mean over seeds", "log")
-        if is_wide
+        if costs_lie_far_apart(ranking)
         else Axis("env steps of a training, mean over seeds", low=0)
     )
     plot = Plot(x, Axis(subject.score_name), tuple(line for line in lines if line.x), goal=_goal(subject))

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from analysis.front_words import cheapest_near_text, front_rows, interval_text, near_text, undecided_text
+from analysis.front_words import about_front, cheapest_near_text, front_rows, interval_text
 from analysis.page.scores import score_means
 from analysis.page.source import Source
 from analysis.points import searched_names, value_text
 from analysis.report_tables import Cell, Table
 from analysis.tables import cell_value
 from analysis.wording import NONE, number, return_text
-
-_ABOUT = (
-    "On the front are the settings than which no other is as cheap and better, or as good and cheaper, by expected "
-    "means over seeds. The cost is the mean env steps of a training: less than its length where it reached its goal, "
-    "and the whole length where a scheduler ended it or it failed."
-)
 
 
 @dataclass(frozen=True)
@@ -56,7 +50,4 @@ def section(source: Source) -> Front:
         rows.append(
             [*cells, Cell(item.num_seeds, str(item.num_seeds)), Cell(told, told, "" if row.is_on_front else "pending")]
         )
-    about = [_ABOUT, near_text(front), undecided_text(front)]
-    if front.num_on_front > len(front.points):
-        about.append(f"The {len(front.points)} cheapest of {front.num_on_front:,} on the front are listed.")
-    return Front(cheapest_near_text(settings), about, Table(headings, rows))
+    return Front(cheapest_near_text(front), about_front(front), Table(headings, rows))

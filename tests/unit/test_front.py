@@ -197,19 +197,19 @@ def test_settings_are_set_against_their_cost_if_that_is_asked_for() -> None:
     trials, results = [one for one, _ in made], {one.trial_id: rows for one, rows in made}
     plain = present(judge_settings(trials, results, num_env_steps=CAP, threshold=None))
     assert plain.front is None
-    assert cheapest_near_text(plain) == ""
+    assert cheapest_near_text(plain.front) == ""
     both = present(judge_settings(trials, results, num_env_steps=CAP, threshold=None, cost="env_steps"))
     front = present(both.front)
     assert [item.point_index for item in front.points] == [1, 0]
     assert both.best.point_index == 0
-    assert cheapest_near_text(both) == "lr 1: 99.0 for 2,000 env steps a training, 22 % of the best one's"
+    assert cheapest_near_text(both.front) == "lr 1: 99.0 for 2,000 env steps a training, 22 % of the best one's"
     assert [row.on_front for row in front_rows(front)] == ["yes, the cheapest near the best", "yes"]
     assert (
         "on the untrained policies' 10.0: one whose mean, drawn back to that of all settings, is 95.5 or more"
         in near_text(front)
     )
     alone = present(judge_settings(trials[:1], results, num_env_steps=CAP, threshold=None, cost="env_steps"))
-    assert "the best setting itself" in cheapest_near_text(alone)
+    assert "the best setting itself" in cheapest_near_text(alone.front)
 
 
 def test_many_settings_take_no_time_to_speak_of() -> None:

@@ -115,7 +115,7 @@ def test_downloads_are_described(site: Live) -> None:
     "path",
     [
         "/files", "/report/index.html", "/films/after_mp4", "/policy", "/trials/t0000/checkpoints/6", "/trials.csv",
-        "/best", "/importance",
+        "/best", "/importance", "/front",
     ],
 )  # fmt: skip
 def test_there_is_nothing_of_an_unknown_sweep(site: Live, path: str) -> None:

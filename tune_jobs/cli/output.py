@@ -237,7 +237,7 @@ def _setting_facts(settings: SettingsRecord | None) -> dict[str, str]:
         f"{', ...' if len(best.trial_ids) > 3 else ''})",
         "scored": setting_score(settings),
         "how sure": certainty(settings),
-        **({"cheapest near": near} if (near := cheapest_near_text(settings)) else {}),
+        **({"cheapest near": near} if (near := cheapest_near_text(settings.front)) else {}),
     }
 
 

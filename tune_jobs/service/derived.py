@@ -17,6 +17,7 @@ from tune_jobs.sweeps.status import SweepStatus
 
 if TYPE_CHECKING:
     from analysis.comparison.compare import Comparison
+    from analysis.front_view import FrontView
     from analysis.importance import WhatMattered
     from analysis.records import Objective
     from tune_jobs.sweeps.side_by_side import SideBySide
@@ -64,6 +65,17 @@ class Derived:
         from tune_jobs.sweeps.results import importance_of
 
         found: WhatMattered = self._get(name, "importance", importance_of)
+        return found
+
+    def front(self, name: str) -> FrontView:
+        """Set a sweep's settings against their cost, as of a while ago if it runs.
+
+        Raises:
+            NotFoundError: There is no such sweep, or it is damaged.
+        """
+        from tune_jobs.sweeps.results import front_view_of
+
+        found: FrontView = self._get(name, "front", front_view_of)
         return found
 
     def trials_csv(self, name: str) -> str:

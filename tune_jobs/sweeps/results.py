@@ -14,6 +14,7 @@ from policies.arguments import checked
 from policies.envs.modules import allowed_again
 
 if TYPE_CHECKING:
+    from analysis.front_view import FrontView
     from analysis.importance import WhatMattered
     from tune_jobs.store.contract import Sweep
 
@@ -89,6 +90,14 @@ def importance_of(store: Sweep) -> WhatMattered:
 
     data = sweep_data(store)
     return what_mattered(store.read_record(), data.trials, data.results, threshold=data.threshold)
+
+
+def front_view_of(store: Sweep) -> FrontView:
+    """Set a sweep's settings against their cost, as its report does; it may still run."""
+    from analysis.front_view import front_view
+    from tune_jobs.sweeps.gathered import spec_of, sweep_data
+
+    return front_view(sweep_data(store), spec_of(store).objective.cost)
 
 
 @allowed_again()

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from typing import Any
 
 from analysis.best_records import BestRecord
+from analysis.front_view import front_view
 from analysis.importance import what_mattered
 from analysis.records import IterationRecord, SweepRecord, TrialRecord
 from analysis.selection import score_trial
@@ -23,7 +24,7 @@ from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import is_url
 from tune_jobs.sweeps.curves import Columns, Curve
-from tune_jobs.sweeps.gathered import sweep_data
+from tune_jobs.sweeps.gathered import spec_of, sweep_data
 from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.shortened_paths import Shortener
 from tune_jobs.sweeps.status import SweepStatus, status_of
@@ -77,6 +78,7 @@ def _document(store: Sweep) -> dict[str, Any]:
         "trials": _rows(trials),
         "curves": _curves(data.results),
         "importance": to_json(mattered),
+        "front": to_json(front_view(data, spec_of(store).objective.cost)),
         "best": to_json(_best(store)),
     }
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
 
+from analysis.front_view import FrontView
 from policies.errors import NotFoundError
 from policies.portable.file import policy_files
 from tune_jobs.service.http.caller import TheService
@@ -156,6 +157,12 @@ def importance(name: str, service: TheService) -> dict[str, Any]:
     """Say which hyperparameters scores depend on, as `tune-jobs importance --json`; of a running sweep a while ago."""
     found: dict[str, Any] = to_json(service.derived.importance(name))
     return found
+
+
+@router.get("/front")
+def front(name: str, service: TheService) -> FrontView:
+    """Set scores against env steps: the Pareto front of a sweep that asks for it; of a running one a while ago."""
+    return service.derived.front(name)
 
 
 def _sweep(service: Service, name: str) -> Sweep:

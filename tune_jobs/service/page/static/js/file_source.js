@@ -37,6 +37,11 @@ export class FileSource {
     return this.file.importance;
   }
 
+  async front() {
+    if (this.file.front === null) throw new Error("The file says nothing of it.");
+    return this.file.front;
+  }
+
   async outcome() {
     return { files: new Set(), best: this.file.best };
   }

@@ -1,5 +1,6 @@
 // Which hyperparameters the scores depend on, as it firms up.
 import { el, reconcile, setAttribute, setText } from "./dom.js";
+import { Ended } from "./ended.js";
 
 const width = (share) => `${100 * share}%`;
 const percentText = (share) => `${Math.round(100 * share)} %`;
@@ -7,7 +8,7 @@ const percentText = (share) => `${Math.round(100 * share)} %`;
 export class ImportanceCard {
   constructor(card, source) {
     Object.assign(this, { card, source });
-    this.numEnded = -1;
+    this.ended = new Ended();
     this.isAsking = false;
     this.caption = el("p", { class: "quiet small" });
     this.rows = el("ul", { class: "shares" });
@@ -15,14 +16,11 @@ export class ImportanceCard {
     card.append(el("div", { class: "card-head" }, el("h2", {}, "What mattered")), this.caption, this.rows, this.notes);
   }
 
-  // It is asked for again when a tenth more trials have ended: reading all of them takes the service a while.
+  // It is asked for again as trials end.
   async follow(sweep) {
-    const ended = ["completed", "failed", "stopped"].reduce((sum, status) => sum + (sweep.counts[status] ?? 0), 0);
-    const isLast = ended === sweep.num_trials && ended !== this.numEnded;
     setText(this.caption, this.caption.textContent || "Said once some trials have ended.");
-    if (this.isAsking || ended === 0 || !(isLast || this.numEnded < 0 || ended >= 1.1 * this.numEnded + 1)) return;
+    if (this.isAsking || !this.ended.isDue(sweep)) return;
     this.isAsking = true;
-    this.numEnded = ended;
     try {
       this.show(await this.source.importance());
     } catch (error) {

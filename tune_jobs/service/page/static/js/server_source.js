@@ -45,6 +45,11 @@ export class ServerSource {
     return ask(ofSweep(this.name, "/importance"));
   }
 
+  // Score against cost, as far as trials have ended.
+  front() {
+    return ask(ofSweep(this.name, "/front"));
+  }
+
   // What a finished sweep has come to: the paths of its files, and both answers; null: there is no policy yet.
   async outcome() {
     const files = new Set((await ask(ofSweep(this.name, "/files"))).map((file) => file.path));

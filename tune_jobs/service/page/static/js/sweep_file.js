@@ -45,7 +45,7 @@ const spec = is.object({
   algorithm: is.text,
   env: (value, place) => (typeof value === "string" ? { id: value } : is.object({ id: is.text })(value, place)),
   space: maybe(is.mapOf(domain, MOST_HYPERPARAMS), Object.create(null)),
-  objective: section({ threshold: maybe(is.number) }),
+  objective: section({ threshold: maybe(is.number), cost: maybe(is.text) }),
   stop: section({ evaluation_return: maybe(is.number), training_return: maybe(is.number) }),
 });
 
@@ -128,6 +128,50 @@ const importance = is.object({
   notes: names,
 });
 
+// A mean of counts; drawn to a log scale it is above 0.
+function cost(value, place) {
+  if (is.number(value, place) < 0) throw new is.Unfit(`${place} is below 0.`);
+  return value;
+}
+
+const frontPoint = is.object({
+  rank: is.count,
+  point_index: is.count,
+  point,
+  num_seeds: is.count,
+  score: maybe(is.number),
+  expected: is.number,
+  num_env_steps: cost,
+  lower: maybe(is.number),
+  upper: maybe(is.number),
+});
+
+const frontPoints = is.listOf(frontPoint, 1000);
+const frontOf = is.object({
+  points: frontPoints,
+  num_on_front: is.count,
+  undecided: maybe(frontPoints, []),
+  num_undecided: maybe(is.count),
+  cheapest_near: frontPoint,
+});
+
+function someFront(value, place) {
+  const found = frontOf(value, place);
+  if (!found.points.length) throw new is.Unfit(`${place}.points is empty.`);
+  return found;
+}
+
+const front = is.object({
+  num_settings: is.count,
+  front: maybe(someFront),
+  others: is.listOf(
+    is.object({ rank: is.count, point_index: is.count, expected: is.number, num_env_steps: cost }),
+  ),
+  costs_lie_far_apart: is.flag,
+  cheapest_near: is.text,
+  about: names,
+});
+
 const setting = is.object({
   point,
   scores: is.listOf(maybe(is.number)),
@@ -156,6 +200,7 @@ const document = is.object({
   trials: is.listOf(trial, MOST_TRIALS),
   curves: is.mapOf(curve),
   importance: maybe(importance),
+  front: maybe(front),
   best: maybe(best),
 });
 

@@ -6,6 +6,7 @@ import { makeAlert, notYet, refusal } from "./dialogs.js";
 import { colour, el, isTyping, setAttribute } from "./dom.js";
 import { filterOf } from "./filter.js";
 import { Finished } from "./finished.js";
+import { FrontCard } from "./front_card.js";
 import { ImportanceCard } from "./importance.js";
 import { Parallel } from "./parallel.js";
 import { keep } from "./route.js";
@@ -71,6 +72,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     finished: card("Result", "finished"),
     curves: card("Learning curves", "curves"),
     best: card("Best so far", "best-card"),
+    front: card("Score against cost", "front"),
     parallel: card("Values and scores", "values"),
     importance: card("Importance", "importance"),
     timeline: card("Timeline", "timeline"),
@@ -80,6 +82,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
   const finished = new Finished(cards.finished, source, { onOpen: open });
   const curves = new CurvesChart(cards.curves, { onOpen: open, onMetric: (metric) => change({ metric }) });
   const best = new BestChart(cards.best, { onOpen: open });
+  const front = new FrontCard(cards.front, source, { onOpen: open });
   const parallel = new Parallel(cards.parallel, { onRange: setRange, onOpen: open });
   const importance = new ImportanceCard(cards.importance, source);
   const timeline = new Timeline(cards.timeline, { isOpen: route.params.timeline === "open", onOpen: open });
@@ -251,6 +254,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
     showHead();
     show();
     importance.follow(data.summary);
+    front.follow(data);
   }
 
   return {
@@ -265,7 +269,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
       isClosed = true;
       followed.close();
       removeEventListener("keydown", shortcut);
-      for (const part of [actions, curves, best, parallel, timeline, table, panel]) part.close();
+      for (const part of [actions, curves, best, front, parallel, timeline, table, panel]) part.close();
     },
   };
 }
