@@ -19,6 +19,7 @@ from ray.rllib.core.rl_module.apis import TargetNetworkAPI
 from torch import Tensor
 
 from policies.hyperparams import DQNHyperparams
+from policies.networks.denormals import denormals_as_zero
 from policies.replay import ReplayBuffer, Transitions
 from policies.schedules import linear
 
@@ -76,6 +77,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
         hyperparams = self.hyperparams
         return linear(hyperparams.lr, hyperparams.lr_final, hyperparams.lr_decay_steps, num_env_steps)
 
+    @denormals_as_zero()
     def update_from_replay(
         self, replay: ReplayBuffer, num_updates: int, *, num_env_steps: int, num_new_steps: int, num_episodes: int
     ) -> dict[str, float]:

@@ -25,6 +25,7 @@ from ray.rllib.utils.torch_utils import explained_variance
 from torch import Tensor
 
 from policies.errors import CheckpointError
+from policies.networks.denormals import denormals_as_zero
 from policies.return_statistics import ReturnStatistics, discounted_returns
 from policies.rllib.ruined import check_gradients, check_outputs
 from policies.schedules import linear
@@ -77,6 +78,11 @@ class PPOLearner(PPOTorchLearner):  # type: ignore[misc]
         self.return_statistics = ReturnStatistics()
         self._returns: dict[str, NDArray[np.float64]] = {}
         """The discounted return of each running episode, (1,), by the episode's id."""
+
+    def update(self, *args: Any, **kwargs: Any) -> Any:
+        """Make RLlib's updates, in which denormal numbers count as zero."""
+        with denormals_as_zero():
+            return super().update(*args, **kwargs)
 
     def compute_loss_for_module(self, *, module_id: str, config: Any, batch: Any, fwd_out: dict[str, Any]) -> Any:
         """Return RLlib's loss, with a range of values where there is one.

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import DQNHyperparams
+from policies.networks.denormals import denormals_as_zero
 from policies.packed.dqn import loss as dqn
 from policies.packed.dqn.replay import Drawn, StackedReplay
 from policies.packed.member import TARGET_PREFIX, Member
@@ -103,6 +104,7 @@ class DQNGroup:
         """Return Q-values or advantages, (M, N, A), for prepared observations, (M, N, D)."""
         return self._acting(observations)[..., : self._num_actions]
 
+    @denormals_as_zero()
     def learn(self, numbers: NDArray[np.float64], num_new_steps: int, *, wants_stats: bool) -> list[dict[str, float]]:
         """Make the updates of one training phase.
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import PPOHyperparams
+from policies.networks.denormals import denormals_as_zero
 from policies.packed.member import Member
 from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, clip_by_global_norm
@@ -117,6 +118,7 @@ class PPOGroup:
             return self._networks.forward(observations)[..., -1]
         return self._networks.evaluate(observations, num_members, 2 * num_members)[..., 0]
 
+    @denormals_as_zero()
     def learn(self, batch: Batch) -> None:
         """Make the updates of one iteration, or on a GPU start them; `finish` has to be called next."""
         shared = self._shared
