@@ -100,14 +100,46 @@ def test_who_selects_seldom_keeps_what_it_has_meanwhile_and_is_saved_for_the_oth
     assert {weights for weights in opened if not weights.endswith("@8")} == {f"{name}@0" for name in SLOW}
 
 
-def test_a_sweep_that_is_resumed_selects_when_it_would_have(tmp_path: Path) -> None:
-    score = random_scores(3, 40)
-    whole = Packs(tmp_path / "whole", 8, score, MF).run()
-    packs = Packs(tmp_path / "killed", 8, score, MF)
-    # After the comparison at 400 all trained on, and none came to 600.
-    packs.run(until=lambda: all(one.num_env_steps == 500 for one in packs.records()))
+@pytest.mark.parametrize("frequencies", [[1], [1, 2]])
+@pytest.mark.parametrize("stops", [False, True])
+def test_a_sweep_that_is_resumed_is_compared_where_it_would_have_been(
+    tmp_path: Path, frequencies: list[int], stops: bool
+) -> None:
+    score, scheduler = random_scores(3, 40), {**MF, "frequencies": frequencies}
+    whole = Packs(tmp_path / "whole", 8, score, scheduler).run()
+    packs = Packs(tmp_path / "killed", 8, score, scheduler)
+    # Those of one pack wait at 400, where all are compared, those of the other have not come there.
+    packs.run(until=lambda: {400} < {one.num_env_steps for one in packs.records()})
+    if stops:
+        packs.store.request_stop()
+        packs.run()
+        packs.store.clear_stop_request()
+    assert not of(packs, 400)
+    before = {record.trial_id for record in packs.records() if record.num_env_steps == 400}
+    assert 0 < len(before) < 8
     packs.begin()
     packs.run()
     assert {record.status for record in packs.records()} == {"completed"}
     assert packs.changes() == whole.changes()
+
+
+def test_a_sweep_that_is_resumed_between_two_comparisons_selects_when_it_would_have(tmp_path: Path) -> None:
+    score = random_scores(3, 40)
+    whole = Packs(tmp_path / "whole", 8, score, MF).run()
+    packs = Packs(tmp_path / "killed", 8, score, MF)
+    packs.run(until=lambda: all(one.num_env_steps == 500 for one in packs.records()))
+    packs.begin()
+    packs.run()
+    assert packs.changes() == whole.changes()
     assert times(packs, SLOW) == [400, 800]
+
+
+def test_trials_that_are_added_do_not_hold_back_those_that_are_far_ahead(tmp_path: Path) -> None:
+    packs = Packs(tmp_path, 8, random_scores(3, 40), {**MF, "frequencies": [1]})
+    for record in packs.records()[:4]:
+        known = {"num_iterations": 6, "num_env_steps": 600, "evaluation_return": 1.0}
+        packs.store.trial(record.trial_id).write_record(record.model_copy(update=known))
+    packs.begin()
+    population = packs.population()
+    population.in_step()
+    assert [population.due_at(record.trial_id) for record in packs.records()] == [800] * 4 + [200] * 4

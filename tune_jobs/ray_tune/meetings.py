@@ -74,6 +74,7 @@ class PopulationMeeting:
 
     def __init__(self, population: Population) -> None:
         self._population = population
+        self._has_met = False
         self._live: dict[str, Standing | None] = {}
         """The trials that have not ended, in the order in which they began; None: it has not arrived."""
         self._gone: set[str] = set()
@@ -85,6 +86,10 @@ class PopulationMeeting:
 
     def due_at(self, trial_id: str) -> int:
         """Return the end of the present interval."""
+        if not self._has_met:
+            # All have begun now, so it is known who of a resumed sweep is ahead of the others.
+            self._has_met = True
+            self._population.in_step()
         return self._population.due_at(trial_id)
 
     def reached(self, standing: Standing, others: object) -> Decision:  # noqa: ARG002 (it is compared where it waits)

@@ -101,6 +101,22 @@ class Population:
         due_from, selected_from = (steps // each * each for each in (interval, self._frequencies[own] * interval))
         self._members[trial_id] = _Compared(steps, due_from, score if steps else None, own, selected_from)
 
+    def in_step(self) -> None:
+        """Let trials that are where they wait for the others be compared there, in a sweep that is resumed.
+
+        Where all are compared at once, nobody is trained beyond the next comparison. So the last one was where those
+        who are furthest behind come from, or a later one that changed somebody, as records may be older than changes.
+        """
+        interval = self._spec.perturb_every_env_steps
+        changes = [change.num_env_steps for name in self._members for change in self._read(name).changes]
+        known = {member.due_from for member in self._members.values()}
+        last = max(min(known), max(changes, default=0) // interval * interval)
+        if not known <= {last - interval, last, last + interval}:
+            return  # some were added, and are compared when they have come as far as they have to
+        for member in self._members.values():
+            own = self._frequencies[member.subpopulation] * interval
+            member.due_from, member.selected_from = last, last // own * own
+
     def compared_at(self, trial_id: str) -> int:
         """Return the env steps at which a trial was compared last, or at which it began if it never was."""
         return self._members[trial_id].num_env_steps
