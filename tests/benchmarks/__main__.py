@@ -12,11 +12,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from tests.benchmarks import dqn, objects, populations, ppo, workload
+from tests.benchmarks import beside, dqn, objects, populations, ppo, workload
 from tests.benchmarks.cluster import rows as cluster
 from tests.benchmarks.service import rows as service
 
-_TOGETHER = ("ppo", "many", "dqn", "populations", "service", "objects")
+_TOGETHER = ("ppo", "many", "dqn", "beside", "populations", "service", "objects")
 _PARTS = (*_TOGETHER, "cluster", "largest")
 """`cluster` takes an hour, with 10,000 trials and a cluster of its own; `largest` is the last of those alone."""
 
@@ -47,6 +47,7 @@ def _rows(part: str, options: argparse.Namespace) -> list[ppo.Row]:
         "ppo": lambda: ppo.rows(options) + ppo.command_rows(),
         "many": lambda: ppo.many_rows(options.env_steps),
         "dqn": lambda: dqn.rows(options.repeats, options.dqn_env_steps, peers=not options.no_peers),
+        "beside": lambda: beside.rows(options.repeats),
         "populations": lambda: populations.rows(options),
         "service": lambda: service.rows(options.repeats, options.hours),
         "objects": lambda: objects.rows(options.repeats),

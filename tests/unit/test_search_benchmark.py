@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 
+from tests.benchmarks.search import envs
 from tests.benchmarks.search import trainings as module
 from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run, run_all
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
-from tests.benchmarks.search.trainings import Trainings, Wanted
+from tests.benchmarks.search.trainings import ENVS, Trainings, Wanted
 from tune_jobs.search.proposal import next_point
 
 TASK = TASKS["cartpole-ppo"]
@@ -187,3 +188,15 @@ def _small(data: dict[str, Any]) -> Task:
     small = Task("small", {})
     vars(small)["spec"] = load_spec(data)
     return small
+
+
+def test_the_time_limit_of_mountain_car_is_an_end() -> None:
+    env = envs.make()
+    env.reset(seed=0)
+    ends = [env.step(1)[2:4] for _ in range(200)]
+    assert ends == [(False, False)] * 199 + [(True, False)]
+    assert (
+        TASKS["mountaincar-dqn"].spec.env.id
+        == f"{envs.__name__}:EndingMountainCar-v0"
+        == f"{ENVS}:EndingMountainCar-v0"
+    )

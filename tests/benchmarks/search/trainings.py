@@ -23,6 +23,8 @@ from tune_jobs.plan.engine_choice import pack_key
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 
+ENVS = "tests.benchmarks.search.envs"
+"""The module of the environments that a task may name."""
 MAX_AT_ONCE = 24
 """Trainings in a pack; more gain little, and one that a kill takes with it is lost."""
 
@@ -110,11 +112,13 @@ def train(task: Task, wanted: Sequence[tuple[dict[str, Any], int]]) -> list[floa
     """
     from policies.acting.evaluate import Episodes, Evaluator
     from policies.acting.load import policy_from_portable
+    from policies.envs.modules import allow_modules
     from policies.packed.evaluation import evaluate_many
     from tune_jobs.training.packed import PackedEngine
     from tune_jobs.training.protocol import TrialTask
 
     spec = task.spec
+    allow_modules([ENVS])
     engine = PackedEngine()
     names = [f"t{index:04d}" for index in range(len(wanted))]
     for name, (point, seed) in zip(names, wanted, strict=True):
