@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +45,10 @@ def build_report(
     trials: Sequence[TrialRecord],
     results: Mapping[str, Sequence[IterationRecord]],
     best: BestRecord | None,
-    videos: Mapping[str, Path],
+    videos: Mapping[str, Path] | Callable[[], Mapping[str, Path]],
     why_no_best: tuple[str, str] | None = None,
     settings: SettingsRecord | None = None,
+    before_each: Callable[[], None] = lambda: None,
 ) -> Path:
     """Write the report of a sweep.
 
@@ -59,8 +60,10 @@ def build_report(
         results: Iterations by trial id, oldest first; a trial may have none.
         best: The confirmed winner; None: the report says why there is none.
         videos: Files to embed, by "before", "after" or another name; those that do not exist are left out.
+            A function returns them once all else is made, as they may not be there before.
         why_no_best: Why the winner could not be confirmed, and what to do; None: the reason is found in the trials.
         settings: The settings as they are judged now; None: those of the winner's record.
+        before_each: Called before each figure is drawn; what it raises ends this.
 
     Returns:
         Path of index.html.
@@ -78,11 +81,10 @@ def build_report(
     source = Source(place, sweep, trials, results, best, goal, why_no_best, settings)
     page = _render(
         source=source,
-        figures=draw_figures(source, target / "figures"),
-        charts=charts.make(source, target / "figures"),
+        figures=draw_figures(source, target / "figures", before_each),
+        charts=charts.make(source, target / "figures", before_each),
         head=head.section(source),
         answer=answer.section(source),
-        cards=cards.section(source, videos),
         how_sure=how_sure.section(source),
         front=front.section(source),
         mattered=mattered.section(source),
@@ -90,6 +92,7 @@ def build_report(
         next_steps=next_steps.section(source),
         trials=all_trials.section(source),
         repeat=repeat.section(source),
+        cards=cards.section(source, videos() if callable(videos) else videos),
     )
     write_atomic(target / "index.html", page)
     return target / "index.html"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,12 +35,13 @@ class Charts:
     """JSON, for the page's script."""
 
 
-def make(source: Source, folder: Path) -> Charts:
+def make(source: Source, folder: Path, before_each: Callable[[], None] = lambda: None) -> Charts:
     """Make the charts of a sweep, and write each that has data as SVG and PDF.
 
     Args:
         source: The sweep.
         folder: The folder that the files are written to.
+        before_each: Called before each chart is drawn; what it raises ends this.
 
     Raises:
         CannotRunError: A file cannot be written.
@@ -53,6 +54,7 @@ def make(source: Source, folder: Path) -> Charts:
     for chart in charts:
         picture = None
         if chart.data is not None:
+            before_each()
             svg = write_figure(draw(chart), folder / chart.id)
             # Markup marks text as safe HTML: `page_svg` escapes all that is not its own, as `to_json` does.
             picture = Markup(page_svg(svg, label=chart.title, prefix=chart.id))  # noqa: S704

@@ -52,18 +52,22 @@ class DrawnFigure:
     narrow: Markup
 
 
-def draw_figures(source: Source, folder: Path) -> Mapping[Section, list[DrawnFigure]]:
+def draw_figures(
+    source: Source, folder: Path, before_each: Callable[[], None] = lambda: None
+) -> Mapping[Section, list[DrawnFigure]]:
     """Draw all figures for which there is data, for the page, and write each as PNG, SVG and PDF.
 
     Args:
         source: The sweep.
         folder: The folder that the files are written to.
+        before_each: Called before each figure is drawn; what it raises ends this.
 
     Raises:
         CannotRunError: A file cannot be written.
     """
     drawn: dict[Section, list[DrawnFigure]] = {"how_sure": [], "mattered": [], "learning": [], "cost": []}
     for picture in pictures(source):
+        before_each()
         wide = write_figure(picture.draw(_WIDE), folder / picture.stem, png=True)
         if picture.is_on_page:
             narrow = to_svg_file(picture.draw(_NARROW))

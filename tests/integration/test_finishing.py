@@ -5,6 +5,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from policies.errors import EnvFailedError
 from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.process.interruption import taking_signals
 from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude as finish
@@ -134,6 +137,71 @@ def test_an_env_that_cannot_be_drawn_is_no_failure(sweep_of: Callable[..., Sweep
     result = finished(store)
     assert (result.exit_code, result.best is None) == (0, False)
     assert "cannot be drawn: ValueError: the motor broke" in result.notes[0]
+
+
+def as_films(store: SweepStore) -> dict[str, Path]:
+    """Film the winner, as it were."""
+    with store.writing_films() as paths:
+        for path in paths.values():
+            path.write_bytes(b"a film")
+    return dict(store.films())
+
+
+def page_of(store: SweepStore) -> Path:
+    return store.report_folder / "index.html"
+
+
+def test_the_report_is_drawn_while_films_are_made_and_shows_them(
+    sweep_of: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def film(store: SweepStore) -> dict[str, Path]:
+        until = time.monotonic() + 120
+        while not list(store.report_folder.glob("figures/*.svg")):
+            assert time.monotonic() < until, "no figure is drawn meanwhile"
+            time.sleep(0.05)
+        assert not page_of(store).exists()
+        return as_films(store)
+
+    monkeypatch.setattr(finish, "make_videos", film)
+    store = sweep_of(how="fail", where="close")
+    result = finished(store)
+    assert (result.notes, result.artifacts["report"]) == ((), page_of(store))
+    assert list(result.artifacts)[-1] == "report"
+    assert page_of(store).read_text(encoding="utf-8").count("data:video/mp4") == 2
+    assert store.current_report() == page_of(store)
+
+
+def test_a_report_is_given_up_where_the_films_are_interrupted(
+    sweep_of: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def film(_: SweepStore) -> dict[str, Path]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(finish, "make_videos", film)
+    store = sweep_of(how="fail", where="close")
+    with taking_signals():
+        result = finished(store)
+    assert result.interrupted
+    assert "report" not in result.artifacts
+    assert not page_of(store).exists()
+    assert "tune-jobs-report" not in {thread.name for thread in threading.enumerate()}
+
+
+@pytest.mark.parametrize("is_link", [True, False])
+def test_a_report_that_cannot_be_written_is_told_and_films_are_made(
+    sweep_of: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch, *, is_link: bool
+) -> None:
+    monkeypatch.setattr(finish, "make_videos", as_films)
+    store = sweep_of(how="fail", where="close")
+    # Where its folder belongs: one is refused before anything is drawn, the other when the first file is written.
+    if is_link:
+        store.report_folder.symlink_to(store.best_folder)
+    else:
+        store.report_folder.write_text("mine")
+    result = finished(store)
+    assert "after_mp4" in result.artifacts
+    (note,) = result.notes
+    assert note.startswith("No report: ")
 
 
 @pytest.mark.parametrize("call", [sweeps.best, sweeps.evaluate, sweeps.video])

@@ -30,6 +30,7 @@ from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
 from tune_jobs.store.opening import name_for_commands
+from tune_jobs.sweeps.drawing import ReportMatter, videos_of
 from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
 from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.sources import find_sweep
@@ -333,9 +334,6 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
         store: The sweep.
         why_no_best: Why its winner could not be confirmed just now; None: it was confirmed, or this was not tried.
     """
-    from analysis.report import build_report
-    from analysis.report_data import goal_of
-
     best = None
     if why_no_best is None:
         try:
@@ -344,24 +342,10 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
             why_no_best = error
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None
-    with store.reading():
-        record, trials, results = store.read_record(), read_trials(store), read_results(store)
-    threshold = goal_of(record, None) if best is None else best.confirmation.threshold
-    films = store.films()
-    videos = {name: films[key] for name, key in (("before", "before_mp4"), ("after", "after_mp4")) if key in films}
+    matter = ReportMatter.read(store, best, why_no_best)
+    videos = videos_of(store) if why_no_best is None else {}
     with store.writing_report() as target:
-        page = build_report(
-            store.place,
-            target=target,
-            sweep=record,
-            trials=trials,
-            results=results,
-            best=best,
-            settings=judged(stored_spec(record), trials, results, threshold),
-            why_no_best=None if why_no_best is None else (why_no_best.message, why_no_best.hint),
-            videos=videos if why_no_best is None else {},
-        )
-        name = page.relative_to(target).as_posix()
+        name = matter.write(target, videos)
     return store.report_files()[name]
 
 

@@ -80,16 +80,34 @@ class _Finish:
         except TuneJobsError as error:
             self._why = error
         self.failed = self._why is not None
+        if self.best is not None and not kept:
+            self._films_and_report(self.best)
+            return
         if self.best is not None:
-            films = dict(store.current_films()) if kept else {}
+            films = dict(store.current_films())
             self.artifacts.update(films)
             if not films:
-                self._attempt("video", "filming the best policy", lambda: finish.make_videos(store))
+                self._film()
         page = store.current_report() if kept else None
         if page is not None:
             self.artifacts["report"] = page
         else:
             self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
+
+    def _films_and_report(self, best: BestRecord) -> None:
+        """Film the winner, and draw the report meanwhile."""
+        from tune_jobs.sweeps.drawing import DrawnReport
+
+        if self._asked_to_stop():
+            return
+        with DrawnReport(self._store, best) as report:
+            self._film()
+            self._attempt("report", "writing the report", lambda: {"report": report.written()})
+
+    def _film(self) -> None:
+        from tune_jobs.sweeps import conclude as finish
+
+        self._attempt("video", "filming the best policy", lambda: finish.make_videos(self._store))
 
     def _working(self, doing: str) -> AbstractContextManager[None]:
         from tune_jobs.sweeps.live_view import working
@@ -97,9 +115,7 @@ class _Finish:
         return working(self._store.name, doing, self._progress)
 
     def _attempt(self, what: str, doing: str, make: Callable[[], dict[str, Path]]) -> None:
-        # Another process may have asked to stop, which ends this too.
-        self.stopped = self.stopped or self._store.stop_requested()
-        if self.stopped:
+        if self._asked_to_stop():
             return
         try:
             with self._working(doing):
@@ -108,3 +124,8 @@ class _Finish:
             self.notes.append(f"No {what}: {error}")
             # Other errors are expected, as not every environment can be drawn.
             self.failed = self.failed or isinstance(error, EnvFailedError)
+
+    def _asked_to_stop(self) -> bool:
+        # Another process may have asked to stop, which ends this too.
+        self.stopped = self.stopped or self._store.stop_requested()
+        return self.stopped

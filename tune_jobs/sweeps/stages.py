@@ -16,6 +16,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing
 from tune_jobs.sweeps.confirm import points_to_confirm
+from tune_jobs.sweeps.drawing import import_ahead
 from tune_jobs.sweeps.drive import Shared, close_if_open, run_trials_of
 from tune_jobs.sweeps.finishing import finish_sweep
 from tune_jobs.sweeps.lost_storage import told_if_it_is_gone
@@ -111,6 +112,9 @@ def _run_sweep(
             result = run_trials_of(
                 store, plan, shared, address=address, machine=machine, progress=progress, told=told
             )  # fmt: skip
+        if finish and not result.interrupted and not current().came:
+            # Ray's end and what is played next leave this process little to do.
+            import_ahead()
     if result.interrupted or not finish:
         return result
     if current().came:
