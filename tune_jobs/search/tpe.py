@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 from policies import random_streams
 from policies.errors import SpecError
 from tune_jobs.search.asking import Check, Question
-from tune_jobs.search.coordinates import distribution_of, from_optuna, to_optuna
-from tune_jobs.search.history import KnownPoint
+from tune_jobs.search.coordinates import distribution_of, from_optuna
 from tune_jobs.spec.domains import Domain
 
 if TYPE_CHECKING:
@@ -37,6 +36,8 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     """
     import optuna
 
+    from tune_jobs.search.told_trials import told
+
     with warnings.catch_warnings():
         # Optuna 4 warns of arguments that are new in it.
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -51,7 +52,7 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     try:
         study = optuna.create_study(direction="maximize", sampler=sampler)
         distributions = {name: distribution_of(domain) for name, domain in question.space.items()}
-        study.add_trials([_told(question.space, distributions, known) for known in question.known])
+        study.add_trials([told(question.space, distributions, known) for known in question.known])
         return _first_valid(study, question.space, distributions, check)
     finally:
         optuna.logging.set_verbosity(verbosity)
@@ -77,21 +78,3 @@ def _first_valid(
         else:
             return point
     raise last_error
-
-
-def _told(
-    space: Mapping[str, Domain], distributions: dict[str, optuna.distributions.BaseDistribution], known: KnownPoint
-) -> optuna.trial.FrozenTrial:
-    """Return a point as a trial of Optuna's."""
-    import optuna
-
-    states = optuna.trial.TrialState
-    told: dict[str, Any] = {"state": states.PRUNED}
-    if known.is_running:
-        told = {"state": states.RUNNING}
-    elif known.score is not None and known.level is None:
-        told = {"state": states.COMPLETE, "value": known.score}
-    elif known.score is not None:
-        told = {"state": states.PRUNED, "intermediate_values": {known.level: known.score}}
-    params = {name: to_optuna(domain, known.point[name]) for name, domain in space.items()}
-    return optuna.trial.create_trial(params=params, distributions=distributions, **told)

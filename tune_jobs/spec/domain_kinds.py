@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Generator
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -110,11 +111,15 @@ class Listed(AnyDomain):
         Raises:
             ValueError: The value isn't in the list.
         """
-        return [json.dumps(known) for known in self.values].index(json.dumps(value))
+        return self._texts.index(json.dumps(value))
 
     @override
     def gives(self, value: Any) -> bool:
-        return json.dumps(value) in map(json.dumps, self.values)
+        return json.dumps(value) in self._texts
+
+    @cached_property
+    def _texts(self) -> list[str]:
+        return [json.dumps(known) for known in self.values]
 
     @override
     def probes(self) -> list[tuple[int | None, Any]]:
