@@ -56,7 +56,7 @@ class Work:
         return {
             "env": self.env_id,
             "algorithm": self.algorithm,
-            "hyperparams": self.hyperparams | {"lr": self.lrs[0]},
+            "hyperparams": {name: value for name, value in self.hyperparams.items() if name != "lr"},
             "space": {"lr": {"grid": self.lrs}},
             "stop": {"num_env_steps": self.num_env_steps},
             "evaluation": {"every_iterations": 100_000, "num_episodes": 10},
