@@ -7,6 +7,7 @@ an RLlib algorithm and back.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.packed.convolutions import Convolution
 from policies.packed.sizes import group_key
 from policies.return_statistics import ReturnStatistics
 
@@ -80,16 +82,36 @@ class MemberStats:
 
 @dataclass(frozen=True)
 class Part:
-    """One linear layer of the RLModule: some columns of a layer of the stack."""
+    """One layer of the RLModule: some columns of a layer of the stack."""
 
     name: str
     start: int
     stop: int
+    planes: tuple[int, int, int] | None = None
+    """(channels, height, width) of a kernel or of the images that a dense layer gets: the order of the RLModule's
+    weights, while a stack has channels last. None: inputs are vectors."""
+    is_kernel: bool = False
+    """Whether it is a convolution."""
+
+    def as_matrix(self, weight: NDArray[Any]) -> NDArray[Any]:
+        """Return the RLModule's weight as the stack's matrix, (inputs, outputs)."""
+        if self.planes is not None:
+            weight = weight.reshape(-1, *self.planes).transpose(0, 2, 3, 1).reshape(len(weight), -1)
+        return np.ascontiguousarray(weight.T)
+
+    def as_weight(self, matrix: NDArray[Any]) -> NDArray[Any]:
+        """Return a matrix of the stack as the RLModule's weight; the inverse of `as_matrix`."""
+        weight = matrix.T
+        if self.planes is not None:
+            channels, height, width = self.planes
+            weight = weight.reshape(-1, height, width, channels).transpose(0, 3, 1, 2)
+            weight = weight if self.is_kernel else weight.reshape(len(weight), -1)
+        return np.array(weight, order="C")
 
 
 @dataclass(frozen=True)
 class NetworkLayout:
-    """The linear layers of the RLModule that make one network of a stack, from input to output."""
+    """The layers of the RLModule that make one network of a stack, from input to output."""
 
     layers: tuple[tuple[Part, ...], ...]
 
@@ -97,7 +119,7 @@ class NetworkLayout:
         """Copy an RLModule's weights into the layers of one row, each of shape (inputs + 1, outputs)."""
         for parts, layer in zip(self.layers, layers, strict=True):
             for part in parts:
-                matrix = torch.from_numpy(np.ascontiguousarray(weights[f"{prefix}{part.name}.weight"].T))
+                matrix = torch.from_numpy(part.as_matrix(weights[f"{prefix}{part.name}.weight"]))
                 layer[: len(matrix), part.start : part.stop] = matrix
                 layer[-1, part.start : part.stop] = torch.from_numpy(weights[f"{prefix}{part.name}.bias"])
 
@@ -107,18 +129,22 @@ class NetworkLayout:
         for parts, layer in zip(self.layers, layers, strict=True):
             for part in parts:
                 columns = layer[:, part.start : part.stop].detach().cpu().numpy()
-                weights[f"{prefix}{part.name}.weight"] = np.array(columns[:num_inputs].T, order="C")
+                num_inputs = num_inputs if part.planes is None else math.prod(part.planes)
+                weights[f"{prefix}{part.name}.weight"] = part.as_weight(columns[:num_inputs])
                 weights[f"{prefix}{part.name}.bias"] = np.array(columns[-1])
             num_inputs = parts[-1].stop
         return weights
 
 
-def network_layouts(hyperparams: TrainedHyperparams, num_outputs: int) -> tuple[NetworkLayout, ...]:
+def network_layouts(
+    hyperparams: TrainedHyperparams, num_outputs: int, convolutions: Sequence[Convolution] = ()
+) -> tuple[NetworkLayout, ...]:
     """Return the layouts of one member's networks.
 
     Args:
         hyperparams: The member's.
         num_outputs: PPO: the number of outputs of the policy's head; DQN: the number of actions.
+        convolutions: The sizes of its convolutions.
 
     Returns:
         PPO: the policy and the value function, or both in one if they share layers; DQN: the Q-network. The value is
@@ -127,23 +153,32 @@ def network_layouts(hyperparams: TrainedHyperparams, num_outputs: int) -> tuple[
     value = Part("vf", num_outputs, num_outputs + 1)
     if isinstance(hyperparams, DQNHyperparams):
         heads = [Part("af", 0, num_outputs), *([value] if hyperparams.dueling else [])]
-        return (_layout(hyperparams, "encoder", heads),)
+        return (_layout(hyperparams, "encoder", heads, convolutions),)
     policy = Part("pi", 0, num_outputs)
     if hyperparams.vf_share_layers:
-        return (_layout(hyperparams, "encoder.encoder", [policy, value]),)
+        return (_layout(hyperparams, "encoder.encoder", [policy, value], convolutions),)
     return (
-        _layout(hyperparams, "encoder.actor_encoder", [policy]),
-        _layout(hyperparams, "encoder.critic_encoder", [Part("vf", 0, 1)]),
+        _layout(hyperparams, "encoder.actor_encoder", [policy], convolutions),
+        _layout(hyperparams, "encoder.critic_encoder", [Part("vf", 0, 1)], convolutions),
     )
 
 
-def _layout(hyperparams: TrainedHyperparams, encoder: str, heads: list[Part]) -> NetworkLayout:
+def _layout(
+    hyperparams: TrainedHyperparams, encoder: str, heads: list[Part], convolutions: Sequence[Convolution]
+) -> NetworkLayout:
     # Layers with weights are at every other index, with the activations (none if linear) between them.
     step = 1 if hyperparams.activation == "linear" else 2
+    kernels, planes = [], None
+    for number, one in enumerate(convolutions):
+        kernel = (one.image[2], one.kernel, one.kernel)
+        kernels.append((Part(f"{encoder}.conv.{number * step}", 0, one.num_filters, kernel, is_kernel=True),))
+        height, width, channels = one.out
+        planes = channels, height, width
     hidden = [
-        (Part(f"{encoder}.mlp.{number * step}", 0, size),) for number, size in enumerate(hyperparams.hidden_sizes)
+        (Part(f"{encoder}.mlp.{number * step}", 0, size, None if number else planes),)
+        for number, size in enumerate(hyperparams.hidden_sizes)
     ]
-    return NetworkLayout((*hidden, tuple(heads)))
+    return NetworkLayout((*kernels, *hidden, tuple(heads)))
 
 
 def num_stack_outputs(hyperparams: TrainedHyperparams, num_outputs: int) -> int:

@@ -5,11 +5,13 @@ Shapes: M members, n networks per member; row k * M + m is network k of member m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
+from policies.packed.convolutions import convolutions_for
 from policies.packed.member import AnyMember, NetworkLayout, network_layouts, num_stack_outputs
 from policies.packed.networks import StackedNetworks
 from policies.packed.optimizers import StackedOptimizer
@@ -19,23 +21,26 @@ class StackedRows:
     """The stacked networks of some members, made from the members' own weights.
 
     Args:
-        members: Members with equally many layers and one activation.
-        num_inputs: Numbers per observation.
+        members: Members with equally many layers, one activation and the same convolutions.
+        shape: The shape of what networks see of an observation: (n,), or (height, width, channels).
         num_outputs: The number of outputs of a policy's head, or of actions.
         device: Where the weights lie.
         prefix: The prefix of the weights' names: that of the target networks, or none.
     """
 
     def __init__(
-        self, members: Sequence[AnyMember], num_inputs: int, num_outputs: int, device: str, prefix: str = ""
+        self, members: Sequence[AnyMember], shape: Sequence[int], num_outputs: int, device: str, prefix: str = ""
     ) -> None:
         first = members[0].hyperparams
-        self._members, self._num_inputs, self._prefix = members, num_inputs, prefix
-        self._layouts = [network_layouts(member.hyperparams, num_outputs) for member in members]
+        self._members, self._num_inputs, self._prefix = members, math.prod(shape), prefix
+        convolutions = convolutions_for(shape, first.conv_filters)
+        self._layouts = [network_layouts(member.hyperparams, num_outputs, convolutions) for member in members]
         self.networks_per_member = len(self._layouts[0])
         hidden = [max(sizes) for sizes in zip(*(member.hyperparams.hidden_sizes for member in members), strict=True)]
+        num_inputs = math.prod(convolutions[-1].out if convolutions else shape)
         sizes = (num_inputs, *hidden, num_stack_outputs(first, num_outputs))
-        self.networks = StackedNetworks(self.networks_per_member * len(members), sizes, first.activation, device)
+        num_networks = self.networks_per_member * len(members)
+        self.networks = StackedNetworks(num_networks, sizes, first.activation, device, convolutions)
         for _, layers, member, layout in self._rows(self.networks.layers):
             layout.write(layers, member.weights, prefix)
 

@@ -10,10 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from policies.envs.masks import FORBIDDEN
 from policies.networks.layers import OBSERVATION_CLIP, VARIANCE_EPSILON
+from policies.packed.inputs import Inputs
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, AnyMember
 
 Floats = NDArray[np.float32]
@@ -70,72 +73,82 @@ class EpisodeTracker:
 
 
 class Observations:
-    """Prepares observations for the networks: normalised by each member's own statistics, or unchanged.
+    """Prepares observations for the networks: bytes scaled, all normalised by each member's own statistics if asked to.
 
     Args:
         members: The members in the order of the rows.
         num_envs: Sub-environments per member, N.
         normalizes: Whether observations are normalised.
-        num_masked: The numbers of a mask, A.
+        seen: What networks see of observations, of which A numbers are a mask.
     """
 
-    def __init__(self, members: Sequence[AnyMember], num_envs: int, *, normalizes: bool, num_masked: int = 0) -> None:
+    def __init__(self, members: Sequence[AnyMember], num_envs: int, *, normalizes: bool, seen: Inputs) -> None:
         self._members, self._num_envs, self._normalizes = members, num_envs, normalizes
-        self._num_masked = num_masked
+        self._seen, self._num_masked = seen, seen.num_masked
         if normalizes:
             self._refresh()
 
     def _refresh(self) -> None:
-        self._mean = np.stack([member.weights[OBS_MEAN] for member in self._members])[:, None]
-        variance = np.stack([member.weights[OBS_VAR] for member in self._members])[:, None]
+        self._mean = np.stack([member.weights[OBS_MEAN].reshape(-1) for member in self._members])[:, None]
+        variance = np.stack([member.weights[OBS_VAR].reshape(-1) for member in self._members])[:, None]
         self._factor = (1.0 / np.sqrt(variance + np.float32(VARIANCE_EPSILON))).astype(np.float32)
 
-    def prepare(self, observations: Floats) -> Floats:
+    def prepare(self, observations: NDArray[Any]) -> Floats:
         """Return what networks see of observations: (S, W) as (M, N, D), or (T, S, W) as (T, M, N, D)."""
         if self._num_masked:
             # In one piece of memory, as other sums may be rounded otherwise.
             observations = np.ascontiguousarray(observations[..., self._num_masked :])
         num_members = len(self._members)
         x: Floats = observations.reshape(*observations.shape[:-2], num_members, -1, observations.shape[-1])
+        if self._seen.is_bytes:
+            x = x.astype(np.float32)
+            x *= np.float32(self._seen.scale)
         if not self._normalizes:
             return x
         scaled: Floats = (x - self._mean) * self._factor
         np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP, out=scaled)
         return scaled
 
-    def prepare_rows(self, rows: Floats, num_inputs: int) -> Floats:
-        """Prepare the observations in rows of a replay memory, (M, B, columns), in place, and return the rows."""
+    def prepare_bytes(self, images: Tensor) -> Tensor:
+        """Return what networks see of images of bytes, (M, B, D)."""
+        x = images.float()
+        x *= self._seen.scale
+        if self._normalizes:
+            mean, factor = (torch.from_numpy(part).to(x.device) for part in (self._mean, self._factor))
+            x = ((x - mean) * factor).clamp_(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+        return x
+
+    def prepare_columns(self, columns: Floats) -> None:
+        """Prepare observations in columns, (M, B, W or more), in place; those of bytes are prepared as tensors."""
         if self._normalizes:
             masked = self._num_masked
-            for first in (masked, masked + num_inputs + 1 + masked):
-                columns = rows[..., first : first + num_inputs]
-                columns -= self._mean
-                columns *= self._factor
-                np.clip(columns, -OBSERVATION_CLIP, OBSERVATION_CLIP, out=columns)
-        return rows
+            columns = columns[..., masked : masked + self._seen.num_inputs]
+            columns -= self._mean
+            columns *= self._factor
+            np.clip(columns, -OBSERVATION_CLIP, OBSERVATION_CLIP, out=columns)
 
     def part(self, start: int, stop: int) -> Observations:
         """Return the same for only the members from start to stop."""
-        return Observations(
-            self._members[start:stop], self._num_envs, normalizes=self._normalizes, num_masked=self._num_masked
-        )
+        return Observations(self._members[start:stop], self._num_envs, normalizes=self._normalizes, seen=self._seen)
 
-    def learn(self, observations: Floats) -> None:
+    def learn(self, observations: NDArray[Any]) -> None:
         """Add observations as the env returned them, (T, S, W), to each member's statistics."""
         if not self._normalizes:
             return
         observations = observations[..., self._num_masked :]
         rows = observations.reshape(len(observations), len(self._members), -1, observations.shape[-1])
         for index, member in enumerate(self._members):
-            merge_statistics(member, rows[:, index].reshape(-1, observations.shape[-1]))
+            merge_statistics(member, rows[:, index].reshape(-1, observations.shape[-1]), self._seen.scale)
         self._refresh()
 
 
-def merge_statistics(member: AnyMember, rows: Floats) -> None:
-    """Add observations, (B, D), to a member's statistics, as `ObservationStatistics` does."""
+def merge_statistics(member: AnyMember, rows: NDArray[Any], scale: float = 1.0) -> None:
+    """Add observations, (B, D), times a scale to a member's statistics, as `ObservationStatistics` does."""
     weights: dict[str, Any] = member.weights
     count, num_new = int(weights[OBS_COUNT]), len(rows)
-    batch = rows.astype(np.float64)
+    batch = rows.astype(np.float64).reshape(-1, *weights[OBS_MEAN].shape)
+    if scale != 1.0:
+        batch *= scale
     mean = batch.mean(axis=0)
     total = count + num_new
     delta = mean - weights[OBS_MEAN]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
-from policies.envs.masks import num_masked
 from policies.packed.envs.vector import PackedEnvs
+from policies.packed.inputs import Inputs
 from policies.packed.member import H, Member, MemberStats
 from policies.packed.sampling import EpisodeTracker
 from policies.packed.shared import Shared
@@ -47,8 +46,9 @@ class Stack(ABC, Generic[H, G, S]):
         # Stale: members came or went since the groups were made. Written: no group has learned since its weights were
         # copied back to the members, which is always so while the groups are stale.
         self._stale, self._is_written = False, True
-        self._num_masked = num_masked(envs.observation_space)
-        self._num_inputs = math.prod(envs.observation_space.shape or ()) - self._num_masked
+        self._seen = Inputs.of(envs.observation_space)
+        self._num_masked = self._seen.num_masked
+        self._num_inputs = self._seen.num_inputs
         """The numbers of an observation that networks see."""
 
     def add(self, member: Member[H], env_seed: int) -> None:

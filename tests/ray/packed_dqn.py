@@ -19,6 +19,7 @@ from policies.packed.dqn import loss as dqn
 from policies.packed.dqn.group import DQNGroup
 from policies.packed.dqn.replay import Drawn
 from policies.packed.envs.vector import EnvKind
+from policies.packed.inputs import Inputs
 from policies.packed.member import Member, Weights
 from policies.packed.sampling import Observations
 from policies.replay import Transitions
@@ -88,8 +89,13 @@ def add_noise_rows(stack: DQNStack, gamma: float = 0.9) -> None:
     """Transitions with rewards of all sizes and discounts of one to three steps, the same for all members."""
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(100, stack._replay.num_columns)).astype(np.float32)
-    num_masked, num_observed = stack._num_masked, stack._num_masked + stack._num_inputs
-    rows[:, [num_observed, -4]] = 1.0
+    seen, num_masked = stack._seen, stack._num_masked
+    middle, num_observed = seen.num_columns, seen.num_observed
+    if seen.is_bytes:
+        for start in (0, middle):
+            seen.put(rows[:, start : start + middle], rng.integers(0, 256, (100, num_observed)))
+    else:
+        rows[:, [num_observed, -4]] = 1.0
     rows[:, -3] = rng.integers(0, stack._num_actions, 100)
     if num_masked:
         for start in (0, num_observed + 1):
@@ -127,12 +133,17 @@ def read_gradients(group: DQNGroup, index: int) -> Weights:
     return layout.read([layer[index] for layer in views], group._num_inputs)
 
 
-def as_transitions(rows: NDArray[np.float32], num_inputs: int, weights: NDArray[np.float32] | None) -> Transitions:
+def as_transitions(rows: NDArray[np.float32], seen: Inputs, weights: NDArray[np.float32] | None) -> Transitions:
+    def observed(start: int) -> NDArray[Any]:
+        columns = rows[:, start : start + seen.num_columns]
+        flat = seen.bytes_in(columns) if seen.is_bytes else columns[:, : seen.num_observed]
+        return flat.reshape(-1, *seen.shape) if seen.is_image else flat
+
     return Transitions(
-        obs=rows[:, :num_inputs],
+        obs=observed(0),
         actions=rows[:, -3].astype(np.int64),
         rewards=rows[:, -2],
-        next_obs=rows[:, num_inputs + 1 : -4],
+        next_obs=observed(seen.num_columns),
         discounts=rows[:, -1],
         weights=weights,
     )
@@ -154,7 +165,7 @@ def follow(group: DQNGroup, found: dict[str, Learned]) -> contextlib.ExitStack:
         for index, member in enumerate(group.members):
             one = found[member.member_id]
             weights = None if drawn.weights is None else drawn.weights[index].copy()
-            one.batches.append(as_transitions(rows[index], group._num_masked + group._num_inputs, weights))
+            one.batches.append(as_transitions(rows[index], group._seen, weights))
             one.losses.append(stats[index]["total_loss"])
             one.lrs.append(stats[index]["lr"])
             one.td_errors.append(losses[-1].td_errors[index].abs().numpy())

@@ -72,8 +72,8 @@ class Sampled:
     fragment: Fragment
     groups: list[tuple[PPOGroup, Batch]]
     """(group, its batch)."""
-    observations: NDArray[np.float32]
-    """As the envs gave them, (M, R, D)."""
+    observations: NDArray[Any]
+    """As the envs gave them, (M, R, ...)."""
 
 
 def sample(stack: PPOStack) -> Sampled:
@@ -89,7 +89,8 @@ def sample(stack: PPOStack) -> Sampled:
         start = stop
     steps, _, size = fragment.observations.shape
     observations = fragment.observations.reshape(steps, len(stack.members), num_envs, size).swapaxes(0, 1)
-    return Sampled(fragment, groups, observations.reshape(len(stack.members), -1, size))
+    shape = stack.envs.observation_space.shape or ()
+    return Sampled(fragment, groups, observations.reshape(len(stack.members), -1, *shape))
 
 
 def shake(stack: PPOStack, scale: float = 0.1) -> None:
@@ -138,7 +139,7 @@ def learn_in_pack(stack: PPOStack, sampled: Sampled) -> dict[str, Learned]:
     return found
 
 
-def parts_of(sampled: Sampled, member: PPOMember) -> tuple[int, Batch, NDArray[np.float32]]:
+def parts_of(sampled: Sampled, member: PPOMember) -> tuple[int, Batch, NDArray[Any]]:
     """(place in its group, batch of the group, observations) of a member."""
     place = 0
     for group, batch in sampled.groups:

@@ -10,7 +10,7 @@ from torch.nn import functional
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.networks import layers, parts
-from policies.packed import networks
+from policies.packed import activations as packed_activations
 from policies.portable import forward
 from tests.narrowing import present
 
@@ -18,7 +18,7 @@ TABLES: dict[str, Any] = {
     "torch's modules": layers._ACTIVATIONS,
     "RLlib's names": parts.RLLIB_ACTIVATIONS,
     "portable policies": forward._ACTIVATION_FUNCTIONS,
-    "packs": networks._ACTIVATIONS,
+    "packs": packed_activations.ACTIVATIONS,
 }
 VALUES = [-20.0, -3.0, -0.5, -1e-6, 0.0, 1e-6, 0.7, 4.0, 30.0]
 
@@ -43,7 +43,7 @@ def test_all_compute_the_same_function(name: str) -> None:
     assert module is None or np.array_equal(module()(torch.from_numpy(x)).numpy(), expected)
     portable = forward._ACTIVATION_FUNCTIONS[name]
     assert portable is None or np.allclose(portable(x.copy()), expected, rtol=1e-6, atol=1e-6)
-    packed = networks._ACTIVATIONS[name]
+    packed = packed_activations.ACTIVATIONS[name]
     if packed.forward is not None:
         assert_as_close(name, packed.forward(torch.from_numpy(x.copy())), torch.from_numpy(expected))
     assert packed.of_few is None or np.allclose(packed.of_few(x.copy()), expected, rtol=1e-6, atol=1e-6)
@@ -53,7 +53,7 @@ def test_all_compute_the_same_function(name: str) -> None:
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_the_gradients_of_packs_are_those_of_torch(name: str) -> None:
     x = torch.tensor([VALUES], requires_grad=True)
-    packed = networks._ACTIVATIONS[name]
+    packed = packed_activations.ACTIVATIONS[name]
     out = x if name == "linear" else getattr(functional, name)(x)
     out.sum().backward()
     kept = (x if packed.keeps_input else out).detach()

@@ -12,6 +12,7 @@ from replay_rows import D, as_rows, make_hyperparams
 
 from policies.packed.dqn.n_step import StackedNStep
 from policies.packed.envs.vector import Step
+from policies.packed.inputs import Inputs
 from policies.replay import NStep
 
 Seen = tuple[NDArray[np.float32], NDArray[np.int64], Step]
@@ -61,7 +62,7 @@ def expected_rows(steps: Sequence[Seen], row: int, n_step: int, gamma: float) ->
 
 @pytest.mark.parametrize("n_step", [1, 2, 3])
 def test_n_step_rows_are_those_of_one_sum_a_row(n_step: int) -> None:
-    stacked = StackedNStep(N, D, n_step)
+    stacked = StackedNStep(N, Inputs.vector(D), n_step)
     for name in NAMES:
         stacked.add_member(name, make_hyperparams(n_step=n_step, gamma=GAMMA[name]))
     steps = list(random_steps(60, len(NAMES) * N, seed=n_step))
@@ -82,7 +83,7 @@ def test_n_step_rows_are_those_of_one_sum_a_row(n_step: int) -> None:
 
 
 def test_what_waits_for_rewards_leaves_with_its_member() -> None:
-    stacked = StackedNStep(1, D, 3)
+    stacked = StackedNStep(1, Inputs.vector(D), 3)
     for name in ("a", "b"):
         stacked.add_member(name, make_hyperparams(n_step=3))
     flags = np.zeros(2, dtype=np.bool_)

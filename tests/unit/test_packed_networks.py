@@ -42,7 +42,7 @@ def make_stack(num_layers: int, activation: str, *, shares: bool) -> tuple[list[
         random_member(f"m{index}", index, hidden_sizes=sizes, activation=activation, vf_share_layers=shares)
         for index, sizes in enumerate(SIZES[num_layers])
     ]
-    return members, StackedRows(members, NUM_INPUTS, NUM_OUTPUTS, "cpu")
+    return members, StackedRows(members, (NUM_INPUTS,), NUM_OUTPUTS, "cpu")
 
 
 def observations(num_members: int, seed: int = 0) -> torch.Tensor:
@@ -351,7 +351,7 @@ def test_a_member_is_padded_beside_a_wider_one_of_its_group(
     one, two = random_member("a", **ours), random_member("b", **theirs)
     assert is_padded_beside(one.hyperparams, two.hyperparams) is expected
     (group,) = (found for found in group_members([one, two]) if one in found)
-    sizes = StackedRows(group, 4, 3, "cpu").networks.sizes[1:-1]
+    sizes = StackedRows(group, (4,), 3, "cpu").networks.sizes[1:-1]
     assert (sizes != one.hyperparams.hidden_sizes) is expected
 
 

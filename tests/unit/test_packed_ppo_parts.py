@@ -16,6 +16,7 @@ from packed_members import random_member
 from torch import nn
 
 from policies.networks.layers import ObservationStatistics
+from policies.packed.inputs import Inputs
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR
 from policies.packed.ppo import loss as ppo
 from policies.packed.ppo.gae import advantages_and_targets, standardise
@@ -280,7 +281,7 @@ def test_observations_are_normalised_as_rlmodules_do_it() -> None:
             OBS_MEAN: np.zeros(size, np.float32), OBS_VAR: np.ones(size, np.float32), OBS_COUNT: np.array(0)
         }  # fmt: skip
     references = [Statistics(size) for _ in members]
-    observations = Observations(members, num_envs, normalizes=True)
+    observations = Observations(members, num_envs, normalizes=True, seen=Inputs.vector(size))
     for num_steps in (1, 5, 40):
         drawn = rng.normal(size=(num_steps, len(members) * num_envs, size)) * [1e-3, 1.0, 100.0] + [0.0, 5.0, 300.0]
         rows = drawn.astype(np.float32)
@@ -307,7 +308,7 @@ def test_observations_are_normalised_as_rlmodules_do_it() -> None:
 def test_observations_as_they_are() -> None:
     members = [random_member(f"m{index}") for index in range(2)]
     rows = np.arange(2 * 3 * 4, dtype=np.float32).reshape(6, 4)
-    observations = Observations(members, 3, normalizes=False)
+    observations = Observations(members, 3, normalizes=False, seen=Inputs.vector(4))
     np.testing.assert_array_equal(observations.prepare(rows), rows.reshape(2, 3, 4))
     observations.learn(rows[None])
     assert OBS_MEAN not in members[0].weights

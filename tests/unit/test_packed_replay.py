@@ -13,6 +13,7 @@ from replay_rows import BATCH, D, as_rows, make_hyperparams
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn.replay import Drawn, StackedPrioritizedReplay, StackedReplay, make_stacked_replay
 from policies.packed.envs.vector import Step
+from policies.packed.inputs import Inputs
 from policies.replay import LastTransitions, PrioritizedReplayBuffer, ReplayBuffer, Transitions, make_replay
 from tests.narrowing import present
 
@@ -28,7 +29,7 @@ def transitions(first: int, count: int) -> Transitions:
 
 def stack_of(replay: str, *members: tuple[str, dict[str, float]]) -> StackedPrioritizedReplay | StackedReplay:
     """A memory with members of (name, further hyperparameters)."""
-    stacked = make_stacked_replay(cast("Any", make_hyperparams(replay=replay)), D)
+    stacked = make_stacked_replay(cast("Any", make_hyperparams(replay=replay)), Inputs.vector(D))
     for name, values in members:
         stacked.add_member(name, make_hyperparams(replay=replay, **values))
     return stacked
@@ -285,7 +286,7 @@ def test_the_memory_that_the_hyperparameters_name(
     replay: str, kind: type[StackedPrioritizedReplay | StackedReplay], reference: type
 ) -> None:
     hyperparams = make_hyperparams(replay=replay)
-    assert type(make_stacked_replay(cast("Any", hyperparams), D)) is kind
+    assert type(make_stacked_replay(cast("Any", hyperparams), Inputs.vector(D))) is kind
     assert type(make_replay(hyperparams, 0)) is reference
 
 

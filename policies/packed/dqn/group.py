@@ -18,6 +18,7 @@ from policies.hyperparams import DQNHyperparams
 from policies.networks.denormals import denormals_as_zero
 from policies.packed.dqn import loss as dqn
 from policies.packed.dqn.replay import Drawn, StackedReplay
+from policies.packed.inputs import Inputs
 from policies.packed.member import TARGET_PREFIX, Member
 from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, StackedOptimizer, StackedRMSprop, clip_by_global_norm
@@ -35,10 +36,9 @@ class DQNGroup:
     Args:
         members: The members.
         shared: The hyperparameters that the members share.
-        num_inputs: Numbers per observation that networks see, D.
+        seen: What networks see of an observation, D numbers, behind a mask of A numbers if there is one.
         num_actions: The number of actions, A.
         replay: The replay memory that batches are drawn from.
-        num_masked: The numbers of a mask of actions, before those that networks see: A, or 0 if there is none.
         device: Where the updates are computed; acting is on the CPU.
 
     Attributes:
@@ -50,25 +50,24 @@ class DQNGroup:
         self,
         members: Sequence[Member[DQNHyperparams]],
         shared: SharedByDQN,
-        num_inputs: int,
+        seen: Inputs,
         num_actions: int,
         replay: StackedReplay,
         *,
-        num_masked: int,
         device: str,
     ) -> None:
         self.members, self._shared = members, shared
         self.positions: slice | NDArray[np.int64] = slice(0, 0)
         self.learns = False
-        self._num_inputs, self._num_actions, self._device = num_inputs, num_actions, device
-        self._num_masked = num_masked
+        self._num_inputs, self._num_actions, self._device = seen.num_inputs, num_actions, device
+        self._seen = seen
         self._replay, self._slots = replay, replay.slots([member.member_id for member in members])
         self._hyperparams = [member.hyperparams for member in members]
-        self._rows = StackedRows(members, num_inputs, num_actions, device)
+        self._rows = StackedRows(members, seen.shape, num_actions, device)
         self._networks = self._rows.networks
         self._targets: StackedRows | None = None
         if shared.target_network:
-            self._targets = StackedRows(members, num_inputs, num_actions, device, TARGET_PREFIX)
+            self._targets = StackedRows(members, seen.shape, num_actions, device, TARGET_PREFIX)
         self._optimizer = self._make_optimizer()
         self._rows.read_moments(self._optimizer)
         self._acting = ActingNetworks(self._networks, len(members))
@@ -119,9 +118,7 @@ class DQNGroup:
         if self._has_schedule:
             self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
         num_updates = len(numbers)
-        observations = Observations(
-            self.members, 1, normalizes=self._shared.normalize_observations, num_masked=self._num_masked
-        )
+        observations = Observations(self.members, 1, normalizes=self._shared.normalize_observations, seen=self._seen)
         self._optimizer.begin(num_updates)
         stats: list[dict[str, float]] = []
         for number in range(num_updates):
@@ -139,12 +136,8 @@ class DQNGroup:
         return linear(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
 
     def _update(self, drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
-        shared, num_inputs, num_masked = self._shared, self._num_inputs, self._num_masked
-        rows = observations.prepare_rows(drawn.rows, num_inputs)
-        batch = torch.from_numpy(rows).to(self._device)
-        middle = num_masked + num_inputs + 1
-        now, later = batch[..., num_masked:middle], batch[..., middle + num_masked : 2 * middle]
-        masks = batch[..., middle : middle + num_masked] if num_masked else None
+        shared = self._shared
+        batch, now, later, masks = self._observed(drawn, observations)
         actions, rewards, discounts = batch[..., -3].long(), batch[..., -2], batch[..., -1]
         weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
         targets = rewards + discounts * self._next_values(later, masks, uses_double_q=shared.double_q)
@@ -159,6 +152,20 @@ class DQNGroup:
         if not wants_stats:
             return []
         return self._stats(dqn.mean_loss(loss.td_errors, weights, shared), loss.q_selected.mean(dim=1), norms)
+
+    def _observed(self, drawn: Drawn, observations: Observations) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Return a batch's rows, what networks see now and next, (M, B, D or more), and the next masks, if any."""
+        middle, num_masked = self._seen.num_columns, self._seen.num_masked
+        if self._seen.is_bytes:
+            batch = torch.from_numpy(drawn.rows).to(self._device)
+            parts = batch[..., :middle], batch[..., middle : 2 * middle]
+            now, later = (observations.prepare_bytes(self._seen.bytes_in_tensor(part)) for part in parts)
+            return batch, now, later, None
+        for start in (0, middle):
+            observations.prepare_columns(drawn.rows[..., start : start + middle])
+        batch = torch.from_numpy(drawn.rows).to(self._device)
+        masks = batch[..., middle : middle + num_masked] if num_masked else None
+        return batch, batch[..., num_masked:middle], batch[..., middle + num_masked : 2 * middle], masks
 
     def _next_values(self, later: Tensor, masks: Tensor | None, *, uses_double_q: bool) -> Tensor:
         """Return Q' of the best next action that the masks, (M, B, A), allow, (M, B)."""

@@ -4,8 +4,8 @@ They are the memories of `policies.replay`, where the words are explained. Shape
 transitions, B rows per batch, D numbers per observation. A member's rows are its *slot*, which it keeps until
 it leaves.
 
-Columns of a row: observation, 1, next observation, 1, action, reward, discount; the ones are multiplied by the
-first bias of `StackedNetworks`.
+Columns of a row: observation, next observation, each as `policies.packed.inputs.Inputs` puts it into columns (with a 1
+after it, or four bytes of an image in each), then action, reward, discount.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from policies.hyperparams import DQNHyperparams
+from policies.packed.inputs import Inputs
 from policies.packed.shared import SharedByDQN
 from policies.sum_trees import SumTrees
 
@@ -42,13 +43,12 @@ class StackedReplay:
 
     Args:
         shared: The hyperparameters that all members share.
-        num_inputs: Numbers per observation, D.
+        seen: What networks see of an observation.
     """
 
-    def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
+    def __init__(self, shared: SharedByDQN, seen: Inputs) -> None:
         self._newest_only = shared.replay == "none"
-        self.num_columns = 2 * num_inputs + 5
-        self._num_inputs = num_inputs
+        self.num_columns = 2 * seen.num_columns + 3
         self._rows: Floats = np.empty((0, 0, self.num_columns), dtype=np.float32)
         self._slots: dict[str, int] = {}
         self._capacity: Indices = np.zeros(0, dtype=np.int64)
@@ -146,8 +146,8 @@ class StackedReplay:
 class StackedPrioritizedReplay(StackedReplay):
     """Draws in proportion to (|TD error| + epsilon)^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
 
-    def __init__(self, shared: SharedByDQN, num_inputs: int) -> None:
-        super().__init__(shared, num_inputs)
+    def __init__(self, shared: SharedByDQN, seen: Inputs) -> None:
+        super().__init__(shared, seen)
         # A tree for each slot, whose leaves are the rows.
         self._priorities = SumTrees(0, 0)
         self._highest: NDArray[np.float64] = np.zeros(0)
@@ -204,8 +204,8 @@ class StackedPrioritizedReplay(StackedReplay):
         self._priorities.set(self._first(slots) + indices, priorities)
 
 
-def make_stacked_replay(shared: SharedByDQN, num_inputs: int) -> StackedReplay:
+def make_stacked_replay(shared: SharedByDQN, seen: Inputs) -> StackedReplay:
     """Return the replay memory that the hyperparameters name, without members."""
     if shared.replay == "prioritized":
-        return StackedPrioritizedReplay(shared, num_inputs)
-    return StackedReplay(shared, num_inputs)
+        return StackedPrioritizedReplay(shared, seen)
+    return StackedReplay(shared, seen)

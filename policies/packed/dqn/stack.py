@@ -53,15 +53,14 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
 
     def __init__(self, shared: SharedByDQN, envs: PackedEnvs, device: str = "cpu") -> None:
         super().__init__(shared, envs, device)
-        num_observed = self._num_masked + self._num_inputs
-        self._replay = make_stacked_replay(shared, num_observed)
-        self._n_step = StackedNStep(envs.num_envs, num_observed, shared.n_step)
+        self._replay = make_stacked_replay(shared, self._seen)
+        self._n_step = StackedNStep(envs.num_envs, self._seen, shared.n_step)
         self._steps_per_phase = math.ceil(shared.train_freq / shared.num_envs)
         """Vector steps between two training phases."""
         self._updates_per_phase = self._steps_per_phase * envs.num_envs * shared.updates_per_env_step
         # Env steps at which a restored member's replay memory is as full as it was when learning began.
         self._refilled_at: dict[str, int] = {}
-        self._unlearned: list[Floats] = []
+        self._unlearned: list[NDArray[Any]] = []
         self._stats: dict[str, MemberStats] = {}
         self._num_actions = int(cast("gym.spaces.Discrete[Any]", envs.action_space).n)
 
@@ -95,10 +94,9 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
             group = DQNGroup(
                 members,
                 self._shared,
-                self._num_inputs,
+                self._seen,
                 self._num_actions,
                 self._replay,
-                num_masked=self._num_masked,
                 device=self._device,
             )
             indices = np.array([places[member.member_id] for member in members], dtype=np.int64)
@@ -123,7 +121,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
             self.members,
             self.envs.num_envs,
             normalizes=self._shared.normalize_observations,
-            num_masked=self._num_masked,
+            seen=self._seen,
         )
 
     def _learns(self, member: Member[DQNHyperparams]) -> bool:
@@ -203,7 +201,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
     def _sample(self, draws: _Draws, number: int) -> Step:
         """Make one vector step and put its transitions into the replay memory."""
         num_members, num_envs = len(self.members), self.envs.num_envs
-        observations = self.envs.observations
+        observations = self.envs.observations.reshape(num_members * num_envs, -1)
         seen = self._observations.prepare(observations)
         outputs = np.empty((num_members, num_envs, self._num_actions), dtype=np.float32)
         for group in self._groups:
@@ -265,5 +263,5 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         for index, member in enumerate(self.members):
             # A refilling member's are in its checkpoint's statistics already, as far as its policy goes on as it did.
             if member.num_env_steps > self._refilled_at.get(member.member_id, 0):
-                merge_statistics(member, rows[:, index].reshape(-1, self._num_inputs))
+                merge_statistics(member, rows[:, index].reshape(-1, self._num_inputs), self._seen.scale)
         self._observations = self._make_observations()

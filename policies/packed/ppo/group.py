@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import PPOHyperparams
 from policies.networks.denormals import denormals_as_zero
+from policies.packed.inputs import Inputs
 from policies.packed.member import Member
 from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, clip_by_global_norm
@@ -34,8 +36,8 @@ Floats = NDArray[np.float32]
 class Batch:
     """The data that an iteration's updates learn from, member by member."""
 
-    observations: Floats
-    """Prepared observations, (M, R, D)."""
+    observations: NDArray[Any]
+    """Prepared observations, (M, R, D), or bytes of images as they were observed."""
     actions: Floats
     """Actions, one-hot or as the policy drew them, (M, R, actions)."""
     outputs: Floats
@@ -48,6 +50,8 @@ class Batch:
     """The values V of the observations, (M, R); None: no member has a `vf_clip_range`."""
     masks: Floats | None = None
     """Which actions were allowed, (M, R, A); None: all."""
+    prepare_bytes: Callable[[Tensor], Tensor] | None = None
+    """Prepares rows of images of bytes, (M, B, D); None: observations are prepared."""
 
 
 class PPOGroup:
@@ -56,10 +60,9 @@ class PPOGroup:
     Args:
         members: The members.
         shared: The hyperparameters that the members share.
-        num_inputs: Numbers per observation.
+        seen: What networks see of an observation, whose mask of actions has A numbers, or 0 if there is none.
         num_outputs: The number of outputs of the policy's head.
         heads: What those outputs mean.
-        num_masked: The numbers of a mask of actions: A, or 0 if there is none.
         device: Where the updates are computed; acting is on the CPU.
     """
 
@@ -67,17 +70,17 @@ class PPOGroup:
         self,
         members: Sequence[Member[PPOHyperparams]],
         shared: SharedByPPO,
-        num_inputs: int,
+        seen: Inputs,
         num_outputs: int,
         *,
         heads: ppo.Heads,
-        num_masked: int,
         device: str,
     ) -> None:
         self.members, self._shared = members, shared
         self._num_outputs, self._heads, self._device = num_outputs, heads, device
-        self._num_masked = num_masked
-        self._rows = StackedRows(members, num_inputs, num_outputs, device)
+        self._num_masked, self._inputs = seen.num_masked, seen.unmasked
+        self._prepare_bytes: Callable[[Tensor], Tensor] | None = None
+        self._rows = StackedRows(members, seen.shape, num_outputs, device)
         self._networks = self._rows.networks
         self._shares = self._rows.networks_per_member == 1
         column = self._rows.per_row
@@ -126,6 +129,7 @@ class PPOGroup:
         num_updates = math.ceil(num_rows * shared.num_epochs / shared.minibatch_size)
         self._move_schedules()
         columns = self._columns(batch)
+        self._prepare_bytes = batch.prepare_bytes
         # No column: the width of the others may decide how products of them are rounded.
         old_values = None if batch.values is None else torch.from_numpy(batch.values).reshape(-1).to(self._device)
         indices = torch.from_numpy(self._draw_rows(num_rows, num_updates * shared.minibatch_size)).to(self._device)
@@ -154,18 +158,16 @@ class PPOGroup:
 
     def _columns(self, batch: Batch) -> Tensor:
         """Put all that a minibatch needs side by side, (M * R, columns), so that one gather copies it."""
-        observations = batch.observations
-        num_members, num_rows, num_inputs = observations.shape
+        num_members, num_rows, _ = batch.observations.shape
         num_actions, num_outputs = batch.actions.shape[2], self._num_outputs
         keeps_outputs, num_masked = self._shared.use_kl_loss, self._num_masked
-        sizes = [num_inputs + 1, num_actions, 1, 1, 1, num_outputs if keeps_outputs else 0, num_masked]
+        sizes = [self._inputs.num_columns, num_actions, 1, 1, 1, num_outputs if keeps_outputs else 0, num_masked]
         self._bounds = np.cumsum(sizes).tolist()
         actions, outputs = torch.from_numpy(batch.actions), torch.from_numpy(batch.outputs)
         logp = ppo.log_probabilities(outputs, actions, heads=self._heads)
         columns = np.empty((num_members, num_rows, self._bounds[-1]), dtype=np.float32)
-        columns[..., :num_inputs] = observations
-        columns[..., num_inputs] = 1.0
-        columns[..., num_inputs + 1 : self._bounds[1]] = batch.actions
+        self._inputs.put(columns[..., : self._bounds[0]], batch.observations)
+        columns[..., self._bounds[0] : self._bounds[1]] = batch.actions
         columns[..., self._bounds[1]] = logp.numpy()
         columns[..., self._bounds[2]] = batch.advantages
         columns[..., self._bounds[3]] = batch.value_targets
@@ -188,6 +190,8 @@ class PPOGroup:
     def _forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return the policy's outputs, (M, B, A), and the values, (M, B)."""
         observations = rows[..., : self._bounds[0]]
+        if self._prepare_bytes is not None:
+            observations = self._prepare_bytes(self._inputs.bytes_in_tensor(observations))
         if self._shares:
             outputs = self._networks.forward(observations)
             return self._allowed(outputs[..., : self._num_outputs], rows), outputs[..., -1]

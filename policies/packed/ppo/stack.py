@@ -23,6 +23,7 @@ from policies.envs.action_bounds import ToBounds
 from policies.envs.own_actions import sizes_of
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.vector import PackedEnvs
+from policies.packed.inputs import Inputs
 from policies.packed.member import Member, MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo.gae import advantages_and_targets, standardise
@@ -35,22 +36,25 @@ from policies.return_statistics import discounted_returns
 
 Floats = NDArray[np.float32]
 
+_IMAGES_AT_ONCE = 64
+"""The most images of each member whose values are computed at once."""
+
 
 class Fragment:
     """The results of T vector steps, as columns of shape (T, S, ...)."""
 
-    def __init__(self, num_steps: int, num_rows: int, num_observed: int, num_outputs: int) -> None:
+    def __init__(self, num_steps: int, num_rows: int, seen: Inputs, num_outputs: int) -> None:
         shape = (num_steps, num_rows)
-        self.observations = np.empty((*shape, num_observed), dtype=np.float32)
+        self.observations: NDArray[Any] = np.empty((*shape, seen.num_observed), dtype=seen.dtype)
         self.outputs = np.empty((*shape, num_outputs), dtype=np.float32)
         self.actions: NDArray[Any] = np.empty(0)
         """Whole numbers, (T, S) or (T, S, choices), or continuous actions as drawn, (T, S, num_actions)."""
         self.rewards, self.own_rewards = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         """The rewards to learn from, normalised for members with `normalize_rewards`, and the env's own, (T, S)."""
         self.terminated, self.ended = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
-        self.cuts: list[tuple[int, int, Floats]] = []
+        self.cuts: list[tuple[int, int, NDArray[Any]]] = []
         """The step, the row and the last observation of each truncated episode."""
-        self.last: Floats = np.empty((num_rows, num_observed), dtype=np.float32)
+        self.last: NDArray[Any] = np.empty((num_rows, seen.num_observed), dtype=seen.dtype)
         """The observations that the next actions answer."""
 
 
@@ -91,18 +95,15 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             PPOGroup(
                 group,
                 self._shared,
-                self._num_inputs,
+                self._seen,
                 self._num_outputs,
                 heads=self._heads,
-                num_masked=self._num_masked,
                 device=self._device,
             )
             for group in groups
         ]
         normalizes = self._shared.normalize_observations
-        self._observations = Observations(
-            self.members, self.envs.num_envs, normalizes=normalizes, num_masked=self._num_masked
-        )
+        self._observations = Observations(self.members, self.envs.num_envs, normalizes=normalizes, seen=self._seen)
         self._stale = False
 
     def begin_iteration(self) -> None:
@@ -143,16 +144,16 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
 
     def _sample(self, num_steps: int) -> Fragment:
         envs, num_members, num_envs = self.envs, len(self.members), self.envs.num_envs
-        num_observed = self._num_masked + self._num_inputs
-        fragment = Fragment(num_steps, num_members * num_envs, num_observed, self._num_outputs)
+        fragment = Fragment(num_steps, num_members * num_envs, self._seen, self._num_outputs)
         noise = self._draw_noise(num_steps)
         envs.begin(num_steps)
         bounds = np.cumsum([0, *(len(group.members) for group in self._groups)]).tolist()
         outputs = fragment.outputs.reshape(num_steps, num_members, num_envs, self._num_outputs)
         chosen = []
         for step in range(num_steps):
-            fragment.observations[step] = envs.observations
-            seen = self._observations.prepare(envs.observations)
+            observations = fragment.observations[step]
+            observations[:] = envs.observations.reshape(observations.shape)
+            seen = self._observations.prepare(observations)
             for group, start, stop in zip(self._groups, bounds, bounds[1:], strict=False):
                 outputs[step, start:stop] = group.act(seen[start:stop])
             if self._num_masked:
@@ -165,9 +166,9 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             fragment.ended[step] = done.terminated | done.truncated
             if done.truncated.any():
                 cut = np.flatnonzero(done.truncated & ~done.terminated)
-                fragment.cuts += [(step, row, done.final_observations[row]) for row in cut.tolist()]
+                fragment.cuts += [(step, row, done.final_observations[row].reshape(-1)) for row in cut.tolist()]
         fragment.actions = np.stack(chosen)
-        fragment.last = np.array(envs.observations, dtype=np.float32)
+        fragment.last[:] = envs.observations.reshape(fragment.last.shape)
         self._normalize_rewards(fragment)
         return fragment
 
@@ -233,8 +234,12 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             moved = values.reshape(shape).swapaxes(0, 1)
             return moved.reshape(num_members, num_steps * num_envs, *values.shape[2:])
 
-        seen = self._observations.part(start, stop).prepare(fragment.observations[:, rows])
-        seen = by_member(seen.reshape(num_steps, num_members * num_envs, -1))
+        observations = self._observations.part(start, stop)
+        if self._seen.is_bytes:
+            seen = by_member(fragment.observations[:, rows])
+        else:
+            prepared = observations.prepare(fragment.observations[:, rows])
+            seen = by_member(prepared.reshape(num_steps, num_members * num_envs, -1))
         values, next_values = self._values(group, fragment, seen, start, stop)
         hyperparams = [member.hyperparams for member in group.members]
         repeat = np.repeat(np.arange(num_members), num_envs)
@@ -262,18 +267,35 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             value_targets=by_member(targets),
             values=by_member(values) if limits_values else None,
             masks=by_member(fragment.observations[:, rows, : self._num_masked]) if self._num_masked else None,
+            prepare_bytes=observations.prepare_bytes if self._seen.is_bytes else None,
         )
 
     def _values(
-        self, group: PPOGroup, fragment: Fragment, seen: Floats, start: int, stop: int
+        self, group: PPOGroup, fragment: Fragment, seen: NDArray[Any], start: int, stop: int
     ) -> tuple[Floats, Floats]:
-        """Return V of the observations that were acted on and of those that each step led to, (T, m * N)."""
+        """Return V of the observations that were acted on and of those that each step led to, (T, m * N).
+
+        Args:
+            group: Members `start` to `stop` of the stack.
+            fragment: What the stack sampled.
+            seen: `Batch.observations` of the group.
+            start: The first member's number.
+            stop: The number after the last member's.
+        """
         num_envs = self.envs.num_envs
         num_members, num_steps = stop - start, len(fragment.rewards)
         observations = self._observations.part(start, stop)
         rows = slice(start * num_envs, stop * num_envs)
-        last = observations.prepare(fragment.last[rows])
-        values = self._evaluate(group, np.concatenate([seen, last], axis=1))
+        last = fragment.last[rows]
+        last = last.reshape(num_members, num_envs, -1) if self._seen.is_bytes else observations.prepare(last)
+        all_seen = np.concatenate([seen, last], axis=1)
+        if self._seen.is_image:
+            # In blocks, since the windows of kernels take many times the memory of an image.
+            blocks = range(0, all_seen.shape[1], _IMAGES_AT_ONCE)
+            each = [self._evaluate(group, observations, all_seen[:, at : at + _IMAGES_AT_ONCE]) for at in blocks]
+            values = np.concatenate(each, axis=1)
+        else:
+            values = self._evaluate(group, observations, all_seen)
         values = values.reshape(num_members, num_steps + 1, num_envs).swapaxes(0, 1)
         values = values.reshape(num_steps + 1, num_members * num_envs)
         next_values = np.array(values[1:])
@@ -284,19 +306,24 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             places = [row // num_envs for _, row, _ in cuts]
             slots = [divmod(places[:number].count(place), num_envs) for number, place in enumerate(places)]
             num_blocks = 1 + max(block for block, _ in slots)
-            finals = np.zeros((num_blocks, num_members, num_envs, fragment.last.shape[1]), dtype=np.float32)
+            finals = np.zeros((num_blocks, num_members, num_envs, fragment.last.shape[1]), fragment.last.dtype)
             for place, (block, slot), (_, _, final) in zip(places, slots, cuts, strict=True):
                 finals[block, place, slot] = final
-            found = [
-                self._evaluate(group, observations.prepare(final.reshape(-1, final.shape[-1]))) for final in finals
-            ]
+            if not self._seen.is_bytes:
+                finals = np.stack([observations.prepare(final.reshape(-1, final.shape[-1])) for final in finals])
+            found = [self._evaluate(group, observations, final) for final in finals]
             for place, (block, slot), (step, row, _) in zip(places, slots, cuts, strict=True):
                 next_values[step, row] = found[block][place, slot]
         return values[:-1], next_values
 
-    def _evaluate(self, group: PPOGroup, observations: Floats) -> Floats:
+    def _evaluate(self, group: PPOGroup, observations: Observations, seen: NDArray[Any]) -> Floats:
+        """Return V, (m, B), of rows of `Batch.observations`, (m, B, D)."""
         with torch.no_grad():
-            return group.values(torch.from_numpy(with_ones(observations)).to(self._device)).cpu().numpy()
+            if self._seen.is_bytes:
+                ready = observations.prepare_bytes(torch.from_numpy(seen).to(self._device))
+            else:
+                ready = torch.from_numpy(with_ones(seen)).to(self._device)
+            return group.values(ready).cpu().numpy()
 
 
 def _as_learnt(advantages: Floats, hyperparams: Sequence[PPOHyperparams]) -> Floats:

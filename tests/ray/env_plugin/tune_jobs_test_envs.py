@@ -197,6 +197,13 @@ class Shades(gym.Env[NDArray[Any], Any]):
         return self._observation(), reward, self.ticks >= 10, False, {}
 
 
+class FineShades(Shades):
+    """The same of numbers from 0 to 1."""
+
+    def __init__(self) -> None:
+        super().__init__(as_bytes=False)
+
+
 class Precise(gym.Env[NDArray[Any], Any]):
     """A random walk of any precision, ten steps an episode, that takes the actions of its space alone.
 
@@ -309,6 +316,7 @@ def register() -> None:
         ("TestTrouble-v0", Trouble, None),
         ("TestLaps-v0", Laps, None),
         ("TestShades-v0", Shades, None),
+        ("TestFineShades-v0", FineShades, None),
         ("TestPrecise-v0", Precise, None),
         ("TestSecret-v0", Secret, None),
         ("TestReply-v0", Reply, None),
