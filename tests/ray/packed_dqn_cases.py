@@ -12,7 +12,6 @@ import pytest
 from packed_dqn import ROUNDING, DQNMember, Learned, add, compare, differences, make_stack, q_values_of
 
 from policies.activations import ACTIVATIONS
-from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn.replay import StackedPrioritizedReplay
 from tests.narrowing import present
 from tests.rounding import assert_network
@@ -225,14 +224,17 @@ def check_initializer() -> None:
 
 @arrives("conv_filters")
 def check_conv_filters() -> None:
-    from tune_jobs.plan.engine_choice import why_not
-    from tune_jobs.spec.engines import engine_named
-    from tune_jobs.spec.sweep_spec import SweepSpec
-
-    spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "dqn"})
-    packed = engine_named("packed")
-    assert why_not(packed, spec, DQNHyperparams()) is None
-    assert "conv_filters" in present(why_not(packed, spec, DQNHyperparams(conv_filters=((16, 4, 2),))))
+    stack = make_stack("TestShades-v0")
+    filters = (((5, 4, 2),), ((3, 2, 1), (4, 3, 2)))
+    for index, one in enumerate(filters):
+        add(stack, f"m{index}", index, conv_filters=one)
+    stack.train_iteration()
+    assert [len(group.members) for group in stack._groups] == [1, 1]
+    for index, shapes in enumerate(([(5, 2, 4, 4)], [(3, 2, 2, 2), (4, 3, 3, 3)])):
+        weights = stack.member(f"m{index}").weights
+        kernels = {key: value.shape for key, value in weights.items() if key.startswith("encoder.conv")}
+        assert [shape for key, shape in kernels.items() if key.endswith("weight")] == shapes
+    stack.envs.close()
 
 
 @arrives("normalize_observations")

@@ -65,7 +65,7 @@ def check_targets(**values: Any) -> None:
     sampled = sample(stack)
     ((group, batch),) = sampled.groups
     value, _ = stack._values(group, sampled.fragment, batch.observations, 0, 2)
-    last = stack._evaluate(group, sampled.fragment.last.reshape(2, 4, 4))
+    last = stack._evaluate(group, stack._observations, sampled.fragment.last.reshape(2, 4, 4))
     hyperparams = stack.members[1].hyperparams
     assert not sampled.fragment.cuts
     for place in range(4):

@@ -15,7 +15,6 @@ import torch
 from packed_rllib import ROUNDING, ROWS, Learned, Sampled, compare, differences, make_stack
 
 from policies.activations import ACTIVATIONS
-from policies.hyperparams import PPOHyperparams
 from policies.packed.networks import with_ones
 from tests.narrowing import present
 
@@ -95,15 +94,16 @@ def check_initializer() -> None:
 
 @arrives
 def check_conv_filters() -> None:
-    """Packs have none: the plan leaves such trials to RLlib."""
-    from tune_jobs.plan.engine_choice import why_not
-    from tune_jobs.spec.engines import engine_named
-    from tune_jobs.spec.sweep_spec import SweepSpec
-
-    spec = SweepSpec.model_validate({"env": "CartPole-v1", "algorithm": "ppo"})
-    packed = engine_named("packed")
-    assert why_not(packed, spec, PPOHyperparams()) is None
-    assert "no convolutions" in present(why_not(packed, spec, PPOHyperparams(conv_filters=((4, 8, 4),))))
+    """Members of other filters are in other groups; that each learns as in RLlib is in `test_packed_images`."""
+    stack = make_stack("TestShades-v0", [{"conv_filters": ((5, 4, 2),)}, {"conv_filters": ((3, 2, 1), (4, 3, 2))}])
+    stack.train_iteration()
+    assert [len(group.members) for group in stack._groups] == [1, 1]
+    for name, shapes in (("m0", [(5, 2, 4, 4)]), ("m1", [(3, 2, 2, 2), (4, 3, 3, 3)])):
+        weights = stack.member(name).weights
+        for encoder in ("actor_encoder", "critic_encoder"):
+            kernels = {key: value.shape for key, value in weights.items() if f"{encoder}.conv" in key}
+            assert [shape for key, shape in kernels.items() if key.endswith("weight")] == shapes
+    stack.envs.close()
 
 
 @arrives

@@ -149,14 +149,10 @@ def test_a_member_that_was_saved_is_read_as_it_was(tmp_path: Path) -> None:
     save_member(member, tmp_path / "state")
     read = load_member(tmp_path / "state", "watched")
     assert member.weights["obs_mean"].shape == (12, 9, 2)
-    for ours, theirs in (
-        (read.weights, member.weights),
-        *zip(read.moments.values(), member.moments.values(), strict=True),
-    ):
-        assert set(ours) == set(theirs)
-        for name, value in theirs.items():
-            np.testing.assert_array_equal(ours[name], value)
-            assert ours[name].shape == value.shape
+    assert_same(read.weights, member.weights)
+    assert set(read.moments) == set(member.moments)
+    for name, moments in member.moments.items():
+        assert_same(read.moments[name], moments)
 
 
 # -- learning
@@ -211,13 +207,9 @@ def test_a_checkpoint_goes_on_and_is_an_rllib_algorithm(algorithm: str, tmp_path
     assert isinstance(policy, NetworkPolicy)
     rllib = algorithm_from_checkpoint(folder)
     weights, moments = packed_rllib.state_of(packed_rllib.learner_of(rllib))
-    for ours, theirs in (
-        (weights, member.weights),
-        *((moments[name], found) for name, found in member.moments.items()),
-    ):
-        assert set(ours) == set(theirs)
-        for name, value in theirs.items():
-            np.testing.assert_array_equal(ours[name], value)
+    assert_same(weights, member.weights)
+    for name, found in member.moments.items():
+        assert_same(moments[name], found)
     images = np.random.default_rng(0).integers(0, 256, (100, 12, 9, 2), dtype=np.uint8)
     with torch.no_grad():
         module = rllib.get_module(packed_rllib.MODULE)

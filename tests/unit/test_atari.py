@@ -311,7 +311,8 @@ def test_the_plan_knows_what_replayed_images_take_and_runs_fewer_trials_at_once(
     # 100,000 transitions of two images of 84 x 84 x 4 bytes: 5.6 GB.
     at_once, notes = planned(64e9)
     assert at_once == 4
-    assert notes == "No trial is packed, RLlib trains them all: env.atari is set, and packs have no convolutions."
+    why = "env.atari is set, and packs do not have what training alone sees of a game"
+    assert notes == f"No trial is packed, RLlib trains them all: {why}."
     at_once, notes = planned(25e9)
     assert at_once == 2
     assert "2 trials instead of 4 run at once: one trial may take 5.7 GB of memory, and half of what" in notes

@@ -55,7 +55,7 @@ def make_members(filters: Sequence[Any], **values: Any) -> list[Member[PPOHyperp
     ]
 
 
-def torch_networks(member: Member[PPOHyperparams]) -> list[nn.Module]:
+def torch_networks(member: Member[PPOHyperparams]) -> list[nn.Sequential]:
     """Policy and value function of a member, in torch's modules and float64."""
     found = []
     for layout in network_layouts(member.hyperparams, 3, convolutions_for(IMAGE, member.hyperparams.conv_filters)):
@@ -70,7 +70,7 @@ def torch_networks(member: Member[PPOHyperparams]) -> list[nn.Module]:
             else:
                 layers += [nn.Flatten()] if number and ".conv." in layout.layers[number - 1][0].name else []
                 layer = nn.Linear(weight.shape[1], weight.shape[0])
-            layer.weight.data, layer.bias.data = weight.double(), bias.double()
+            layer.weight, layer.bias = nn.Parameter(weight.double()), nn.Parameter(bias.double())
             layers += [layer, MODULES[member.hyperparams.activation]()]
         found.append(nn.Sequential(*layers[:-1]))
     return found
@@ -105,9 +105,9 @@ def test_outputs_and_gradients_are_torchs(filters: tuple[Any, ...], activation: 
                 }
             )
     rows.networks.backward(gradient)
-    for row, layers, member, layout in rows._rows(rows.networks.views_of(rows.networks.gradients)):
+    for row, layers, owner, layout in rows._rows(rows.networks.views_of(rows.networks.gradients)):
         for name, value in layout.read(layers, 0).items():
-            expected = member.moments["expected"][name]
+            expected = owner.moments["expected"][name]
             assert value.shape == expected.shape
             np.testing.assert_allclose(value, expected, atol=ROUNDING * max(1.0, np.abs(expected).max()), err_msg=name)
             assert np.abs(expected).max() > 0 or activation == "relu", (row, name)

@@ -13,7 +13,7 @@ from policies.errors import EnvError, SpecError
 from policies.guard import guarded
 from policies.hyperparams import Algorithm, make_hyperparams
 from tests.narrowing import present
-from tune_jobs.plan.engine_choice import pack_key, why_not
+from tune_jobs.plan.engine_choice import MAX_PRODUCTS, pack_key, why_not
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.engines import engine_named
@@ -25,7 +25,9 @@ from tune_jobs.sweeps.adding import check_same_trials
 from tune_jobs.sweeps.drive import write_new
 
 PACKED = engine_named("packed")
-IMAGES = {"env": {"id": "CartPole-v1", "pixels": True}, "hyperparams": {"conv_filters": [[4, 8, 4]]}}
+IMAGES: dict[str, Any] = {"env": {"id": "CartPole-v1", "pixels": True}}
+SMALL, LARGE = [[4, 8, 4]], [[64, 3, 1]]
+"""Filters for pictures of 40 x 60 pixels."""
 
 
 @pytest.fixture
@@ -67,7 +69,6 @@ def test_what_can_be_packed_is_packed() -> None:
     ("fields", "reason"),
     [
         ({"resources": {"num_env_runners": 1}}, "resources.num_env_runners is 1, and packs have no env runners"),
-        (IMAGES, "env.pixels is true, and packs have no convolutions"),
         ({"rl_module": "my_nets:Net"}, "rl_module is my_nets:Net, and packs have no networks but their own"),
     ],
 )
@@ -95,17 +96,41 @@ def test_a_baseline_has_an_engine_of_its_own() -> None:
     assert "algorithm is random, which does not learn" in errors(algorithm="random", engine="packed")
 
 
-def test_trials_with_convolutions_are_not_packed(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Whether observations are images is known of the environment alone: here none of them is looked at.
-    monkeypatch.setattr("tune_jobs.plan.sweep_plan.check_env_rules", lambda *arguments: None)
-    fields = {"space": {"conv_filters": {"grid": [None, [[4, 8, 4]]]}}, "num_samples": 3}
-    space = load_spec({**MINIMAL, **fields})
-    values = make_hyperparams("ppo", {"conv_filters": [[4, 8, 4]]})
-    assert why_not(PACKED, space, values) == "conv_filters is [[4, 8, 4]], and packs have no convolutions"
-    assert why_not(PACKED, space, make_hyperparams("ppo", {})) is None
+def test_small_images_are_packed_and_large_ones_where_that_is_asked_for() -> None:
+    assert plan(**IMAGES, hyperparams={"conv_filters": SMALL}).engines == {"packed": 10}
+    # 38 x 58 places of 3 x 3 pixels for 64 filters, and what these are for each of 64 units.
+    products = 38 * 58 * 9 * 64 + 38 * 58 * 64 * 64 + 64 * 64
+    made = plan(**IMAGES, hyperparams={"conv_filters": LARGE})
+    assert made.engines == {"rllib": 10}
+    why = f"a network makes {products:,} multiplications for an image of 40 x 60 x 1"
+    assert made.notes == (
+        f"No trial is packed, RLlib trains them all: {why}, and packs are the faster engine up to 300,000.",
+    )
+    assert plan(**IMAGES, hyperparams={"conv_filters": LARGE}, engine="packed").engines == {"packed": 10}
+    assert plan(**IMAGES, hyperparams={"conv_filters": LARGE}, engine="rllib").notes == ()
+
+
+def test_the_reason_names_where_packs_are_faster() -> None:
+    assert f"{MAX_PRODUCTS:,}" in PACKED.lacks["large_images"]
+
+
+def test_engines_are_chosen_by_each_trials_own_filters() -> None:
+    made = plan(**IMAGES, space={"conv_filters": {"grid": [SMALL, LARGE]}}, num_samples=1, seeds_per_point=2)
+    assert [trial.engine for trial in made.trials] == ["packed"] * 2 + ["rllib"] * 2
+    assert made.notes[0].startswith("t0002, t0003 are not packed, RLlib trains them: a network makes ")
     # Of a point that is not known, any of the space.
-    assert why_not(PACKED, space, None) == why_not(PACKED, space, values)
-    assert why_not(PACKED, load_spec({**MINIMAL, **TPE}), None) is None
+    search: dict[str, Any] = {"search": {"type": "tpe", "num_startup_trials": 2}, "num_samples": 4}
+    small = plan(**IMAGES, space={"conv_filters": {"choice": [SMALL, [[4, 8, 8]]]}}, **search)
+    assert small.engines == {"packed": 4}
+    mixed = plan(**IMAGES, space={"conv_filters": {"choice": [SMALL, LARGE]}}, **search)
+    assert [trial.engine for trial in mixed.trials][2:] == ["rllib"] * 2
+
+
+def test_games_are_not_packed() -> None:
+    game: dict[str, Any] = {"env": {"id": "ALE/Pong-v5", "atari": True}, "hyperparams": {"conv_filters": [[32, 8, 4]]}}
+    reason = "env.atari is set, and packs do not have what training alone sees of a game"
+    assert why_not(PACKED, load_spec({**MINIMAL, **game})) == reason
+    assert reason in errors(**game, engine="packed")
 
 
 def test_engines_are_chosen_trial_by_trial(monkeypatch: pytest.MonkeyPatch) -> None:

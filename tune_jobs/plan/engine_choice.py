@@ -17,6 +17,8 @@ from policies.hyperparams import (
     RandomHyperparams,
 )
 from policies.packed.shared import shared_of
+from tune_jobs.plan.estimates import products_per_image
+from tune_jobs.search.points import largest_hyperparams
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import Engine, engine_on_record, engines_for
 from tune_jobs.spec.rules import why_none
@@ -26,6 +28,12 @@ if TYPE_CHECKING:
     from policies.packed.envs.vector import EnvKind
     from tune_jobs.spec.sweep_spec import SweepSpec
 
+MAX_PRODUCTS = 300_000
+"""The most multiplications of a network for an image that packs are chosen for.
+
+Measured by CPU time beside the `rllib` engine (decision 49): 1.7 to 2.8 times as fast up to 200,000, 1.0 to 1.9 times
+at 480,000, and slower from 1.7 million on, where the products are what takes time, and those of RLlib are as fast.
+"""
 _MOST_NAMED = 8
 """The most trials that a note lists by name; more are counted."""
 
@@ -138,7 +146,7 @@ def choose_engines(
     """
     able = engines_for(spec.algorithm)
     wished = _of_population(spec, recorded) or tuple(engine for engine in able if engine.name == spec.engine)
-    seeding = _Seeding(spec)
+    seeding, images = _Seeding(spec), _Images(spec, env, [values for _, values in trials if values is not None])
     engines: list[str] = []
     refused: dict[tuple[str, str, str], list[str]] = {}
     for index, (trial_id, hyperparams) in enumerate(trials):
@@ -147,7 +155,8 @@ def choose_engines(
             continue
         reasons: list[tuple[Engine, str]] = []
         for engine in wished or able:
-            reason = why_not(engine, spec, hyperparams, env) or seeding.why_not(engine)
+            reason = why_not(engine, spec, hyperparams, env)
+            reason = reason or images.why_not(engine, hyperparams) or seeding.why_not(engine)
             if reason is None:
                 engines.append(engine.name)
                 for other, why in reasons:
@@ -174,6 +183,35 @@ def _of_population(spec: SweepSpec, recorded: Mapping[str, str]) -> tuple[Engine
         return ()
     known = {engine_on_record(name, spec.algorithm).name: None for name in recorded.values()}
     return tuple(engine_on_record(name, spec.algorithm) for name in known)
+
+
+class _Images:
+    """Finds out whether images are too large for an engine that nobody asked for.
+
+    Args:
+        spec: The sweep.
+        env: Its environment.
+        known: The hyperparameters of the points that are known.
+    """
+
+    def __init__(self, spec: SweepSpec, env: EnvInfo, known: Sequence[Hyperparams]) -> None:
+        self._spec, self._env, self._known = spec, env, known
+        self._largest: list[Hyperparams] = []
+
+    def why_not(self, engine: Engine, hyperparams: Hyperparams | None) -> str | None:
+        """Return why an engine is not chosen for a trial, or None if it is; None for a point that is not known."""
+        if self._spec.engine == engine.name or "large_images" not in engine.lacks or not self._env.observes_images:
+            return None
+        if hyperparams is None and not self._largest and self._known:
+            self._largest = largest_hyperparams(self._spec, self._known)
+        shape = tuple(self._env.observation_space.shape or ())
+        most = max(
+            (products_per_image(shape, each) for each in ([hyperparams] if hyperparams else self._largest)), default=0
+        )
+        if most <= MAX_PRODUCTS:
+            return None
+        size = " x ".join(map(str, shape))
+        return engine.why_not("large_images", f"a network makes {most:,} multiplications for an image of {size}")
 
 
 class _Seeding:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,19 +78,45 @@ def trial_bytes(env: EnvInfo, values: Hyperparams) -> int:
     itemsize = np.dtype(observation_dtype(env.observation_space)).itemsize
     observation = math.prod(env.observation_space.shape or ()) * itemsize
     hidden = 0 if isinstance(values, RandomHyperparams) else 2 * sum(values.hidden_sizes) * _BYTES_PER_NUMBER
+    windows = _numbers_of_convolutions(env, values) * _BYTES_PER_NUMBER
     total = _num_weights(env, values) * _COPIES_OF_WEIGHTS * _BYTES_PER_NUMBER
     if isinstance(values, PPOHyperparams):
         step = _COPIES_OF_BATCH * (observation + _NUMBERS_PER_STEP * _BYTES_PER_NUMBER) + hidden
-        total += values.train_batch_size * step
+        total += values.train_batch_size * step + values.minibatch_size * 2 * windows
     elif isinstance(values, DQNHyperparams):
         # The observations before and after, the action (8 bytes), reward and discount.
         transition = 2 * observation + 4 * _BYTES_PER_NUMBER
-        total += values.train_batch_size * (_COPIES_OF_BATCH * transition + hidden)
+        total += values.train_batch_size * (_COPIES_OF_BATCH * transition + hidden + windows)
         total += (0 if values.replay == "none" else values.replay_capacity) * transition
         if values.replay == "prioritized":
             # A tree of sums, two nodes of 8 bytes per transition, whose number is rounded up to a power of 2.
             total += 16 * (1 << (values.replay_capacity - 1).bit_length())
     return total
+
+
+def products_per_image(shape: Sequence[int], values: Hyperparams) -> int:
+    """Return the multiplications of a network, but for its head's, for an image of (height, width, channels)."""
+    if isinstance(values, RandomHyperparams) or values.conv_filters is None:
+        return 0
+    products = 0
+    for number, (channels, kernel, _) in enumerate(values.conv_filters):
+        inputs = output_shape(shape, values.conv_filters[:number])[2]
+        height, width, _ = output_shape(shape, values.conv_filters[: number + 1])
+        products += height * width * kernel**2 * inputs * channels
+    sizes = [math.prod(output_shape(shape, values.conv_filters)), *values.hidden_sizes]
+    return products + sum(inputs * outputs for inputs, outputs in itertools.pairwise(sizes))
+
+
+def _numbers_of_convolutions(env: EnvInfo, values: Hyperparams) -> int:
+    """Return the numbers that the convolutions of one network keep of an image: the windows of kernels, and outputs."""
+    if isinstance(values, RandomHyperparams) or values.conv_filters is None:
+        return 0
+    shape, numbers = tuple(env.observation_space.shape or ()), 0
+    for number, (channels, kernel, _) in enumerate(values.conv_filters):
+        inputs = output_shape(shape, values.conv_filters[:number])[2]
+        height, width, _ = output_shape(shape, values.conv_filters[: number + 1])
+        numbers += height * width * (kernel**2 * inputs + 2 * channels)
+    return numbers
 
 
 def _num_weights(env: EnvInfo, values: Hyperparams) -> int:
