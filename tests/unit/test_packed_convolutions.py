@@ -16,6 +16,7 @@ from policies.activations import ACTIVATIONS
 from policies.envs.spaces import observation_dtype
 from policies.errors import SpecError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
+from policies.networks.denormals import denormals_as_zero
 from policies.packed import optimizers
 from policies.packed.convolutions import convolutions_for
 from policies.packed.initial import new_member
@@ -145,17 +146,18 @@ def test_filters_that_do_not_fit_are_refused() -> None:
 
 @pytest.mark.parametrize("shape", [(2, 3, 1), (2, 2, 1), (4, 4, 4)], ids=str)
 def test_bytes_lie_in_columns_and_come_out_as_they_were(shape: tuple[int, ...]) -> None:
-    """Also those that are no numbers, taken as floating-point ones."""
+    """Also those that are no numbers, or next to zero, as floating-point ones: what copies them computes nothing."""
     inputs = Inputs(shape, np.uint8, 1 / 255)
     images = np.random.default_rng(0).integers(0, 256, (50, 3, inputs.num_inputs), dtype=np.uint8)
-    images[0] = 255
+    images[0], images[1], images[2, :, 1:] = 255, 0, 0
     columns = np.zeros((50, 3, inputs.num_columns + 2), np.float32)
     inputs.put(columns[..., : inputs.num_columns], images)
     assert inputs.num_columns == -(-inputs.num_inputs // 4)
     assert not columns[..., inputs.num_columns :].any()
-    moved = columns.reshape(150, -1).take(np.arange(150), axis=0).reshape(columns.shape)
+    with denormals_as_zero():
+        moved = columns.reshape(150, -1).take(np.arange(150), axis=0).reshape(columns.shape)
+        rows = torch.from_numpy(moved).view(150, -1).index_select(0, torch.arange(150))[:, : inputs.num_columns]
     np.testing.assert_array_equal(inputs.bytes_in(moved[..., : inputs.num_columns]), images)
-    rows = torch.from_numpy(moved).view(150, -1).index_select(0, torch.arange(150))[:, : inputs.num_columns]
     np.testing.assert_array_equal(inputs.bytes_in_tensor(rows), images.reshape(150, -1))
 
 
