@@ -13,10 +13,11 @@ import pytest
 
 from tests.benchmarks.search import envs
 from tests.benchmarks.search import trainings as module
+from tests.benchmarks.search.pack_trainer import ENVS
 from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run, run_all
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
-from tests.benchmarks.search.trainings import ENVS, Trainings, Wanted
+from tests.benchmarks.search.trainings import Trainings, Wanted
 from tune_jobs.search.proposal import next_point
 
 TASK = TASKS["cartpole-ppo"]
@@ -140,7 +141,7 @@ def test_a_line_that_was_not_written_whole_is_made_again(tmp_path: Path) -> None
 def test_what_no_point_is_to_blame_for_is_no_failed_training(monkeypatch: pytest.MonkeyPatch) -> None:
     from tune_jobs.training.packed import PackedEngine
 
-    monkeypatch.setattr(PackedEngine, "train_iteration", lambda _: {"t0000": OSError("the disk is full")})
+    monkeypatch.setattr(PackedEngine, "train_iteration", lambda *_: {"t0000-0": OSError("the disk is full")})
     with pytest.raises(OSError, match="the disk is full"):
         module.train(TASK, [({"lr": 1e-3, "minibatch_size": 128}, 0)])
 

@@ -17,9 +17,11 @@ from typing import Any
 
 from tests.benchmarks.ppo import machine_name
 from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, run_all
+from tests.benchmarks.search.schedulers import SCHEDULERS
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import HERE, TASKS
 from tests.benchmarks.search.trainings import Trainings
+from tests.benchmarks.search.whole_runs import WholeRuns
 
 DATA = HERE / "data"
 PAGE = HERE.parents[2] / "docs" / "search-benchmark.md"
@@ -71,7 +73,8 @@ def main() -> None:
     """Train what is missing, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; none: all")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="these alone")
+    methods = (*METHODS, *SCHEDULERS)
+    parser.add_argument("--methods", nargs="+", choices=methods, default=methods, help="these alone")
     parser.add_argument("--runs", type=int, default=NUM_RUNS, help="of each method")
     parser.add_argument("--processes", type=int, default=2, help="how many packs train at once")
     parser.add_argument("--tables", action="store_true", help="train nothing")
@@ -82,8 +85,12 @@ def main() -> None:
     for name in options.tasks or TASKS:
         if not options.tables:
             trainings = Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)
-            keep(name, run_all(TASKS[name], trainings, options.methods, options.runs))
-    lines = list(tables({(task, method): read_runs(task, method) for task in TASKS for method in METHODS}))
+            choosing = [method for method in options.methods if method in METHODS]
+            keep(name, run_all(TASKS[name], trainings, choosing, options.runs))
+            whole = WholeRuns(TASKS[name], DATA / f"{name}.whole.jsonl", options.processes)
+            looking = [method for method in options.methods if method in SCHEDULERS]
+            keep(name, whole.runs(looking, options.runs))
+    lines = list(tables({(task, method): read_runs(task, method) for task in TASKS for method in methods}))
     write_page(lines)
     print("\n".join(lines))
 

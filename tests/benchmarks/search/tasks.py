@@ -6,7 +6,7 @@ Reinforcement Learning", and its published results (github.com/automl/arlbench, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -35,6 +35,12 @@ class Task:
     def spec(self) -> SweepSpec:
         """The sweep."""
         return load_spec(HERE / "tasks" / f"{self.name}.yaml")
+
+    def with_spec(self, spec: SweepSpec) -> Task:
+        """Return this task with another sweep."""
+        found = replace(self)
+        vars(found)["spec"] = spec
+        return found
 
     @property
     def evaluation_seeds(self) -> tuple[int, ...]:

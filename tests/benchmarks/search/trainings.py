@@ -17,14 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from policies.errors import NonFiniteWeightsError
+from tests.benchmarks.search.pack_trainer import PackTrainer
 from tests.benchmarks.search.tasks import Task
 from tune_jobs.plan.engine_choice import pack_key
 from tune_jobs.plan.points import point_hyperparams
-from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
 
-ENVS = "tests.benchmarks.search.envs"
-"""The module of the environments that a task may name."""
 MAX_AT_ONCE = 24
 """Trainings in a pack; more gain little, and one that a kill takes with it is lost."""
 
@@ -55,14 +52,9 @@ class Trainings:
         self._task, self._file, self._num_processes = task, file, num_processes
         self._known: dict[str, float | None] = {}
         self._pool: ProcessPoolExecutor | None = None
-        if file.exists():
-            lines, _, unfinished = file.read_text().rpartition("\n")
-            if unfinished:
-                # It was killed while it wrote this one; what is written next must not stand behind it.
-                os.truncate(file, len(lines) + 1 if lines else 0)
-            for line in lines.splitlines():
-                row = json.loads(line)
-                self._known[Wanted(row["point"], row["seed"]).key] = row["return"]
+        for line in whole_lines(file):
+            row = json.loads(line)
+            self._known[Wanted(row["point"], row["seed"]).key] = row["return"]
 
     def __len__(self) -> int:
         """How many are known."""
@@ -110,55 +102,26 @@ def train(task: Task, wanted: Sequence[tuple[dict[str, Any], int]]) -> list[floa
     Raises:
         Exception: Something else went wrong, of which no point is to blame.
     """
-    from policies.acting.evaluate import Episodes, Evaluator
-    from policies.acting.load import policy_from_portable
-    from policies.envs.modules import allow_modules
-    from policies.packed.evaluation import evaluate_many
-    from tune_jobs.training.packed import PackedEngine
-    from tune_jobs.training.protocol import TrialTask
-
-    spec = task.spec
-    allow_modules([ENVS])
-    engine = PackedEngine()
+    trainer = PackTrainer(task)
     names = [f"t{index:04d}" for index in range(len(wanted))]
     for name, (point, seed) in zip(names, wanted, strict=True):
-        hyperparams = point_hyperparams(spec, point, 0)
-        engine.add(
-            TrialTask(
-                sweep_place=".",
-                trial_id=name,
-                # As far apart as the training seeds of a sweep.
-                seed=1024 * seed,
-                algorithm=spec.algorithm,
-                hyperparams=hyperparams.model_dump(mode="json"),
-                env_id=spec.env.id,
-                env_args=spec.env.wrapped_args,
-                stop=StopSpec(),
-                evaluation=EvaluationSpec(),
-                checkpoints=CheckpointSpec(),
-                evaluation_seeds=(0,),
-            ),
-            None,
-        )
-    found: dict[str, float | None] = {}
-    policies = {}
+        trainer.add(name, point, (seed,))
     left = set(names)
     while left:
-        for name, stats in engine.train_iteration().items():
-            if isinstance(stats, Exception):
-                raise stats
-            if stats.num_env_steps >= spec.stop.num_env_steps:
-                policies[name] = engine.policy(name)
-                engine.remove(name)
-                left.discard(name)
-    engine.close()
-    evaluator = Evaluator(spec.env.id, spec.env.wrapped_args, task.evaluation_seeds)
-    acting = [policy_from_portable(portable) for portable in policies.values()]
-    for name, episodes in zip(policies, evaluate_many(evaluator, acting), strict=True):
-        if isinstance(episodes, Episodes):
-            found[name] = episodes.mean_return
-        elif isinstance(episodes, NonFiniteWeightsError):
-            found[name] = None
-        else:
-            raise episodes
-    return [found[name] for name in names]
+        left -= {name for name, steps in trainer.train(left).items() if steps >= task.spec.stop.num_env_steps}
+    found = trainer.returns(names)
+    trainer.close()
+    return [found[name][0] for name in names]
+
+
+def whole_lines(file: Path) -> list[str]:
+    """Return the lines of a file of JSON lines that need not exist; one that was not written whole is removed.
+
+    What is written next must not stand behind it.
+    """
+    if not file.exists():
+        return []
+    lines, _, unfinished = file.read_text().rpartition("\n")
+    if unfinished:
+        os.truncate(file, len(lines) + 1 if lines else 0)
+    return lines.splitlines()
