@@ -36,14 +36,14 @@ def make(task: Task, method: str, number: int) -> dict[str, Any]:
 
 
 def row_of(method: str, number: int, found: Tuned, test: float) -> dict[str, Any]:
-    """Return a run as it is kept."""
+    """Return a run as it is kept; the other schedules follow from its number and from what the rule was told."""
     return {
         "method": method,
         "run": number,
         "scores": list(map(_finite, found.scores)),
         "num_env_steps": found.num_env_steps,
-        "schedules": [_plain(schedule) for schedule in found.schedules],
         "best": found.scores.index(max(found.scores)),
+        "schedule": _plain(found.best),
         "test": _finite(test),
         "told": found.told,
     }
@@ -63,7 +63,7 @@ def run_of(row: Mapping[str, Any]) -> Run:
     def number(score: float | None) -> float:
         return -math.inf if score is None else score
 
-    schedule = row["schedules"][row["best"]]
+    schedule = row["schedule"]
     best = schedule[0]["point"] if len(schedule) == 1 else {"schedule": schedule}
     return Run(tuple(map(number, row["scores"])), best, number(row["test"]))
 
