@@ -17,9 +17,4 @@ export class Ended {
     this.state = sweep.state;
     return true;
   }
-
-  // The next look asks again.
-  forget() {
-    this.seen = -1;
-  }
 }

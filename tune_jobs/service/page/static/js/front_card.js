@@ -39,7 +39,7 @@ export class FrontCard {
     try {
       this.show(await this.source.front(), data);
     } catch (error) {
-      this.ended.forget();
+      // Asked for again with the next trials: what can't be made now may not be so in a second.
       if (this.view === null) setText(this.missing, error.message);
     } finally {
       this.isAsking = false;
