@@ -32,6 +32,7 @@ from tune_jobs.ray_tune.connected_ray import (
     of_a_sweep,
 )
 from tune_jobs.ray_tune.environment import prepare_environment
+from tune_jobs.ray_tune.forking import fork_server
 from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, start, without_environments
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
@@ -50,7 +51,9 @@ class Connection:
 
 
 @contextlib.contextmanager
-def connect(address: str | None, machine: Machine | None = None, *, is_users: bool = False) -> Iterator[Connection]:
+def connect(
+    address: str | None, machine: Machine | None = None, *, is_users: bool = False, packs: bool = True
+) -> Iterator[Connection]:
     """Join a cluster, or start Ray on this machine, for the duration of the block.
 
     A connection that the caller already has is used and kept if it is to the wanted address, or if none is given.
@@ -59,6 +62,7 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
         address: None: this machine; `auto`, `host:port` or `ray://host:port`.
         machine: The CPUs and GPUs to start Ray with on this machine.
         is_users: Whether the connection stands for one that the caller has in another process.
+        packs: Whether packs are trained, whose processes a Ray of this machine forks then (see `forking`).
 
     Raises:
         CannotRunError: Nothing answers at the address, its Ray differs, Ray does not start, or the caller is connected
@@ -69,6 +73,7 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
         check_connected_to(address)
         yield Connection(address, is_client(), connected_machine())
         return
+    forks: str | None = None
     logger = logging.getLogger("ray")
     level = logger.level
     with contextlib.ExitStack() as stack:
@@ -76,10 +81,13 @@ def connect(address: str | None, machine: Machine | None = None, *, is_users: bo
             stack.enter_context(of_a_sweep())
         if address is None:
             stack.enter_context(reaping())
+            if packs and machine is not None and not machine.num_gpus:
+                # A driver of a GPU does not survive a fork, and need not be asked whether something has loaded it.
+                forks = stack.enter_context(fork_server())
         try:
             with ending_if_it_fails(), _keeping_sigterm(), _deaf_to_hangups():
                 if address is None:
-                    start(machine)
+                    start(machine, forks)
                     stack.enter_context(without_environments())
                 else:
                     # One that a sweep's process started here for its others: a cluster's nodes are elsewhere.

@@ -20,6 +20,7 @@ from policies.envs.modules import module_folders
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.ray_tune.environment import provide_token
+from tune_jobs.ray_tune.forking import forked_workers
 from tune_jobs.ray_tune.replaced import replaced
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
@@ -28,11 +29,12 @@ QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
 """What `ray.init` is told, so that it prints nothing."""
 
 
-def start(machine: Machine | None) -> None:
+def start(machine: Machine | None, forks: str | None = None) -> None:
     """Start a Ray of this machine and join it.
 
     Args:
         machine: The CPUs and GPUs to start it with; None: all that Ray finds.
+        forks: Where its processes are forked (see `forking`); None: it starts them itself.
 
     Raises:
         CannotRunError: Ray does not start.
@@ -44,7 +46,13 @@ def start(machine: Machine | None) -> None:
     if machine is not None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
     try:
-        with _finding_own_modules(), _without_unused_processes(), without_dashboards_agent(), at_loopback():
+        with (
+            _finding_own_modules(),
+            _without_unused_processes(),
+            without_dashboards_agent(),
+            forked_workers(forks),
+            at_loopback(),
+        ):
             # "local": a cluster of this sweep's own, even if another one runs already.
             ray.init(
                 address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **QUIET

@@ -74,7 +74,7 @@ def git_commit() -> str | None:
     return done.stdout.strip() or None if done.returncode == 0 else None
 
 
-def connected(address: str | None, here: Machine | None) -> AbstractContextManager[Connection]:
+def connected(address: str | None, here: Machine | None, *, packs: bool = False) -> AbstractContextManager[Connection]:
     """Join a cluster or start Ray here; see `cluster.connect`. Ray is imported only when this is called.
 
     Raises:
@@ -85,7 +85,7 @@ def connected(address: str | None, here: Machine | None) -> AbstractContextManag
         check_address(address)
     from tune_jobs.ray_tune.cluster import connect
 
-    return connect(address, here)
+    return connect(address, here, packs=packs)
 
 
 def machine_here() -> Machine:
@@ -256,7 +256,7 @@ def _run_trials(
 
         with current().asking(ask):
             if shared.connection is None:
-                shared.connection = stack.enter_context(connected(address, machine))
+                shared.connection = stack.enter_context(connected(address, machine, packs=plan.packs is not None))
             monitor.phase = "starting the trials"
             try:
                 if shared.connection.is_client:

@@ -1,0 +1,138 @@
+"""Processes of a local Ray that are forked from one that has imported what packs need."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from policies.parents import is_gone
+from tune_jobs.ray_tune import forked_worker
+from tune_jobs.ray_tune.forking import fork_server
+
+pytestmark = [pytest.mark.ray, pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")]
+
+ROOT = Path(__file__).parents[2]
+
+# In the place of Ray's program: it says what it is, and stays.
+PROGRAM = """\
+import json, os, sys, time
+import threading
+import numpy, ray
+drawn = []
+def draw():
+    drawn.append(ray.ObjectID.from_random().hex())
+draw()
+thread = threading.Thread(target=draw)
+thread.start()
+thread.join()
+from policies.parents import this_process
+said = {
+    "me": this_process(), "options": sys.argv[1:], "path": sys.path, "folder": os.getcwd(),
+    "environment": dict(os.environ),
+    "ids": drawn, "leads_its_group": os.getpgid(0) == os.getpid(), "draw": numpy.random.random(),
+    "loaded": [name for name in ("torch", "ray", "tune_jobs.ray_tune.pack_trainable") if name in sys.modules],
+}
+print(json.dumps(said), flush=True)
+time.sleep(600)
+"""
+Ask = Callable[..., dict[str, Any]]
+
+
+def asked(folder: Path, address: str, *options: str, **environment: str) -> dict[str, Any]:
+    """Run the command that a raylet runs, and return what the process says that comes of it."""
+    program, told = folder / "default_worker.py", folder / f"told-{time.monotonic_ns()}"
+    program.write_text(PROGRAM)
+    # What Ray's own command would do: it says that it was run.
+    (folder / "setup_worker.py").write_text("print('{}')")
+    command = [sys.executable, "-I", "-S", forked_worker.__file__, address]
+    with told.open("wb") as file:
+        subprocess.run(
+            [*command, sys.executable, str(folder / "setup_worker.py"), str(program), *options],
+            stdin=subprocess.DEVNULL, stdout=file, cwd=folder, env=os.environ | environment, check=True, timeout=120,
+        )  # fmt: skip
+    until = time.monotonic() + 60
+    while not told.read_text().endswith("\n"):
+        assert time.monotonic() < until, "it says nothing"
+        time.sleep(0.02)
+    said: dict[str, Any] = json.loads(told.read_text())
+    return said
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with fork_server() as found:
+        assert found is not None
+        yield found
+
+
+def test_a_fork_is_what_the_command_would_have_become(address: str, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    one = asked(tmp_path, address, "--worker-id=1", PYTHONPATH=str(tmp_path / "mine"), MINE="yes")
+    assert one["options"] == ["--worker-id=1"]
+    assert one["path"][:2] == [str(tmp_path), str(tmp_path / "mine")]
+    assert str(ROOT / "tune_jobs" / "ray_tune") not in one["path"]
+    assert one["folder"] == str(tmp_path)
+    assert one["environment"]["MINE"] == "yes"
+    assert one["leads_its_group"]
+    assert one["loaded"] == ["torch", "ray", "tune_jobs.ray_tune.pack_trainable"]
+    # Another job's process is forked too.
+    two = asked(tmp_path, address, "--worker-id=2", RAY_JOB_ID="02000000")
+    assert "MINE" not in two["environment"]
+    assert two["environment"]["RAY_JOB_ID"] == "02000000"
+    assert two["draw"] != one["draw"]
+    assert len({*one["ids"], *two["ids"]}) == 4
+
+
+def test_ray_starts_a_process_itself_where_it_reads_other_settings(address: str, tmp_path: Path) -> None:
+    assert asked(tmp_path, address)["loaded"]
+    assert asked(tmp_path, address, RAY_something_else="1") == {}
+
+
+def test_ray_starts_its_processes_itself_where_nobody_answers(tmp_path: Path) -> None:
+    assert asked(tmp_path, str(tmp_path / "nobody")) == {}
+
+
+def test_forked_processes_end_with_the_one_that_they_are_forked_from(tmp_path: Path) -> None:
+    with fork_server() as found:
+        assert found is not None
+        me = asked(tmp_path, found)["me"]
+        assert not is_gone(me)
+    until = time.monotonic() + 10
+    while not is_gone(me):
+        assert time.monotonic() < until, "it lives on"
+        time.sleep(0.05)
+
+
+def test_a_local_ray_has_its_processes_forked() -> None:
+    # In a process of its own, as this one may have joined a Ray.
+    script = """
+import os
+from pathlib import Path
+import ray
+from tune_jobs.plan.machine import Machine
+from tune_jobs.ray_tune.cluster import connect
+
+@ray.remote(num_cpus=1)
+class Asked:
+    def who(self):
+        parent = Path(f"/proc/{os.getppid()}/cmdline").read_text()
+        return parent.split("\\0")[1], ray.get_runtime_context().get_job_id()
+
+with connect(None, Machine(num_cpus=1, num_gpus=0)):
+    # The first process was started before there was a job, the second for it.
+    for _ in range(2):
+        actor = Asked.remote()
+        print(*ray.get(actor.who.remote()))
+        ray.kill(actor)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False, timeout=240
+    )
+    program = str(ROOT / "tune_jobs" / "ray_tune" / "fork_server.py")
+    assert done.stdout.splitlines() == [f"{program} 01000000"] * 2, done.stderr
