@@ -31,10 +31,11 @@ draw()
 thread = threading.Thread(target=draw)
 thread.start()
 thread.join()
+numpy.ones((512, 512)) @ numpy.ones((512, 512))
 from policies.parents import this_process
 said = {
     "me": this_process(), "options": sys.argv[1:], "path": sys.path, "folder": os.getcwd(),
-    "environment": dict(os.environ),
+    "environment": dict(os.environ), "threads": len(os.listdir("/proc/self/task")),
     "ids": drawn, "leads_its_group": os.getpgid(0) == os.getpid(), "draw": numpy.random.random(),
     "loaded": [name for name in ("torch", "ray", "tune_jobs.ray_tune.pack_trainable") if name in sys.modules],
 }
@@ -87,6 +88,8 @@ def test_a_fork_is_what_the_command_would_have_become(address: str, tmp_path: Pa
     assert two["environment"]["RAY_JOB_ID"] == "02000000"
     assert two["draw"] != one["draw"]
     assert len({*one["ids"], *two["ids"]}) == 4
+    # Nothing of it multiplies matrices in several threads; see `forking`.
+    assert one["threads"] == two["threads"] == 1
 
 
 def test_ray_starts_a_process_itself_where_it_reads_other_settings(address: str, tmp_path: Path) -> None:
@@ -107,6 +110,27 @@ def test_forked_processes_end_with_the_one_that_they_are_forked_from(tmp_path: P
     while not is_gone(me):
         assert time.monotonic() < until, "it lives on"
         time.sleep(0.05)
+
+
+def test_a_killed_driver_leaves_no_folder() -> None:
+    script = """
+import sys
+from tune_jobs.ray_tune.forking import fork_server
+with fork_server() as found:
+    print(found, flush=True)
+    sys.stdin.read()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as driver:
+        assert driver.stdout is not None
+        folder = Path(driver.stdout.readline().strip()).parent
+        assert folder.is_dir()
+        driver.kill()
+    until = time.monotonic() + 60
+    while folder.exists():
+        assert time.monotonic() < until, "it is still there"
+        time.sleep(0.1)
 
 
 def test_a_local_ray_has_its_processes_forked() -> None:

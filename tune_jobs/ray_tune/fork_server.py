@@ -205,8 +205,14 @@ def _take_over_signals(asked: Mapping[str, Any]) -> None:
 
 if __name__ == "__main__":
     _, _descriptor, _early, _late = sys.argv
-    _job = main(socket.socket(fileno=int(_descriptor)), _early.split(","), _late.split(","))
+    _listener = socket.socket(fileno=int(_descriptor))
+    _asked = Path(_listener.getsockname())
+    _job = main(_listener, _early.split(","), _late.split(","))
     if _job is None:
+        # Who started it may have been killed.
+        with contextlib.suppress(OSError):
+            _asked.unlink()
+            _asked.parent.rmdir()
         # Nothing is to be saved, and to take down what was imported takes most of a second.
         os._exit(0)
     _job()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import subprocess
 import sys
@@ -45,6 +46,9 @@ def fork_server() -> Iterator[str | None]:
             listener.listen(64)
             process = subprocess.Popen(  # noqa: S603 (this very Python)
                 [sys.executable, program, str(listener.fileno()), ",".join(_EARLY), ",".join(_LATE)],
+                # Ray says this to a process of one CPU before that imports anything; libraries read it only then, and
+                # products of two threads in each pack would take the cores from one another.
+                env={"OMP_NUM_THREADS": "1", **os.environ},
                 stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
                 pass_fds=[listener.fileno()], start_new_session=True,
             )  # fmt: skip
