@@ -41,6 +41,7 @@ SLOW = {
     "tests/ray/test_faulty_envs.py::test_faulty_trials_fail_alone_and_the_sweep_is_read_retried_and_resumed[rllib]":
         "the same, packed",
     "tests/ray/test_folders_of_our_names.py": "tests/package/test_wheel.py",
+    "tests/ray/test_length_of_training.py::test_each_trial_ends_at_its_own_length[rllib]": "the same, packed",
     "tests/ray/test_more_seeds.py::test_leading_settings_get_fresh_seeds_and_train_to_the_end[rllib-hyperband]":
         "the same, packed",
     "tests/ray/test_more_seeds.py::test_points_that_tpe_chose_are_trained_again":
@@ -55,6 +56,8 @@ SLOW = {
         "tests/unit/test_pack_sizes.py, and tests/unit/test_search_methods.py",
     "tests/ray/test_search.py::test_a_population_that_is_stopped_goes_on_with_its_newest_values[rllib]":
         "the same, packed",
+    "tests/ray/test_search_schedulers.py::test_a_replayed_schedule_gives_what_the_population_gave_to_the_bit[cartpole-dqn]":
+        "the same, cartpole-ppo",
     "tests/ray/test_repetitions.py::test_a_trial_comes_to_the_same_by_itself[rllib]": "the same, packed",
     "tests/ray/test_resumed_rewards.py::test_the_statistics_of_a_resumed_trial_are_of_all_its_env_steps[rllib]":
         "the same, packed",
