@@ -122,7 +122,7 @@ def test_a_signal_while_ray_starts_leaves_the_sweep_interrupted(
 ) -> None:
     pend(store)
 
-    def connect(*_: object) -> None:
+    def connect(*_: object, **__: object) -> None:
         os.kill(os.getpid(), number)  # the first one asks
         assert store.stop_requested()
         os.kill(os.getpid(), signal.SIGTERM if number == signal.SIGHUP else number)  # a SIGHUP is never the second
@@ -144,7 +144,7 @@ def test_a_run_that_fails_leaves_no_sweep_that_says_it_runs(
 ) -> None:
     pend(store)
 
-    def connect(*_: object) -> None:
+    def connect(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(driving, "connected", connect)
@@ -227,7 +227,7 @@ def test_a_run_leaves_no_file_of_its_sweep_open(
     """Also while somebody holds what was raised, or nobody has collected garbage."""
     pend(store)
 
-    def connect(*_: object) -> None:
+    def connect(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(driving, "connected", connect)
