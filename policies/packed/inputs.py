@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import gymnasium as gym
@@ -49,12 +50,12 @@ class Inputs:
         """The same without the mask."""
         return replace(self, num_masked=0)
 
-    @property
+    @cached_property
     def num_inputs(self) -> int:
         """The numbers of an observation that networks see."""
         return math.prod(self.shape)
 
-    @property
+    @cached_property
     def num_observed(self) -> int:
         """The numbers of an observation, with its mask."""
         return self.num_masked + self.num_inputs
@@ -64,12 +65,12 @@ class Inputs:
         """Whether there are convolutions."""
         return len(self.shape) > 1
 
-    @property
+    @cached_property
     def is_bytes(self) -> bool:
         """Whether observations are images of bytes."""
         return self.dtype == np.uint8
 
-    @property
+    @cached_property
     def num_columns(self) -> int:
         """The columns of an observation in a row of floating-point numbers: four bytes in one, or one more for a 1.
 

@@ -7,6 +7,7 @@ Shapes: K rows (networks), P weights per row.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import torch
@@ -70,15 +71,14 @@ class StackedAdam:
         if not self._rates:
             self.begin(1)
         rate, scale = self._rates.pop()
-        for piece in _pieces(self.weights):
-            gradient, weights = gradients[:, piece], self.weights[:, piece]
-            mean, square = self.state["exp_avg"][:, piece], self.state["exp_avg_sq"][:, piece]
-            mean.lerp_(gradient, self._weight1)
-            square.mul_(self._beta2_32)
-            square += gradient * gradient * self._weight2
-            denominator = square.sqrt()
+        mean, square = self.state["exp_avg"], self.state["exp_avg_sq"]
+        for weights, gradient, m, v in _in_pieces(self.weights, gradients, mean, square):
+            m.lerp_(gradient, self._weight1)
+            v.mul_(self._beta2_32)
+            v.add_(gradient * gradient * self._weight2)
+            denominator = v.sqrt()
             denominator.mul_(scale).add_(self._epsilon)
-            torch.div(mean, denominator, out=denominator)
+            torch.div(m, denominator, out=denominator)
             denominator.mul_(rate)
             weights.sub_(denominator)
         self.num_steps += 1
@@ -107,11 +107,10 @@ class StackedRMSprop:
 
     def step(self, gradients: Tensor) -> None:
         """Update the weights by one step of RMSprop."""
-        for piece in _pieces(self.weights):
-            gradient, weights = gradients[:, piece], self.weights[:, piece]
-            square, buffer = self.state["square_avg"][:, piece], self.state["momentum_buffer"][:, piece]
+        states = self.state["square_avg"], self.state["momentum_buffer"]
+        for weights, gradient, square, buffer in _in_pieces(self.weights, gradients, *states):
             square.mul_(self._rho)
-            square += gradient * gradient * self._weight
+            square.add_(gradient * gradient * self._weight)
             update = gradient / (square.sqrt() + self._epsilon)
             # Without momentum the buffer is the update itself, as in torch.
             buffer.mul_(self._momentum).add_(update)
@@ -119,17 +118,17 @@ class StackedRMSprop:
         self.num_steps += 1
 
 
-def _pieces(weights: Tensor) -> list[slice]:
-    """Return the columns of weights in pieces that stay in a core's cache while a step goes over them again and again.
+def _in_pieces(*tensors: Tensor) -> Iterable[Sequence[Tensor]]:
+    """Return tensors of the weights' shape in pieces that stay in a core's cache while a step goes over them again.
 
     Each number is computed by itself, so the pieces have no part in what it becomes. A few of them cost more in calls
     than they save.
     """
-    num_rows, num_columns = weights.shape
-    if weights.is_cuda or weights.numel() <= 4 * _NUMBERS_AT_ONCE:
-        return [slice(None)]
-    size = max(1, _NUMBERS_AT_ONCE // num_rows)
-    return [slice(start, start + size) for start in range(0, num_columns, size)]
+    first = tensors[0]
+    if first.numel() <= 4 * _NUMBERS_AT_ONCE or first.is_cuda:
+        return (tensors,)
+    size = max(1, _NUMBERS_AT_ONCE // len(first))
+    return zip(*(torch.split(tensor, size, dim=1) for tensor in tensors), strict=True)
 
 
 def clip_by_global_norm(gradients: Tensor, limit: Tensor, networks_per_member: int) -> Tensor:
