@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import platform
 from datetime import UTC, datetime
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.ppo import machine_name
-from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, run_all
+from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, finite, run_all
 from tests.benchmarks.search.schedulers import SCHEDULERS
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import HERE, TASKS
@@ -44,15 +43,10 @@ def keep(task: str, runs: dict[tuple[str, int], Run]) -> None:
             "machine": machine_name(),
             "python": platform.python_version(),
             "runs": [
-                {"scores": list(map(_finite, run.scores)), "best": run.best, "test": _finite(run.test)} for run in found
+                {"scores": list(map(finite, run.scores)), "best": run.best, "test": finite(run.test)} for run in found
             ],
         }
         runs_file(task, method).write_text(json.dumps(about, indent=1) + "\n")
-
-
-def _finite(score: float) -> float | None:
-    """Return a score as JSON has it: null where a seed failed."""
-    return score if math.isfinite(score) else None
 
 
 def read_runs(task: str, method: str) -> dict[str, Any] | None:

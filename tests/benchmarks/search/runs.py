@@ -48,6 +48,11 @@ def mean_or_worst(returns: Returns) -> float:
     return sum(known) / len(known) if len(known) == len(returns) else -math.inf
 
 
+def finite(score: float) -> float | None:
+    """Return a score as JSON has it: null where a seed failed."""
+    return score if math.isfinite(score) else None
+
+
 def run(task: Task, method: str, number: int) -> Generator[list[Wanted], list[float | None], Run]:
     """Run one optimiser.
 

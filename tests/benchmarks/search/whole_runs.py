@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.search.pack_trainer import PackTrainer
-from tests.benchmarks.search.runs import Run
+from tests.benchmarks.search.runs import Run, finite
 from tests.benchmarks.search.schedulers import Stage, Tuned, task_of, tested, tuned
 from tests.benchmarks.search.tasks import Task
 from tests.benchmarks.search.trainings import whole_lines
@@ -40,21 +40,17 @@ def row_of(method: str, number: int, found: Tuned, test: float) -> dict[str, Any
     return {
         "method": method,
         "run": number,
-        "scores": list(map(_finite, found.scores)),
+        "scores": list(map(finite, found.scores)),
         "num_env_steps": found.num_env_steps,
         "best": found.scores.index(max(found.scores)),
         "schedule": _plain(found.best),
-        "test": _finite(test),
+        "test": finite(test),
         "told": found.told,
     }
 
 
 def _plain(schedule: Sequence[Stage]) -> list[dict[str, Any]]:
     return [{"from_env_steps": stage.from_env_steps, "point": dict(stage.point)} for stage in schedule]
-
-
-def _finite(score: float) -> float | None:
-    return score if math.isfinite(score) else None
 
 
 def run_of(row: Mapping[str, Any]) -> Run:
